@@ -1,0 +1,341 @@
+"""Joins a learner, collects, uploads, follows its snapshots, leaves. The only threads are the transport's."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from actor.collector import Collector
+from actor.environments import VectorEnvironment, make_environments
+from actor.uploader import Uploader
+from policy.runtime import OnnxRuntime, PolicyRuntime, program_hash
+from protocol import keys
+from protocol.codec import Limits, ProtocolError, VersionMismatchError, decode, encode
+from protocol.messages import (
+    Acknowledgement,
+    Farewell,
+    Join,
+    Message,
+    Program,
+    Refusal,
+    RolloutIdentity,
+    Snapshot,
+    Welcome,
+)
+from protocol.spec import EnvironmentSpec, Spaces
+from protocol.transport import Inbox, Transport, TransportError
+
+_LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
+_ANSWER_SECONDS = 5.0  # a query without an answer by then has none
+_ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
+_DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks for it
+_FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+
+
+class ActorError(Exception):
+    """The actor cannot take part; the message says why and what to do."""
+
+
+class _LearnerLostError(Exception):
+    """The learner went away, or lives another life; join again."""
+
+
+class _OverError(Exception):
+    """Told to stop, or the run is over."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorConfig:
+    """Everything that an actor decides for itself."""
+
+    name: str
+    incarnation: int
+    run: str = keys.ANY_RUN
+    environments: int | None = None  # unset: as many as the learner's specification says
+    runtime: Literal["onnx", "torch"] = "onnx"
+    timeout: float | None = None  # seconds to look for a learner; unset: for ever
+
+
+class ActorService:
+    """One actor over one transport."""
+
+    def __init__(
+        self, config: ActorConfig, transport: Transport, stop: threading.Event, say: Callable[[str], None]
+    ) -> None:
+        self._config = config
+        self._transport = transport
+        self._stop = stop
+        self._say = say
+        self._changed = threading.Condition()  # guards what the transport's threads touch: the next two
+        self._uploader = Uploader(window=1)
+        self._learner_left = False
+        self._inboxes: dict[str, Inbox] = {}  # by run
+        self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
+        self._snapshot: Snapshot | None = None  # the newest of this learner epoch
+
+    def run(self) -> None:
+        """Plays until stopped or until the learner says that the run is over.
+
+        Raises ActorError if the actor is refused or finds no learner within its timeout, and
+        UnplayableError if the environment cannot be made here.
+        """
+        try:
+            while True:
+                try:
+                    self._take_part(self._find_learner())
+                except _LearnerLostError:
+                    self._say("the learner went away; looking for it again")
+        except _OverError:
+            pass
+        finally:
+            if self._made is not None:
+                self._made[1].close()
+
+    # ----------------------------------------------------------------------------------------- joining
+
+    def _find_learner(self) -> Welcome:
+        """Asks for a learner until one answers."""
+        deadline = None if self._config.timeout is None else time.monotonic() + self._config.timeout
+        pause, told = _FIRST_RETRY_SECONDS, False
+        while True:
+            welcome = self._join(self._config.run, Join(actor=self._config.name, incarnation=self._config.incarnation))
+            if welcome is not None:
+                return welcome
+            if deadline is not None and time.monotonic() > deadline:
+                raise ActorError(
+                    f"no learner answered within {self._config.timeout:g} s: is it running, and is the address its own?"
+                )
+            if not told and pause >= _MAX_RETRY_SECONDS:
+                self._say("waiting for a learner")
+                told = True
+            if self._stop.wait(pause):
+                raise _OverError
+            pause = min(2 * pause, _MAX_RETRY_SECONDS)
+
+    def _join(self, run: str, join: Join) -> Welcome | None:
+        """One question to the learner of `run`; None if nobody can answer now."""
+        answers = [self._decode(answer) for answer in self._ask(keys.join(run), encode(join))]
+        answers = [answer for answer in answers if isinstance(answer, Welcome | Refusal)]
+        if not answers:
+            return None
+        welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
+        if len(welcomes) > 1:
+            names = ", ".join(sorted(welcome.run for welcome in welcomes))
+            raise ActorError(f"several learners answer here ({names}): choose one with --run")
+        if welcomes:
+            return welcomes[0]
+        refusal = answers[0]
+        assert isinstance(refusal, Refusal)
+        if refusal.code == "finished":
+            raise _OverError
+        raise ActorError(f"the learner refused this actor: {refusal.reason}")
+
+    def _ask(self, key: str, payload: bytes = b"") -> list[bytes]:
+        try:
+            return self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
+        except TransportError:
+            return []
+
+    def _decode(self, data: bytes) -> Message | None:
+        try:
+            return decode(data, _LIMITS)
+        except VersionMismatchError as error:
+            raise ActorError(str(error)) from None
+        except ProtocolError as error:
+            self._say(f"ignored a message: {error}")
+            return None
+
+    # ----------------------------------------------------------------------------------------- playing
+
+    def _take_part(self, welcome: Welcome) -> None:
+        """Makes the environments, is counted in, and plays."""
+        environments = self._environments(welcome.spec.environment, welcome)
+        self._follow(welcome.run)
+        confirmed = self._join(
+            welcome.run,
+            Join(
+                actor=self._config.name,
+                incarnation=self._config.incarnation,
+                spaces=environments.spaces,
+                environments=environments.count,
+            ),
+        )
+        if confirmed is None or confirmed.learner_epoch != welcome.learner_epoch:
+            raise _LearnerLostError
+        with self._changed:
+            self._uploader = Uploader(window=welcome.spec.collection.window)
+            self._learner_left = False
+        self._snapshot = None
+        self._say(
+            f"joined run {welcome.run!r} as {self._config.name!r}: {environments.count} x {welcome.spec.environment.id}"
+        )
+        self._play(confirmed, environments)
+
+    def _environments(self, spec: EnvironmentSpec, welcome: Welcome) -> VectorEnvironment:
+        """The environments of `spec`; those of an earlier join if they are the same."""
+        if self._made is not None and self._made[0] != spec:
+            self._made[1].close()
+            self._made = None
+        if self._made is None:
+            count = self._config.environments or welcome.spec.collection.envs_per_actor
+            self._made = spec, make_environments(spec, count)
+        return self._made[1]
+
+    def _follow(self, run: str) -> None:
+        if run in self._inboxes:
+            return
+        self._inboxes[run] = self._transport.follow(keys.snapshots(run), self._notify)
+        self._transport.watch(keys.learner(run), self._on_learner)
+        self._transport.announce(keys.presence(run, self._config.name))
+
+    def _play(self, welcome: Welcome, environments: VectorEnvironment) -> None:
+        self._await_snapshot(welcome, newer_than=-1)
+        assert self._snapshot is not None
+        collector = Collector(
+            environments,
+            self._runtime(welcome, self._snapshot, environments.spaces),
+            rollout_length=welcome.spec.collection.rollout_length,
+            reward_scale=welcome.spec.environment.reward_scale,
+            seed=welcome.seed,
+        )
+        sequence, loaded = 0, -1
+        while True:
+            if self._snapshot.policy_version != loaded:
+                collector.load(self._snapshot.weights)
+                loaded = self._snapshot.policy_version
+            identity = RolloutIdentity(
+                actor=self._config.name,
+                incarnation=self._config.incarnation,
+                sequence=sequence,
+                learner_epoch=welcome.learner_epoch,
+            )
+            payload = encode(collector.collect(identity, loaded))
+            self._wait(lambda: self._uploader.has_room)
+            with self._changed:
+                self._uploader.add(sequence, payload)
+            self._send_due(welcome.run)
+            sequence += 1
+            if welcome.spec.synchronous:
+                self._await_snapshot(welcome, newer_than=loaded)
+            else:
+                self._read_inbox(welcome)
+
+    def _runtime(self, welcome: Welcome, snapshot: Snapshot, spaces: Spaces) -> PolicyRuntime:
+        if self._config.runtime == "torch":
+            from policy.torch_runtime import TorchRuntime  # an actor has no torch unless it asks for it
+
+            return TorchRuntime(welcome.spec.policy, spaces)
+        for answer in self._ask(keys.program(welcome.run, snapshot.program)):
+            program = self._decode(answer)
+            if isinstance(program, Program):
+                model = program.model.tobytes()
+                if program_hash(model) == snapshot.program:
+                    return OnnxRuntime(model)
+        raise _LearnerLostError
+
+    # --------------------------------------------------------------------------------------- snapshots
+
+    def _await_snapshot(self, welcome: Welcome, newer_than: int) -> None:
+        """Waits for a snapshot newer than a version; asks for it when in doubt.
+
+        Returns early if the rollout that was to bring it was rejected: another must take its place.
+        """
+
+        def arrived() -> bool:
+            self._read_inbox(welcome)
+            return self._snapshot is not None and self._snapshot.policy_version > newer_than
+
+        pause = _FIRST_RETRY_SECONDS if newer_than < 0 else _DOUBT_SECONDS
+        while not self._wait(lambda: arrived() or self._uploader.must_replace, pause):
+            pause = min(2 * pause, _DOUBT_SECONDS)
+            self._ask_snapshot(welcome)
+        with self._changed:
+            self._uploader.must_replace = False
+
+    def _ask_snapshot(self, welcome: Welcome) -> None:
+        for answer in self._ask(keys.snapshots(welcome.run)):
+            self._take_news(welcome, answer)
+
+    def _read_inbox(self, welcome: Welcome) -> None:
+        news = self._inboxes[welcome.run].take()
+        if news is not None:
+            self._take_news(welcome, news)
+        self._check()
+
+    def _take_news(self, welcome: Welcome, data: bytes) -> None:
+        news = self._decode(data)
+        if isinstance(news, Farewell) and news.learner_epoch == welcome.learner_epoch:
+            self._say(f"the run is over: {news.reason}")
+            raise _OverError
+        if not isinstance(news, Snapshot):
+            return
+        if news.learner_epoch != welcome.learner_epoch:
+            raise _LearnerLostError
+        if self._snapshot is None or news.policy_version > self._snapshot.policy_version:
+            self._snapshot = news
+
+    # ----------------------------------------------------------------------------------------- waiting
+
+    def _wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
+        """Waits until `ready`, sending what falls due meanwhile; False if `timeout` seconds passed first."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        run = next(iter(self._inboxes))
+        while True:
+            self._send_due(run)
+            with self._changed:
+                self._check()
+                if ready():
+                    return True
+                now = time.monotonic()
+                if deadline is not None and now >= deadline:
+                    return False
+                due = self._uploader.next_due()
+                until = min(t for t in (deadline, due, now + _HEARTBEAT_SECONDS) if t is not None)
+                self._changed.wait(max(until - now, 0.0))
+
+    def _check(self) -> None:
+        """Raises if there is a reason to stop playing."""
+        if self._stop.is_set() or self._uploader.over == "finished":
+            raise _OverError
+        if self._learner_left or self._uploader.over == "fenced":
+            raise _LearnerLostError
+
+    def _send_due(self, run: str) -> None:
+        key = keys.rollouts(run, self._config.name)
+        uploader = self._uploader
+        with self._changed:
+            due = uploader.due(time.monotonic())
+        for sequence, payload in due:
+            try:
+                self._transport.send(
+                    key,
+                    payload,
+                    timeout=_ACKNOWLEDGE_SECONDS,
+                    on_answer=lambda answer, sequence=sequence: self._on_answer(uploader, sequence, answer),
+                )
+            except TransportError:
+                self._on_answer(uploader, sequence, None)
+
+    # ------------------------------------------------------------------ called on the transport's threads
+
+    def _on_answer(self, uploader: Uploader, sequence: int, data: bytes | None) -> None:
+        answer = None
+        if data is not None:
+            try:
+                answer = decode(data, _LIMITS)
+            except ProtocolError:
+                answer = None
+        with self._changed:
+            uploader.answered(sequence, answer if isinstance(answer, Acknowledgement) else None, time.monotonic())
+            self._changed.notify_all()
+
+    def _on_learner(self, _key: str, present: bool) -> None:
+        with self._changed:
+            self._learner_left = not present
+            self._changed.notify_all()
+
+    def _notify(self) -> None:
+        with self._changed:
+            self._changed.notify_all()

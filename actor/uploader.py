@@ -1,0 +1,76 @@
+"""Keeps up to `window` rollouts in flight until each is answered for good. State and decisions, no waiting.
+
+The service owns the lock that guards it: answers arrive on the transport's threads.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from protocol.messages import Acknowledgement
+
+_BUSY_SECONDS = 0.005  # first wait after a busy answer; doubles
+_LOST_SECONDS = 0.1  # wait after no answer at all
+_MAX_WAIT_SECONDS = 0.5
+
+
+@dataclass(slots=True)
+class _InFlight:
+    payload: bytes
+    attempts: int = 0
+    send_at: float | None = 0.0  # None while an answer is awaited
+
+
+@dataclass(slots=True)
+class Uploader:
+    """Rollouts that were collected and not yet answered for good, by sequence number."""
+
+    window: int
+    in_flight: dict[int, _InFlight] = field(default_factory=dict)
+    verdicts: Counter[str] = field(default_factory=Counter)
+    newest_version: int = 0  # that any answer told of
+    must_replace: bool = False  # the last answer was a rejection: collect another in its place
+    over: str = ""  # "fenced" or "finished" once the learner said so
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more may be sent."""
+        return len(self.in_flight) < self.window
+
+    def add(self, sequence: int, payload: bytes) -> None:
+        """Takes in a rollout; it is due at once."""
+        self.in_flight[sequence] = _InFlight(payload)
+
+    def due(self, now: float) -> list[tuple[int, bytes]]:
+        """Those to send now, oldest first; each is then awaited until `answered`."""
+        ready = []
+        for sequence, rollout in self.in_flight.items():
+            if rollout.send_at is not None and rollout.send_at <= now:
+                rollout.send_at = None
+                ready.append((sequence, rollout.payload))
+        return ready
+
+    def next_due(self) -> float | None:
+        """When the next of them is due, or None if all are awaited."""
+        times = [rollout.send_at for rollout in self.in_flight.values() if rollout.send_at is not None]
+        return min(times, default=None)
+
+    def answered(self, sequence: int, answer: Acknowledgement | None, now: float) -> None:
+        """Takes in the answer to one; None means that none came, so it is sent again.
+
+        Sending twice is safe: the learner trains on each identity at most once.
+        """
+        rollout = self.in_flight.get(sequence)
+        if rollout is None:
+            return
+        if answer is not None:
+            self.newest_version = max(self.newest_version, answer.policy_version)
+            self.verdicts[answer.verdict] += 1
+        if answer is None or answer.verdict == "busy":
+            first = _LOST_SECONDS if answer is None else _BUSY_SECONDS
+            rollout.send_at = now + min(first * 2**rollout.attempts, _MAX_WAIT_SECONDS)
+            rollout.attempts = min(rollout.attempts + 1, 10)
+            return
+        del self.in_flight[sequence]
+        self.must_replace = answer.verdict == "rejected"
+        if answer.verdict in ("fenced", "finished"):
+            self.over = answer.verdict

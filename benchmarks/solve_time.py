@@ -1,0 +1,35 @@
+"""Seconds from the command to solved: `daedalus train cartpole`, one run a seed.
+
+    python benchmarks/solve_time.py --seeds 1 2 3 4 5
+
+Solved means what the program means by it: the mean of the last 100 training episodes is at least 475. Counted
+from the start of the `daedalus` process; the evaluation that follows is not in it. One run that is not counted
+comes first and warms the disk cache.
+"""
+
+import argparse
+import statistics
+
+from running import machine, table, train
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
+    options.add_argument("--preset", default="cartpole")
+    parsed = options.parse_args()
+    train(parsed.preset, "--seed", 1000)
+    rows, seconds = [], []
+    for seed in parsed.seeds:
+        summary = train(parsed.preset, "--seed", seed)
+        seconds.append(summary["seconds_to_target"] or float("inf"))
+        rows.append(
+            (seed, f"{seconds[-1]:.2f}", f"{summary['env_steps']:,}", f"{summary['evaluation_return_mean']:.1f}")
+        )
+    print(machine())
+    print(table(("seed", "seconds to solved", "env_steps", "evaluation (greedy, 100)"), rows))
+    print(f"median {statistics.median(seconds):.2f} s, worst {max(seconds):.2f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""The share of CPU time that codec and transport take, learner and actors together, on CartPole at full rate.
+
+    python benchmarks/transport_share.py --env-steps 8000000
+
+Process start, imports and everything else of the run is in the total; benchmarks/profiled.py says what is counted.
+"""
+
+import argparse
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from running import machine, table
+
+
+def free_address() -> str:
+    """A loopback address that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--env-steps", type=int, default=8_000_000)
+    options.add_argument("--preset", default="cartpole")
+    parsed = options.parse_args()
+    address = free_address()
+    script = str(Path(__file__).with_name("profiled.py"))
+    with tempfile.TemporaryDirectory() as folder:
+        learner = ["learner", parsed.preset, "--env-steps", parsed.env_steps, "--listen", address]
+        learner += ["--run-dir", f"{folder}/run", "--set", "training.stop_when_solved=false"]
+        actors = [["actor", "--connect", address, "--name", f"actor-{index}", "--quiet"] for index in range(2)]
+        processes = []
+        for index, words in enumerate([learner, *actors]):
+            environment = {**os.environ, "PROFILE": f"{folder}/{index}.json", "OMP_NUM_THREADS": "1"}
+            command = [sys.executable, "-P", script, *(str(word) for word in words)]
+            processes.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL))
+        statuses = [process.wait() for process in processes]
+        if any(statuses):
+            raise SystemExit("a process failed")
+        reports = [json.loads(Path(f"{folder}/{index}.json").read_text()) for index in range(3)]
+    rows, share = [], 0.0
+    total = sum(report["total"] for report in reports)
+    for name, report in zip(("learner", "actor-0", "actor-1"), reports, strict=True):
+        part = report["codec"] + report["transport"]
+        share += part / total
+        cells = (f"{report[kind]:.2f}" for kind in ("total", "codec", "transport"))
+        rows.append((name, *cells, f"{100 * part / report['total']:.1f} %"))
+    print(machine())
+    print(table(("process", "CPU s", "codec", "transport", "share"), rows))
+    print(f"together {100 * share:.1f} % of {total:.1f} CPU seconds")
+
+
+if __name__ == "__main__":
+    main()

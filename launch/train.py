@@ -1,0 +1,190 @@
+"""`daedalus train` and `daedalus resume`: a learner and actors on this machine, watched to their end."""
+
+import argparse
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from launch.supervisor import ActorFailedError, SupervisedActor, start, stop
+from learner import run_directory
+from learner.options import add_settings, resolve
+from learner.settings import SettingsError
+from protocol.process import process_started, stop_on_signals
+from protocol.spec import RunSpec
+
+_POLL_SECONDS = 0.05
+_EVALUATION_EPISODES = 100
+
+_TRAIN = """\
+Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
+reached or the budget is used up, then plays 100 greedy episodes with the result."""
+
+_TRAIN_EXAMPLES = """\
+examples:
+  daedalus train cartpole
+  daedalus train cartpole --algorithm a2c --actors 4 --seed 7
+  daedalus train --env Acrobot-v1 --env-steps 500000
+  daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
+  daedalus train cartpole --set training.stop_when_solved=false --env-steps 5000000
+
+exit status: 0 the target was reached or the asked-for steps were done, 3 the budget ended without the target,
+1 failed or stopped, 2 bad usage"""
+
+_RESUME = """\
+Continues a run from its newest checkpoint that is whole: weights, optimiser, counters and random state go on
+as they were; the environments start new episodes."""
+
+_RESUME_EXAMPLES = """\
+examples:
+  daedalus resume runs/cartpole-impala-s1-20261121-101500
+  daedalus resume RUN_DIR --env-steps 3000000      (the whole budget, the steps already done included)"""
+
+
+def train(arguments: list[str]) -> int:
+    """Runs `daedalus train`."""
+    started = process_started()
+    options = _parser("daedalus train", _TRAIN, _TRAIN_EXAMPLES)
+    add_settings(options)
+    _add_listen(options)
+    parsed = options.parse_args(arguments)
+    try:
+        spec, directory = resolve(parsed)
+        run_directory.create(directory, spec)
+    except SettingsError as error:
+        print(f"daedalus train: {error}", file=sys.stderr)
+        return 2
+    return _run(directory, spec, parsed.listen, started, resume=False)
+
+
+def resume(arguments: list[str]) -> int:
+    """Runs `daedalus resume`."""
+    started = process_started()
+    options = _parser("daedalus resume", _RESUME, _RESUME_EXAMPLES)
+    options.add_argument("directory", type=Path, metavar="RUN_DIR", help="the run to continue")
+    options.add_argument("--env-steps", type=int, metavar="N", help="a new budget (default: the one it had)")
+    _add_listen(options)
+    parsed = options.parse_args(arguments)
+    try:
+        spec = run_directory.read_config(parsed.directory)
+        if parsed.env_steps is not None:
+            spec = run_directory.with_budget(spec, parsed.env_steps)
+            run_directory.write_config(parsed.directory, spec)
+    except SettingsError as error:
+        print(f"daedalus resume: {error}", file=sys.stderr)
+        return 2
+    return _run(parsed.directory, spec, parsed.listen, started, resume=True)
+
+
+def _parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
+    return argparse.ArgumentParser(
+        prog=name,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _add_listen(options: argparse.ArgumentParser) -> None:
+    options.add_argument(
+        "--listen",
+        metavar="tcp/HOST:PORT",
+        help="where more actors may join (default: a free port of this machine)",
+    )
+
+
+def _run(directory: Path, spec: RunSpec, listen: str | None, started: float, *, resume: bool) -> int:
+    """Everything between the settings and the exit status."""
+    stopping = stop_on_signals()
+    address = listen or f"tcp/127.0.0.1:{_free_port()}"
+    arguments = ["--prepared", str(directory), "--listen", address, "--started", repr(started)]
+    learner = start("learner", *arguments, *(["--resume"] if resume else []))
+    actors: list[SupervisedActor] = []
+    try:
+        names = [f"actor-{index}" for index in range(spec.collection.actors)]
+        actors += [SupervisedActor(name, address) for name in names]
+        training = spec.training
+        print(
+            f"{spec.environment.id}: {training.algorithm}, seed {training.seed}, {len(actors)} actors"
+            f" x {spec.collection.envs_per_actor} environments at {address}; run directory {directory}",
+            flush=True,
+        )
+        status = _watch(learner, actors, stopping)
+    except ActorFailedError as error:
+        print(f"daedalus train: {error}", file=sys.stderr)
+        status = 1
+    finally:
+        stop([learner, *(actor.process for actor in actors)])
+    if stopping.is_set():
+        print(f"stopped; continue with: daedalus resume {directory}")
+        return 1
+    if status not in (0, 3):
+        return status
+    if not _evaluate(directory):
+        return 1
+    _report(directory, spec)
+    return status
+
+
+def _watch(learner: subprocess.Popen[bytes], actors: list[SupervisedActor], stopping: threading.Event) -> int:
+    """Waits for the learner's end, restarting actors meanwhile; the learner's exit status."""
+    while not stopping.wait(_POLL_SECONDS):
+        status = learner.poll()
+        if status is not None:
+            if status < 0:
+                print(f"daedalus train: the learner was killed by signal {-status}", file=sys.stderr)
+            return status if status >= 0 else 1
+        for actor in actors:
+            news = actor.check()
+            if news:
+                print(f"\n{news}", flush=True)
+    return 1
+
+
+def _evaluate(directory: Path) -> bool:
+    """Plays the greedy episodes in a process of their own; puts their result into summary.json."""
+    began = time.monotonic()
+    command = [sys.executable, "-P", "-m", "actor.evaluator"]
+    finished = subprocess.run(
+        [*command, str(directory), "--json", "--episodes", str(_EVALUATION_EPISODES)],
+        stdout=subprocess.PIPE,
+        check=False,
+    )
+    if finished.returncode != 0:
+        return False
+    evaluation = json.loads(finished.stdout)
+    summary = run_directory.read_json(directory / run_directory.SUMMARY)
+    summary["evaluation_return_mean"] = evaluation["return_mean"]
+    summary["evaluation_return_std"] = evaluation["return_std"]
+    summary["evaluation"] = {**evaluation, "seconds": time.monotonic() - began}
+    run_directory.write_json(directory / run_directory.SUMMARY, summary)
+    return True
+
+
+def _report(directory: Path, spec: RunSpec) -> None:
+    summary: dict[str, Any] = run_directory.read_json(directory / run_directory.SUMMARY)
+    target = spec.training.target_return
+    if summary["solved"]:
+        print(
+            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s, "
+            f"{summary['env_steps']:,} env_steps, {summary['updates']:,} updates"
+        )
+    else:
+        goal = "" if target is None else f" (the target {target:g} was not reached)"
+        print(f"done: {summary['env_steps']:,} env_steps, {summary['updates']:,} updates{goal}")
+    evaluation = summary["evaluation"]
+    print(
+        f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
+        f"over {evaluation['episodes']} greedy episodes"
+    )
+    print(f"all of it lies in {directory}; draw it with: daedalus plot {directory} --output curve.png")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

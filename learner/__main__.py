@@ -1,0 +1,85 @@
+"""`python -m learner`: constructs one learner and runs it.
+
+Exit status: 0 the target was reached or the asked-for steps were done, 3 the budget ended without the target,
+1 failed or stopped early, 2 bad usage.
+"""
+
+import sys
+import time
+
+from learner import run_directory
+from learner.allocator import keep_freed_memory
+from learner.options import LISTEN, learner_parser, resolve
+from learner.progress import Progress
+from learner.service import LearnerService, Outcome
+from learner.settings import SettingsError
+from policy.sealed import DamagedError
+from protocol.process import exit_with_parent, stop_on_signals
+from protocol.spec import RunSpec
+from protocol.transport import TransportError
+from protocol.zenoh_transport import connect, listen
+
+REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
+
+
+def main() -> int:
+    """Runs `daedalus learner`."""
+    started = time.monotonic()
+    arguments = learner_parser().parse_args()
+    keep_freed_memory()
+    stop = stop_on_signals()
+    if arguments.exit_with_parent:
+        exit_with_parent(stop)
+    try:
+        if arguments.prepared:
+            directory, spec = arguments.prepared, run_directory.read_config(arguments.prepared)
+        else:
+            spec, directory = resolve(arguments)
+            run_directory.check_free(directory)
+    except SettingsError as error:
+        print(f"daedalus learner: {error}", file=sys.stderr)
+        return BAD_USAGE
+    progress = Progress(sys.stdout, spec.training.env_steps)
+    try:
+        restored = None
+        if arguments.resume:
+            from learner.checkpoint import load_newest
+
+            restored = load_newest(directory, progress.say)
+        address = arguments.listen or LISTEN
+        transport = connect(arguments.connect) if arguments.connect else listen([address])
+    except (TransportError, DamagedError) as error:
+        print(f"daedalus learner: {error}", file=sys.stderr)
+        return FAILED
+    try:
+        if arguments.prepared is None:
+            run_directory.create(directory, spec)
+            there = ", ".join(arguments.connect) if arguments.connect else address
+            progress.say(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
+            progress.say(f"actors join with: daedalus actor --connect {there}")
+        service = LearnerService(
+            spec,
+            directory,
+            transport,
+            stop,
+            progress,
+            started=arguments.started or started,
+            restored=restored,
+        )
+        return _status(service.run(), spec)
+    except (ValueError, SettingsError) as error:  # a checkpoint of another network, a folder that cannot be made
+        print(f"daedalus learner: {error}", file=sys.stderr)
+        return FAILED
+    finally:
+        transport.close()
+
+
+def _status(outcome: Outcome, spec: RunSpec) -> int:
+    if not outcome.finished:
+        return FAILED
+    wanted = spec.training.target_return is not None and spec.training.stop_when_solved
+    return NOT_REACHED if wanted and not outcome.solved else REACHED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

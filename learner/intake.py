@@ -1,0 +1,121 @@
+"""Bytes -> verdict. Decides what is trained on; somebody else acts on it. No threads, no I/O.
+
+Every rollout is decoded, held against the run's specification, and taken at most once. What is wrong with a bad
+one is the sender's fault: it is named, counted and dropped, and nothing else changes.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from learner.fleet import Actor, Fleet
+from protocol.codec import Limits, ProtocolError, decode
+from protocol.messages import Acknowledgement, Rollout
+from protocol.spec import RunSpec, Spaces
+
+_ROW_BYTES = 1 + 2 + 4 * 4 + 8  # an environment's share of a row without its observation, rounded up
+_SLACK_BYTES = 64 << 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejected:
+    """A rollout never to train on; `cause` is what it is counted under, `reason` what its sender is told."""
+
+    verdict: Literal["rejected", "fenced"]
+    cause: str
+    reason: str
+
+
+class Intake:
+    """Judges rollouts against a run's specification and the fleet's state."""
+
+    def __init__(self, spec: RunSpec, learner_epoch: int, fleet: Fleet) -> None:
+        self._spec = spec
+        self._epoch = learner_epoch
+        self._fleet = fleet
+        # On-policy learning takes nothing but the newest version.
+        self._max_lag = 0 if spec.synchronous else spec.training.max_policy_lag
+
+    def read(self, sender: str, data: bytes) -> Rollout | Rejected:
+        """Decodes what `sender` put on its key, and holds its content against the specification.
+
+        Takes the time it takes, changes nothing, and needs no lock: what it reads of the fleet only ever
+        goes from unknown to known.
+        """
+        spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
+        if spaces is None or actor is None or not actor.environments:
+            return Rejected(verdict="fenced", cause="unknown_actor", reason=f"{sender!r} has not joined")
+        try:
+            rollout = decode(data, self._limits(spaces, actor))
+        except ProtocolError as error:
+            return Rejected(verdict="rejected", cause="malformed", reason=str(error))
+        if not isinstance(rollout, Rollout):
+            return Rejected(verdict="rejected", cause="malformed", reason="not a rollout")
+        fault = self._fault(rollout, spaces, actor)
+        return Rejected(verdict="rejected", cause="malformed", reason=fault) if fault else rollout
+
+    def judge(self, sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
+        """Decides over what `read` returned while the newest version is `policy_version`, and counts it."""
+        verdict = content if isinstance(content, Rejected) else self._judge(sender, content, policy_version)
+        actor = self._fleet.actors.get(sender)
+        if actor is not None:
+            actor.last_seen = now
+            if isinstance(verdict, Rejected):
+                actor.rejected[verdict.cause] += 1
+            else:
+                actor.accepted += 1
+                actor.policy_lag = policy_version - verdict.policy_version
+        return verdict
+
+    def _judge(self, sender: str, rollout: Rollout, policy_version: int) -> Rollout | Rejected:
+        identity = rollout.identity
+        if identity.learner_epoch != self._epoch:
+            return Rejected(verdict="fenced", cause="epoch", reason="meant for another life of the learner")
+        actor = self._fleet.expected(identity)
+        if identity.actor != sender or actor is None:
+            return Rejected(verdict="fenced", cause="unknown_actor", reason="another life of this actor has joined")
+        if identity.sequence in actor.sequences:
+            return Rejected(verdict="rejected", cause="duplicate", reason="was taken before")
+        lag = policy_version - rollout.policy_version
+        if lag < 0:
+            return Rejected(verdict="rejected", cause="malformed", reason="its policy version is yet to come")
+        actor.sequences.add(identity.sequence)
+        if lag > self._max_lag:
+            return Rejected(
+                verdict="rejected",
+                cause="stale",
+                reason=f"policy lag {lag}, at most {self._max_lag} is allowed",
+            )
+        return rollout
+
+    def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
+        """What the specification and the actor's own word allow a rollout to unpack to."""
+        observation = math.prod(spaces.observation.shape) * np.dtype(spaces.observation.dtype).itemsize
+        rows = self._spec.collection.rollout_length + 1
+        return Limits(max_bytes=rows * actor.environments * (observation + _ROW_BYTES) + _SLACK_BYTES, max_arrays=16)
+
+    def _fault(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
+        """What about its content is against the specification, or nothing."""
+        expected = (self._spec.collection.rollout_length + 1, actor.environments, *spaces.observation.shape)
+        if rollout.observations.shape != expected or rollout.observations.dtype != spaces.observation.dtype:
+            return (
+                f"observations are {rollout.observations.dtype} {rollout.observations.shape}, "
+                f"this run has {spaces.observation.dtype} {expected}"
+            )
+        if rollout.actions.min() < 0 or rollout.actions.max() >= spaces.action.count:
+            return f"an action is not one of {spaces.action}"
+        for name in ("observations", "behaviour_log_probs", "rewards", "episode_returns"):
+            if not np.isfinite(getattr(rollout, name)).all():
+                return f"{name} has a value that is not finite"
+        if (rollout.behaviour_log_probs > 1e-4).any():
+            return "a log-probability is above 0"
+        return ""
+
+
+def acknowledgement(verdict: Rollout | Rejected, policy_version: int) -> Acknowledgement:
+    """What to tell the sender."""
+    if isinstance(verdict, Rollout):
+        return Acknowledgement(verdict="accepted", policy_version=policy_version)
+    return Acknowledgement(verdict=verdict.verdict, reason=verdict.reason[:500], policy_version=policy_version)

@@ -1,0 +1,89 @@
+"""The two optimisers, over one flat vector of all parameters.
+
+One vector instead of many small tensors: a step is a handful of operations whatever the network, the gradient's
+norm is one, and a checkpoint is a vector for each statistic. (Torch's own optimisers also load its compiler when
+they are first made, which takes as long as all of a CartPole run.)
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+
+class FlatParameters:
+    """All parameters of a module as views into one vector, and their gradients as views into another."""
+
+    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
+        parameters = list(parameters)
+        self.values = torch.cat([parameter.detach().flatten() for parameter in parameters])  # [P]
+        self.gradients = torch.zeros_like(self.values)  # [P]
+        start = 0
+        for parameter in parameters:
+            end = start + parameter.numel()
+            parameter.data = self.values[start:end].view_as(parameter)
+            parameter.grad = self.gradients[start:end].view_as(parameter)
+            start = end
+
+    def clip_gradients(self, max_norm: float) -> Tensor:
+        """Scales the gradients so that their norm is at most `max_norm`; returns the norm they had."""
+        norm = self.gradients.norm()
+        self.gradients.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
+        return norm
+
+
+class Optimizer(Protocol):
+    """Turns a gradient into a step. Its statistics are tensors, to be saved and restored by name."""
+
+    statistics: dict[str, Tensor]
+
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
+        """Moves `values` [P] in place."""
+        ...
+
+
+class Adam:
+    """Kingma & Ba (2015), algorithm 1, with the usual decays of 0.9 and 0.999."""
+
+    _FIRST, _SECOND = 0.9, 0.999
+
+    def __init__(self, size: int, epsilon: float) -> None:
+        self._epsilon = epsilon
+        self.statistics = {
+            "mean": torch.zeros(size),
+            "square": torch.zeros(size),
+            "steps": torch.zeros((), dtype=torch.int64),
+        }
+
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
+        """See Optimizer."""
+        mean, square, steps = (self.statistics[name] for name in ("mean", "square", "steps"))
+        steps += 1
+        count = int(steps)
+        mean.lerp_(gradients, 1.0 - self._FIRST)
+        square.mul_(self._SECOND).addcmul_(gradients, gradients, value=1.0 - self._SECOND)
+        # Both corrections for starting at zero, moved out of the vectors into two numbers.
+        scale = math.sqrt(1.0 - self._SECOND**count)
+        rate = learning_rate * scale / (1.0 - self._FIRST**count)
+        values.addcdiv_(mean, square.sqrt().add_(self._epsilon * scale), value=-rate)
+
+
+class RmsProp:
+    """RMSProp without momentum: g = a g + (1 - a) d^2, theta = theta - rate d / sqrt(g + epsilon).
+
+    Mnih et al. (2016), equations S2 and S3. The statistics are the paper's shared ones by construction: there is
+    one learner.
+    """
+
+    def __init__(self, size: int, epsilon: float, decay: float) -> None:
+        self._epsilon = epsilon
+        self._decay = decay
+        self.statistics = {"square": torch.zeros(size)}
+
+    def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
+        """See Optimizer."""
+        square = self.statistics["square"]
+        square.mul_(self._decay).addcmul_(gradients, gradients, value=1.0 - self._decay)
+        values.addcdiv_(gradients, square.add(self._epsilon).sqrt_(), value=-learning_rate)

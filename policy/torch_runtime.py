@@ -1,0 +1,35 @@
+"""PolicyRuntime over the torch network itself, for actors that have torch anyway (`--runtime torch`)."""
+
+import numpy as np
+import torch
+
+from policy.network import ActorCritic
+from policy.runtime import PolicyError
+from policy.sampling import greedy_categorical, sample_categorical
+from protocol.spec import PolicySpec, Spaces
+
+
+class TorchRuntime:
+    """Runs the network with torch on one thread."""
+
+    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
+        torch.set_num_threads(1)
+        self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
+        self._acting = [name for name, _ in self._network.named_parameters() if not name.startswith("value_head")]
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """See PolicyRuntime. The value head plays no part in acting and may be absent."""
+        missing = [name for name in self._acting if name not in weights]
+        if missing:
+            raise PolicyError(f"the snapshot lacks the weights {missing[0]!r} of the network")
+        try:
+            # Copied: torch wants memory that it may write to, and a snapshot's is read-only.
+            tensors = {name: torch.from_numpy(array.copy()) for name, array in weights.items()}
+            self._network.load_state_dict(tensors, strict=False)
+        except RuntimeError as error:
+            raise PolicyError(f"weights do not fit the network: {error}") from None
+
+    def act(self, observations: np.ndarray, random: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """See PolicyRuntime."""
+        logits = self._network.act(torch.from_numpy(observations)).numpy()
+        return greedy_categorical(logits) if random is None else sample_categorical(logits, random)

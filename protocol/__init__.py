@@ -1,0 +1,1 @@
+"""What crosses the wire, and nothing else: messages, their bytes, the run's specification, keys, transports."""

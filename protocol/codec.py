@@ -1,0 +1,316 @@
+"""Messages to bytes and back; bytes to messages, or an error that says what is wrong with them.
+
+    offset  bytes
+         0      4  magic b"DAED"
+         4      2  protocol version, little-endian
+         6      2  0: the body is plain, 1: the body is one zstd frame
+         8      4  length of the header, little-endian
+        12      -  header: one msgpack map {"kind", "fields", "arrays", "size"}, padded with zeros to 8
+         -      -  body: the raw little-endian buffers of the arrays, each padded with zeros to 8
+
+The first six bytes keep their meaning in every version, so that two ends of different versions can
+name both. Nothing that is read executes, and no size that a message declares is believed before it
+is held against `Limits`. This file knows no key, no transport and no state.
+"""
+
+import dataclasses
+import functools
+import math
+import struct
+import threading
+import types
+import typing
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+import zstandard
+from pydantic import BaseModel, ValidationError
+
+from protocol.messages import Message, Program, Rollout
+
+PROTOCOL_VERSION = 1
+
+_MAGIC = b"DAED"
+_PREFIX = struct.Struct("<4sHHI")
+_PLAIN, _ZSTD = 0, 1
+_ALIGNMENT = 8
+_DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
+_KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
+_COMPRESSED = (Rollout, Program)  # weights are noise to zstd; the rest is small
+_LEVEL = 1  # higher levels gain a few per cent and cost several times the time
+_MAX_DIMENSIONS = 8
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a message may ask of its reader before anything is known about it.
+
+    Attributes:
+      max_bytes: largest body after decompression; also the largest message.
+      max_header_bytes: largest header.
+      max_arrays: most arrays in one message.
+    """
+
+    max_bytes: int = 64 << 20
+    max_header_bytes: int = 256 << 10
+    max_arrays: int = 4096
+
+
+class ProtocolError(Exception):
+    """The bytes are not a message that this end can accept; the sender's fault."""
+
+
+class VersionMismatchError(ProtocolError):
+    """The other end speaks another version of the protocol."""
+
+    def __init__(self, theirs: int) -> None:
+        super().__init__(
+            f"the other end speaks protocol version {theirs}, this one {PROTOCOL_VERSION}: "
+            "install the same release of daedalus-rl on both"
+        )
+        self.theirs = theirs
+
+
+def encode(message: Message) -> bytes:
+    """The bytes of a message.
+
+    Raises ValueError for an array whose dtype does not travel: a fault of our own.
+    """
+    arrays: list[tuple[str, np.ndarray]] = []
+    fields = _pack(message, "", arrays)
+    body = b"".join(part for name, array in arrays for part in _buffer(name, array))
+    content = {
+        "kind": type(message).__name__,
+        "fields": fields,
+        "arrays": [(name, _travelling(name, array).str, array.shape) for name, array in arrays],
+        "size": len(body),
+    }
+    header = cast(bytes, msgpack.packb(content))
+    flags = _PLAIN
+    if isinstance(message, _COMPRESSED) and body:
+        smaller = _zstd.compressor.compress(body)
+        if len(smaller) < len(body):
+            flags, body = _ZSTD, smaller
+    padding = bytes(-(_PREFIX.size + len(header)) % _ALIGNMENT)
+    return b"".join((_PREFIX.pack(_MAGIC, PROTOCOL_VERSION, flags, len(header)), header, padding, body))
+
+
+def decode(data: bytes, limits: Limits) -> Message:
+    """The message in `data`; its arrays are read-only.
+
+    Raises VersionMismatchError if another version wrote it, ProtocolError if it is anything but one whole,
+    consistent message within `limits`; and nothing else, whatever the bytes.
+    """
+    flags, header, body = _split(data, limits)
+    kind, fields, arrays, size = _read_header(header)
+    if size > limits.max_bytes:
+        raise ProtocolError(f"the body declares {size} bytes, the limit is {limits.max_bytes}")
+    layout = _read_layout(arrays, size, limits)
+    buffers = _read_arrays(layout, _plain_body(flags, body, size))
+    try:
+        message = _unpack(_KINDS[kind], fields, "", buffers)
+    except ValidationError as error:
+        raise ProtocolError(f"{kind}: {error.errors()[0]['msg']}") from None
+    except ValueError as error:
+        raise ProtocolError(f"{kind}: {error}") from None
+    if buffers:
+        raise ProtocolError(f"{kind} has no array {next(iter(buffers))!r}")
+    return message
+
+
+# ------------------------------------------------------------------------------------------- writing
+
+
+def _travelling(name: str, array: np.ndarray) -> np.dtype:
+    dtype = array.dtype.newbyteorder("<")
+    if dtype.str not in _DTYPES:
+        raise ValueError(f"array {name!r} has dtype {array.dtype}, which does not travel")
+    return dtype
+
+
+def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
+    data = np.ascontiguousarray(array, dtype=_travelling(name, array)).tobytes()
+    return data, bytes(-len(data) % _ALIGNMENT)
+
+
+def _pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[str, Any]:
+    packed: dict[str, Any] = {}
+    for name, annotation in _fields(type(value)).items():
+        item = getattr(value, name)
+        if annotation is np.ndarray:
+            arrays.append((path + name, item))
+        elif _is_array_map(annotation):
+            arrays.extend((f"{path}{name}/{key}", array) for key, array in item.items())
+        elif dataclasses.is_dataclass(annotation):
+            packed[name] = _pack(item, f"{path}{name}.", arrays)
+        elif isinstance(item, BaseModel):
+            packed[name] = item.model_dump(mode="json")
+        else:
+            packed[name] = item
+    return packed
+
+
+# ------------------------------------------------------------------------------------------- reading
+
+
+def _split(data: bytes, limits: Limits) -> tuple[int, bytes, memoryview]:
+    if len(data) < _PREFIX.size:
+        raise ProtocolError(f"{len(data)} bytes are too few for a message")
+    magic, version, flags, header_length = _PREFIX.unpack_from(data)
+    if magic != _MAGIC:
+        raise ProtocolError("not a message of this protocol")
+    if version != PROTOCOL_VERSION:
+        raise VersionMismatchError(version)
+    if flags not in (_PLAIN, _ZSTD):
+        raise ProtocolError(f"unknown flags {flags}")
+    if header_length > limits.max_header_bytes:
+        raise ProtocolError(f"the header declares {header_length} bytes, the limit is {limits.max_header_bytes}")
+    if len(data) > limits.max_bytes + header_length + _PREFIX.size + _ALIGNMENT:
+        raise ProtocolError(f"a message of {len(data)} bytes, the limit is {limits.max_bytes}")
+    end = _PREFIX.size + header_length
+    body_start = end + -end % _ALIGNMENT
+    if body_start > len(data):
+        raise ProtocolError("the message ends within its header")
+    return flags, data[_PREFIX.size : end], memoryview(data)[body_start:]
+
+
+def _read_header(header: bytes) -> tuple[str, dict[str, Any], list[Any], int]:
+    try:
+        content = msgpack.unpackb(header, raw=False, strict_map_key=True, max_ext_len=0, max_bin_len=0)
+    except Exception as error:  # msgpack raises ValueError, its own kinds and UnicodeDecodeError alike
+        raise ProtocolError(f"unreadable header: {type(error).__name__}") from None
+    if not isinstance(content, dict) or content.keys() != {"kind", "fields", "arrays", "size"}:
+        raise ProtocolError("the header must have exactly kind, fields, arrays and size")
+    kind, fields, arrays, size = content["kind"], content["fields"], content["arrays"], content["size"]
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise ProtocolError("unknown kind of message")
+    if not isinstance(fields, dict) or not isinstance(arrays, list) or type(size) is not int or size < 0:
+        raise ProtocolError("the header's fields, arrays or size have the wrong type")
+    return kind, fields, arrays, size
+
+
+def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[tuple[str, np.dtype, tuple[int, ...], int]]:
+    """Name, dtype, shape and offset of each array; together they fill the body exactly."""
+    if len(arrays) > limits.max_arrays:
+        raise ProtocolError(f"{len(arrays)} arrays, the limit is {limits.max_arrays}")
+    layout, offset, names = [], 0, set()
+    for entry in arrays:
+        if not isinstance(entry, list) or len(entry) != 3:
+            raise ProtocolError("an array must have a name, a dtype and a shape")
+        name, dtype, shape = entry
+        if not isinstance(name, str) or name in names:
+            raise ProtocolError("array names must be distinct strings")
+        if not isinstance(dtype, str) or dtype not in _DTYPES:
+            raise ProtocolError(f"array {name!r} has a dtype that does not travel")
+        if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
+            raise ProtocolError(f"array {name!r} has no proper shape")
+        if not all(type(side) is int and 0 <= side <= limits.max_bytes for side in shape):
+            raise ProtocolError(f"array {name!r} has no proper shape")
+        layout.append((name, _DTYPES[dtype], tuple(shape), offset))
+        names.add(name)
+        length = math.prod(shape) * _DTYPES[dtype].itemsize
+        offset += length + -length % _ALIGNMENT
+    if offset != size:
+        raise ProtocolError(f"the arrays take {offset} bytes, the body declares {size}")
+    return layout
+
+
+def _plain_body(flags: int, body: memoryview, size: int) -> bytes | memoryview:
+    if flags == _PLAIN:
+        if len(body) != size:
+            raise ProtocolError(f"the body has {len(body)} bytes, it declares {size}")
+        return body
+    try:
+        # python-zstandard ignores max_output_size where the frame declares its size: hold that against ours first.
+        if zstandard.frame_content_size(body) != size:
+            raise ProtocolError("the compressed frame declares another size than the header")
+        plain = _zstd.decompressor.decompress(body, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise ProtocolError(f"unreadable body: {error}") from None
+    if len(plain) != size:
+        raise ProtocolError("the body decompresses to another size than declared")
+    return plain
+
+
+def _read_arrays(
+    layout: list[tuple[str, np.dtype, tuple[int, ...], int]], body: bytes | memoryview
+) -> dict[str, np.ndarray]:
+    arrays = {}
+    for name, dtype, shape, offset in layout:
+        flat = np.frombuffer(body, np.uint8, math.prod(shape) * dtype.itemsize, offset)
+        if dtype == np.bool_ and flat.size and flat.max() > 1:
+            raise ProtocolError(f"array {name!r} has a truth value that is neither 0 nor 1")
+        array = flat.view(dtype).reshape(shape)
+        array.flags.writeable = False
+        arrays[name] = array
+    return arrays
+
+
+def _unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Builds `cls` from header fields and arrays, taking out of `arrays` what it uses."""
+    values: dict[str, Any] = {}
+    expected = _fields(cls)
+    for name, annotation in expected.items():
+        if annotation is np.ndarray:
+            if path + name not in arrays:
+                raise ValueError(f"array {path + name!r} is missing")
+            values[name] = arrays.pop(path + name)
+        elif _is_array_map(annotation):
+            prefix = f"{path}{name}/"
+            found = [key for key in arrays if key.startswith(prefix)]
+            values[name] = {key[len(prefix) :]: arrays.pop(key) for key in found}
+        elif name not in fields:
+            raise ValueError(f"field {path + name!r} is missing")
+        else:
+            values[name] = _value(annotation, fields[name], path + name, arrays)
+    unknown = [name for name in fields if name not in expected]
+    if unknown:
+        raise ValueError(f"unknown field {path + str(unknown[0])!r}")
+    return cls(**values)
+
+
+def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(annotation, types.UnionType):  # `X | None`
+        if item is None:
+            return None
+        annotation = typing.get_args(annotation)[0]
+    if dataclasses.is_dataclass(annotation):
+        if not isinstance(item, dict):
+            raise ValueError(f"field {path!r} must be a map")
+        return _unpack(typing.cast(type, annotation), item, path + ".", arrays)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation.model_validate(item)
+    if typing.get_origin(annotation) is typing.Literal:
+        if not isinstance(item, str) or item not in typing.get_args(annotation):
+            raise ValueError(f"field {path!r} must be one of {', '.join(typing.get_args(annotation))}")
+        return item
+    if type(item) is not annotation:
+        raise ValueError(f"field {path!r} must be {annotation.__name__}, not {type(item).__name__}")
+    if annotation is int and not 0 <= item < 2**63:
+        raise ValueError(f"field {path!r} must be from 0 to 2^63 - 1")
+    return item
+
+
+# --------------------------------------------------------------------------------------------- shared
+
+
+@functools.cache
+def _fields(cls: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _is_array_map(annotation: Any) -> bool:
+    return typing.get_origin(annotation) is dict and typing.get_args(annotation)[1] is np.ndarray
+
+
+class _Zstd(threading.local):
+    """zstd contexts are worth keeping and must not be shared between threads."""
+
+    def __init__(self) -> None:
+        self.compressor = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)
+        self.decompressor = zstandard.ZstdDecompressor(max_window_size=64 << 20)
+
+
+_zstd = _Zstd()

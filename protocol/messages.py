@@ -1,0 +1,166 @@
+"""The vocabulary of the wire: every message that crosses it, as frozen data.
+
+Shapes are checked at construction, so an inconsistent message can neither be sent nor leave the
+decoder. This file does not know how messages become bytes (codec.py), on which key they travel
+(keys.py), nor whether they are welcome (the learner's intake).
+
+Time first: row t holds observation t, the action chosen from it and the reward that action earned.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from protocol.spec import RunSpec, RunStatus, Spaces
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Join:
+    """An actor asks to take part. Actor -> learner, on `join`.
+
+    Sent twice: without spaces it asks what to play; with the spaces that it then found in the
+    environment it asks to be counted in.
+    """
+
+    actor: str  # a name that survives restarts
+    incarnation: int  # this life of the process
+    spaces: Spaces | None = None
+    environments: int = 0  # how many it plays at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Welcome:
+    """What an actor needs to play: learner -> actor, in answer to Join."""
+
+    run: str
+    learner_epoch: int  # this life of the learner; rollouts of another are fenced
+    seed: int  # for this actor's environments and samples, and this life of it only
+    spec: RunSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refusal:
+    """A typed no, in answer to any query."""
+
+    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """The policy's forward pass as an ONNX model without weights, in answer to a `program` query."""
+
+    hash: str  # SHA-256 of `model`, hexadecimal
+    model: np.ndarray  # [bytes] uint8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutIdentity:
+    """Makes a rollout unique: the learner trains on each at most once."""
+
+    actor: str
+    incarnation: int
+    sequence: int  # counts up from 0 within an incarnation and learner epoch
+    learner_epoch: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rollout:
+    """T consecutive rows of E environments under one snapshot. Actor -> learner, on `rollouts/{actor}`.
+
+    Environments reset by gymnasium's NEXT_STEP rule: the row after an episode's end only resets, its
+    action was ignored and it is not `valid`; its observation is the true last one of the episode.
+    """
+
+    identity: RolloutIdentity
+    policy_version: int  # of the behaviour policy
+    observations: np.ndarray  # [T+1, E, *observation_shape]; the last row bootstraps
+    actions: np.ndarray  # [T, E] integers
+    behaviour_log_probs: np.ndarray  # [T, E] float32, log mu(a_t | s_t)
+    rewards: np.ndarray  # [T, E] float32, as learning shall see them (scaled)
+    terminated: np.ndarray  # [T, E] bool, the environment ended the episode
+    truncated: np.ndarray  # [T, E] bool, a limit did
+    valid: np.ndarray  # [T, E] bool, False where the environment only reset
+    episode_returns: np.ndarray  # [K] float32, true undiscounted returns of the episodes that ended here
+    episode_lengths: np.ndarray  # [K] int32, their env_steps
+
+    def __post_init__(self) -> None:
+        if self.actions.ndim != 2:
+            raise ValueError(f"actions must be [T, E], not {self.actions.shape}")
+        rows, environments = self.actions.shape
+        if rows == 0 or environments == 0:
+            raise ValueError("a rollout needs at least one row and one environment")
+        if self.observations.ndim < 3 or self.observations.shape[:2] != (rows + 1, environments):
+            raise ValueError(f"observations must be [{rows + 1}, {environments}, ...], not {self.observations.shape}")
+        for name in ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
+            shape = getattr(self, name).shape
+            if shape != (rows, environments):
+                raise ValueError(f"{name} must be [{rows}, {environments}] like actions, not {shape}")
+        for name in ("terminated", "truncated", "valid"):
+            if getattr(self, name).dtype != np.bool_:
+                raise ValueError(f"{name} must be bool, not {getattr(self, name).dtype}")
+        for name in ("behaviour_log_probs", "rewards", "episode_returns"):
+            if getattr(self, name).dtype != np.float32:
+                raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+        if self.actions.dtype.kind not in "iu" or self.episode_lengths.dtype.kind not in "iu":
+            raise ValueError("actions and episode_lengths must be integers")
+        if self.episode_returns.ndim != 1 or self.episode_returns.shape != self.episode_lengths.shape:
+            raise ValueError("episode_returns and episode_lengths must be [K] alike")
+        if len(self.episode_returns) > rows * environments:
+            raise ValueError("more episodes ended than the rollout has rows")
+
+    @property
+    def rows(self) -> int:
+        """T."""
+        return self.actions.shape[0]
+
+    @property
+    def environments(self) -> int:
+        """E."""
+        return self.actions.shape[1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledgement:
+    """What became of a rollout: learner -> actor.
+
+    accepted: it will be trained on, unless the learner ends first or its policy lag outgrows the bound.
+    busy: the learner has no room now; send it again. rejected: never; `reason` says why.
+    fenced: the rollout belongs to another life of the learner; join again. finished: the run is over.
+    """
+
+    verdict: Literal["accepted", "busy", "rejected", "fenced", "finished"]
+    reason: str = ""
+    policy_version: int = 0  # the newest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Snapshot:
+    """Weights at one policy version, immutable. Learner -> actors, on `snapshots`.
+
+    `program` names the program they bind to; every input of it but the observation is among them.
+    """
+
+    learner_epoch: int
+    policy_version: int
+    program: str
+    weights: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Farewell:
+    """The run is over: learner -> actors, on `snapshots`. Actors leave."""
+
+    learner_epoch: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusReport:
+    """The fleet as the learner sees it, in answer to a `status` query."""
+
+    status: RunStatus
+
+
+Message = Join | Welcome | Refusal | Program | Rollout | Acknowledgement | Snapshot | Farewell | StatusReport

@@ -1,0 +1,215 @@
+"""What the two sides need of a transport, and MemoryTransport, the one for a single process.
+
+    serve / ask / send   queries: a payload goes to whoever serves the key, answers come back
+    publish / follow     the newest value of a key, pushed; only the newest is kept
+    announce / watch     presence: who is there, and who has gone
+
+A transport moves bytes. It knows no message, and its callbacks must only hand over: they run on
+threads that carry everybody else's traffic too.
+"""
+
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+
+class TransportError(Exception):
+    """The transport cannot do what was asked; the message says what to do about it."""
+
+
+class AddressInUseError(TransportError):
+    """Somebody else listens on that address already."""
+
+
+class Request(Protocol):
+    """One query, held by the side that serves it. Answered at most once, from any thread, or dropped."""
+
+    @property
+    def key(self) -> str:
+        """The key that was asked."""
+        ...
+
+    @property
+    def payload(self) -> bytes:
+        """What came with it."""
+        ...
+
+    def reply(self, payload: bytes) -> None:
+        """Answers; later answers are ignored."""
+        ...
+
+
+class Inbox(Protocol):
+    """The newest unread value of a followed key."""
+
+    def take(self) -> bytes | None:
+        """The newest value that was not taken yet, or None. Never waits."""
+        ...
+
+
+class Transport(Protocol):
+    """One end of the network. Safe to use from several threads."""
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> None:
+        """Hands every query for `key` (`*` matches one chunk) to `handler`."""
+        ...
+
+    def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        """Every answer to a query within `timeout` seconds; empty if nobody serves the key."""
+        ...
+
+    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+        """Queries without waiting; `on_answer` gets the first answer, or None, exactly once."""
+        ...
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Pushes a value to all that follow the key; those too slow for it get a later one."""
+        ...
+
+    def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
+        """Follows a key; `on_news` is called when the inbox may have something new."""
+        ...
+
+    def announce(self, key: str) -> None:
+        """Declares presence under `key` until this end closes or dies."""
+        ...
+
+    def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+        """Calls `on_change(key, present)` for all present now and for every change."""
+        ...
+
+    def close(self) -> None:
+        """Ends everything that this end declared. Idempotent."""
+        ...
+
+
+class _MemoryRequest:
+    def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes], None]) -> None:
+        self.key, self.payload = key, payload
+        self._on_answer: Callable[[bytes], None] | None = on_answer
+
+    def reply(self, payload: bytes) -> None:
+        on_answer, self._on_answer = self._on_answer, None
+        if on_answer is not None:
+            on_answer(payload)
+
+
+class _MemoryInbox:
+    def __init__(self, key: str, on_news: Callable[[], None]) -> None:
+        self.key, self.on_news, self.newest = key, on_news, None
+
+    def put(self, payload: bytes) -> None:
+        self.newest: bytes | None = payload
+        self.on_news()
+
+    def take(self) -> bytes | None:
+        newest, self.newest = self.newest, None
+        return newest
+
+
+class MemoryNetwork:
+    """Joins the MemoryTransports made with it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.ends: list[MemoryTransport] = []
+
+
+def _matches(pattern: str, key: str) -> bool:
+    """Whether two keys meet; `*` on either side stands for one chunk."""
+    left, right = pattern.split("/"), key.split("/")
+    return len(left) == len(right) and all(a == b or "*" in (a, b) for a, b in zip(left, right, strict=True))
+
+
+class MemoryTransport:
+    """A Transport within one process: the same promises, no sockets, handlers run on the caller's thread."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self._network = network
+        self._served: dict[str, Callable[[Request], None]] = {}
+        self._inboxes: list[_MemoryInbox] = []
+        self._announced: set[str] = set()
+        self._watches: list[tuple[str, Callable[[str, bool], None]]] = []
+        with network.lock:
+            network.ends.append(self)
+
+    def _ends(self) -> list["MemoryTransport"]:
+        with self._network.lock:
+            return list(self._network.ends)
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> None:
+        """See Transport."""
+        self._served[key] = handler
+
+    def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        """See Transport."""
+        answers: list[bytes] = []
+        answered = threading.Semaphore(0)
+
+        def on_answer(answer: bytes) -> None:
+            answers.append(answer)
+            answered.release()
+
+        handlers = self._handlers(key)
+        for served, handler in handlers:
+            handler(_MemoryRequest(served, payload, on_answer))
+        for _ in handlers:
+            answered.acquire(timeout=timeout)
+        return answers
+
+    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+        """See Transport. An answer that never comes is the server's end closing, so no timer is kept."""
+        handlers = self._handlers(key)
+        if not handlers:
+            on_answer(None)
+        for _, handler in handlers[:1]:
+            handler(_MemoryRequest(key, payload, on_answer))
+
+    def _handlers(self, key: str) -> list[tuple[str, Callable[[Request], None]]]:
+        return [
+            (key if "*" in served else served, handler)
+            for end in self._ends()
+            for served, handler in end._served.items()
+            if _matches(served, key)
+        ]
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """See Transport."""
+        for end in self._ends():
+            for inbox in end._inboxes:
+                if _matches(inbox.key, key):
+                    inbox.put(payload)
+
+    def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
+        """See Transport."""
+        inbox = _MemoryInbox(key, on_news)
+        self._inboxes.append(inbox)
+        return inbox
+
+    def announce(self, key: str) -> None:
+        """See Transport."""
+        self._announced.add(key)
+        self._tell(key, True)
+
+    def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+        """See Transport."""
+        self._watches.append((key, on_change))
+        for end in self._ends():
+            for announced in list(end._announced):
+                if _matches(key, announced):
+                    on_change(announced, True)
+
+    def _tell(self, key: str, present: bool) -> None:
+        for end in self._ends():
+            for pattern, on_change in end._watches:
+                if _matches(pattern, key):
+                    on_change(key, present)
+
+    def close(self) -> None:
+        """See Transport."""
+        with self._network.lock:
+            if self not in self._network.ends:
+                return
+            self._network.ends.remove(self)
+        for key in self._announced:
+            self._tell(key, False)

@@ -1,0 +1,40 @@
+"""An environment that counts, so that a row in the wrong place shows."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+
+class Counting(gymnasium.Env[np.ndarray, np.int64]):
+    """Observation: [episode, step]. Reward: 10 * episode + step + action / 10. Ends at a fixed step.
+
+    `ends` says how each episode ends in turn: a positive number terminates it after so many steps, a negative one
+    truncates it.
+    """
+
+    def __init__(self, ends: tuple[int, ...] = (3, -2, 1)) -> None:
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = gymnasium.spaces.Discrete(4)
+        self._ends = ends
+        self._episode = -1
+        self._step = 0
+
+    def _observe(self) -> np.ndarray:
+        return np.array([self._episode, self._step], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self._episode += 1
+        self._step = 0
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        end = self._ends[self._episode % len(self._ends)]
+        reward = 10.0 * self._episode + self._step + float(action) / 10.0
+        self._step += 1
+        over = self._step == abs(end)
+        return self._observe(), reward, over and end > 0, over and end < 0, {}
+
+
+gymnasium.register("Counting-v0", lambda **kwargs: Counting(**kwargs))

@@ -1,0 +1,75 @@
+"""What goes wrong at the command line: one line that says what to do, and an exit status that is not 0."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import Running
+
+Start = Callable[..., Running]
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["train", "cartpol"], 2, r"unknown preset 'cartpol': did you mean cartpole"),
+        (["train"], 2, r"name a preset \(.*cartpole.*\) or an environment with --env ID"),
+        (
+            ["train", "cartpole", "--set", "training.learning_rat=1"],
+            2,
+            r"did you mean learning_rate",
+        ),
+        (["train", "cartpole", "--set", "training.learning_rate=7"], 2, r"must be above 0 and at most 1"),
+        (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
+        (["train", "cartpole", "--algorithm", "a4c"], 2, r"training.algorithm .*'a2c', 'a3c' or 'impala'"),
+        (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
+        (["train", "nothing.toml"], 2, r"nothing.toml: No such file"),
+        (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
+        (["evaluate", "nowhere"], 1, r"nowhere has no checkpoints"),
+        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere/metrics.csv"),
+        (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
+        (["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"], 1, r"within 0.3 s: is the learner running"),
+        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs must be from 1 to 4096"),
+        (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
+        (["trian"], 2, r"unknown command 'trian': did you mean train"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(
+    start: Start, tmp_path: Path, words: list[str], status: int, message: str
+) -> None:
+    running = start(*words)
+    assert running.wait() == status, running.output
+    running.expect(message)
+    assert len(running.lines) == 1, running.output
+    assert not list(tmp_path.iterdir())  # nothing was begun
+
+
+def test_an_unknown_environment_ends_training_with_near_matches(start: Start) -> None:
+    running = start("train", "--env", "CartPoll-v1", "--run-dir", "run")
+    assert running.wait() == 1
+    running.expect("unknown environment 'CartPoll-v1': did you mean CartPole-v1")
+
+
+def test_a_run_directory_that_exists_is_refused_and_left_alone(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "precious").write_text("kept")
+    running = start("train", "cartpole", "--run-dir", "run")
+    assert running.wait() == 2
+    running.expect("run directory run exists: continue it with `daedalus resume run`")
+    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
+
+
+def test_an_address_in_use_is_told(start: Start, address: str, tmp_path: Path) -> None:
+    first = start("learner", "cartpole", "--listen", address, "--run-dir", "one")
+    first.expect("actors join with")
+    second = start("learner", "cartpole", "--listen", address, "--run-dir", "two")
+    assert second.wait() == 1
+    second.expect(f"address {address} is already in use")
+    assert not (tmp_path / "two").exists()
+
+
+@pytest.mark.parametrize("command", ["train", "resume", "learner", "actor", "evaluate", "status", "plot"])
+def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
+    running = start(command, "--help")
+    assert running.wait() == 0
+    running.expect("examples:")

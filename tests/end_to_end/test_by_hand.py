@@ -1,0 +1,105 @@
+"""Learner and actors started by hand, in any order, over a real router."""
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import Running, until
+
+Start = Callable[..., Running]
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+
+
+@pytest.fixture
+def status(start: Start, address: str) -> Callable[[], dict | None]:
+    """Asks the learner for its status; None while it does not answer."""
+
+    def ask() -> dict | None:
+        running = start("status", "--connect", address, "--json")
+        return json.loads(running.output) if running.wait() == 0 else None
+
+    return ask
+
+
+def env_steps(status: dict | None, actor: str) -> int:
+    return next((entry["env_steps"] for entry in (status or {"actors": []})["actors"] if entry["actor"] == actor), 0)
+
+
+def test_an_actor_that_starts_first_waits_and_says_so(start: Start, address: str) -> None:
+    actor = start("actor", "--connect", address, "--name", "early")
+    actor.expect("waiting for the learner")
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000)
+    actor.expect("joined run 'run' as 'early': 64 x CartPole-v1")
+    assert learner.wait() == 3, learner.output
+    assert actor.wait() == 0, actor.output
+    actor.expect("the run is over")
+
+
+def test_an_actor_that_joins_late_contributes(start: Start, address: str, status: Callable[[], dict | None]) -> None:
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+    start("actor", "--connect", address, "--name", "first")
+    learner.expect(r"updates .*/s")
+    start("actor", "--connect", address, "--name", "late", "--envs", 8, "--runtime", "torch")
+    until(lambda: env_steps(status(), "late") > 0)
+    report = status()
+    assert report is not None
+    assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 64, "late": 8}
+    learner.process.terminate()
+    assert learner.wait() == 1
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "impala"])
+def test_a_killed_actor_does_not_stop_the_others(
+    start: Start, address: str, status: Callable[[], dict | None], algorithm: str
+) -> None:
+    learner = start("learner", "cartpole", "--algorithm", algorithm, "--listen", address, "--run-dir", "run", *ENDLESS)
+    victim = start("actor", "--connect", address, "--name", "victim")
+    start("actor", "--connect", address, "--name", "other")
+    until(lambda: env_steps(status(), "victim") > 0 and env_steps(status(), "other") > 0)
+    os.kill(victim.process.pid, signal.SIGKILL)
+    victim.wait()
+    before = status()
+    assert before is not None
+    until(lambda: env_steps(status(), "other") > env_steps(before, "other") + 10_000)
+    after = status()
+    assert after is not None
+    assert [entry["alive"] for entry in after["actors"] if entry["actor"] == "victim"] == [False]
+    assert learner.process.poll() is None
+
+
+def test_actors_find_a_learner_that_was_restarted(start: Start, address: str, tmp_path: Path) -> None:
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+    actor = start("actor", "--connect", address, "--name", "loyal")
+    learner.expect(r"updates .*/s")
+    learner.process.kill()
+    learner.wait()
+    actor.expect("the learner went away")
+    second = start("learner", "cartpole", "--listen", address, "--run-dir", "run-2", "--env-steps", 30000)
+    assert second.wait() == 3, second.output
+    assert actor.wait() == 0, actor.output
+    assert sum("joined run" in line for line in actor.lines) == 2
+
+
+def test_an_actor_carries_no_torch_and_stays_small(start: Start, address: str) -> None:
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
+    actor = start("actor", "--connect", address, "--name", "thin")
+    learner.expect(r"updates .*/s")
+    maps = Path(f"/proc/{actor.process.pid}/maps").read_text()
+    assert "onnxruntime" in maps
+    assert "libtorch" not in maps
+    resident = next(
+        int(line.split()[1])
+        for line in Path(f"/proc/{actor.process.pid}/status").read_text().splitlines()
+        if line.startswith("VmRSS")
+    )
+    assert resident <= 150 * 1024
+
+
+def test_sigterm_ends_an_actor_in_good_order(start: Start, address: str) -> None:
+    waiting = start("actor", "--connect", address, "--name", "waiting")
+    waiting.expect("waiting for the learner")
+    waiting.process.terminate()
+    assert waiting.wait() == 0

@@ -1,0 +1,68 @@
+"""a2c over processes is the same computation as a2c in one."""
+
+import io
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from conftest import LIMIT, Running
+
+from actor.service import ActorConfig, ActorService
+from learner import run_directory
+from learner.progress import Progress
+from learner.service import LearnerService, Outcome
+from learner.settings import override, read_preset, run_spec
+from protocol.spec import RunSpec
+from protocol.transport import MemoryNetwork, MemoryTransport
+
+SETTINGS = ("training.algorithm='a2c'", "training.env_steps=40000", "training.stop_when_solved=false")
+
+
+def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
+    """A learner and actors as threads of this process, over the memory transport."""
+    network, stop = MemoryNetwork(), threading.Event()
+    run_directory.create(directory, spec)
+    service = LearnerService(
+        spec, directory, MemoryTransport(network), stop, Progress(io.StringIO(), spec.training.env_steps), started=0.0
+    )
+    outcomes: list[Outcome] = []
+    threads = [threading.Thread(target=lambda: outcomes.append(service.run()), daemon=True)]
+    for index in range(spec.collection.actors):
+        config = ActorConfig(name=f"actor-{index}", incarnation=index)
+        actor = ActorService(config, MemoryTransport(network), stop, lambda _text: None)
+        threads.append(threading.Thread(target=actor.run, daemon=True))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(LIMIT)
+        assert not thread.is_alive()
+    return outcomes[0]
+
+
+def checkpoint_files(directory: Path) -> dict[str, bytes]:
+    (checkpoint,) = (directory / "checkpoints").iterdir()
+    return {entry.name: entry.read_bytes() for entry in checkpoint.iterdir() if entry.suffix == ".safetensors"}
+
+
+def test_a2c_over_processes_gives_bit_for_bit_the_weights_of_one_process(
+    start: Callable[..., Running], tmp_path: Path
+) -> None:
+    settings = read_preset("cartpole")
+    override(settings, SETTINGS)
+    assert train_in_one_process(run_spec(settings), tmp_path / "one").finished
+    words = [word for setting in SETTINGS for word in ("--set", setting)]
+    running = start("train", "cartpole", *words, "--run-dir", "many")
+    assert running.wait() == 0, running.output
+    one, many = checkpoint_files(tmp_path / "one"), checkpoint_files(tmp_path / "many")
+    assert one.keys() == {"parameters.safetensors", "learner.safetensors"}
+    assert one == many
+
+
+def test_another_seed_gives_other_weights(tmp_path: Path) -> None:
+    """The test above could not fail if nothing depended on anything."""
+    settings = read_preset("cartpole")
+    override(settings, (*SETTINGS, "training.env_steps=4000"))
+    train_in_one_process(run_spec(settings), tmp_path / "one")
+    override(settings, ("training.seed=2",))
+    train_in_one_process(run_spec(settings), tmp_path / "two")
+    assert checkpoint_files(tmp_path / "one") != checkpoint_files(tmp_path / "two")

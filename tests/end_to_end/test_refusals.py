@@ -1,0 +1,88 @@
+"""Actors that do not fit, and bytes that no actor of ours sent, against a real learner over a real router."""
+
+import struct
+from collections.abc import Callable, Iterator
+
+import pytest
+from conftest import Running, until
+
+from protocol import keys
+from protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
+from protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
+from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from protocol.transport import Transport
+from protocol.zenoh_transport import connect
+
+CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def stranger(start: Start, address: str) -> Iterator[Transport]:
+    """A client of a learner that runs and has an actor already."""
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
+    learner.expect("actors join with")
+    transport = connect([address])
+    try:
+        until(lambda: transport.ask(keys.join("run"), timeout=30.0))  # the last key that is served
+        yield transport
+        assert learner.process.poll() is None, learner.output
+    finally:
+        transport.close()
+
+
+def ask(transport: Transport, key: str, payload: bytes) -> Message:
+    (answer,) = transport.ask(key, payload, timeout=30.0)
+    return decode(answer, Limits())
+
+
+def join(**kwargs: object) -> bytes:
+    return encode(Join(actor="stranger", incarnation=1, **kwargs))  # type: ignore[arg-type]
+
+
+def test_another_protocol_version_is_refused_with_both_named(stranger: Transport) -> None:
+    other = bytearray(join())
+    struct.pack_into("<H", other, 4, 7)
+    answer = ask(stranger, keys.join("run"), bytes(other))
+    assert isinstance(answer, Refusal)
+    assert answer.code == "mismatch"
+    assert "protocol version 7" in answer.reason
+    assert f"this one {PROTOCOL_VERSION}" in answer.reason
+
+
+def test_mismatching_spaces_are_refused_with_both_named(stranger: Transport) -> None:
+    first = ask(stranger, keys.join("*"), join(spaces=CARTPOLE, environments=2))
+    assert isinstance(first, Welcome)
+    other = CARTPOLE.model_copy(update={"action": ChoiceSpace(count=3)})
+    answer = ask(stranger, keys.join("run"), join(spaces=other, environments=2))
+    assert isinstance(answer, Refusal)
+    assert "3 choices" in answer.reason
+    assert "2 choices" in answer.reason
+
+
+def test_the_learner_survives_bytes_of_any_kind_on_every_key(stranger: Transport) -> None:
+    for payload in (b"", b"\x00", b"DAED", b"\xff" * 5000, join()[:-3]):
+        for key in (
+            keys.join("run"),
+            keys.rollouts("run", "x"),
+            keys.program("run", "x"),
+            keys.snapshots("run"),
+            keys.status("run"),
+        ):
+            ask(stranger, key, payload)
+        stranger.publish(keys.snapshots("run"), payload)
+    answer = ask(stranger, keys.rollouts("run", "stranger"), b"\xff")
+    assert isinstance(answer, Acknowledgement)
+    assert answer.verdict == "fenced"
+    ask(stranger, keys.join("run"), join(spaces=CARTPOLE, environments=2))
+    answer = ask(stranger, keys.rollouts("run", "stranger"), b"\xff")
+    assert isinstance(answer, Acknowledgement)
+    assert answer.verdict == "rejected"
+
+
+def test_a_refused_actor_says_why_and_ends(start: Start, stranger: Transport, address: str) -> None:
+    other = CARTPOLE.model_copy(update={"action": ChoiceSpace(count=3)})
+    ask(stranger, keys.join("run"), join(spaces=other, environments=2))
+    actor = start("actor", "--connect", address)
+    assert actor.wait() == 1
+    actor.expect("the learner refused this actor: its environment has .*2 choices; this run has .*3 choices")

@@ -1,0 +1,165 @@
+"""`daedalus train` from the command to the summary, with real processes over a real router."""
+
+import csv
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from conftest import Running, processes_mentioning, until
+
+Start = Callable[..., Running]
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+
+
+def summary(directory: Path) -> dict:
+    return json.loads((directory / "summary.json").read_text())
+
+
+def newest_checkpoint(directory: Path) -> Path:
+    return max((directory / "checkpoints").iterdir())
+
+
+def nobody_listens(output: str) -> bool:
+    port = int(output.split("tcp/127.0.0.1:")[1].split(";")[0])
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run of the main job, to its end; several tests look at it."""
+    folder = tmp_path_factory.mktemp("solved")
+    words = ["-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
+    running = Running([sys.executable, *words, "train", "cartpole", "--run-dir", "solved-run"], folder)
+    try:
+        assert running.wait() == 0, running.output
+    finally:
+        running.end()
+    return folder / "solved-run", running.output
+
+
+def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
+    directory, output = solved
+    result = summary(directory)
+    assert result["solved"] is True
+    assert result["episode_return_mean"] >= 475
+    assert result["evaluation_return_mean"] >= 475
+    assert 0 < result["seconds_to_target"] <= result["wall_seconds"]
+    assert result["rollouts_rejected"] == {}
+    assert result["snapshots_published"] == result["updates"] + 1
+    assert "solved: mean return 475 reached" in output
+    assert "evaluation: return" in output
+
+
+def test_summary_counts_agree_with_each_other(solved: tuple[Path, str]) -> None:
+    result = summary(solved[0])
+    assert result["env_steps"] <= result["rollouts_accepted"] * 64 * 16
+    assert 0 <= result["policy_lag_mean"] <= result["policy_lag_max"] <= 32
+    assert 1 < result["rollout_bytes_per_env_step"] < 30
+    assert result["env_steps_per_second"] > 0
+
+
+def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
+    directory, _ = solved
+    names = {entry.name.split(".out.")[0] for entry in directory.iterdir()}
+    assert names == {"config.toml", "versions.json", "metrics.csv", "events", "checkpoints", "summary.json"}
+    rows = list(csv.DictReader((directory / "metrics.csv").open()))
+    assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
+    assert float(rows[-1]["entropy"]) > 0
+
+
+def test_nothing_is_left_behind(solved: tuple[Path, str]) -> None:
+    assert not processes_mentioning("solved-run")
+    assert nobody_listens(solved[1])
+
+
+def test_evaluate_plays_a_finished_run(solved: tuple[Path, str], start: Start) -> None:
+    running = start("evaluate", solved[0], "--episodes", 7, "--seed", 3, "--json")
+    assert running.wait() == 0, running.output
+    result = json.loads(running.output)
+    assert result["episodes"] == 7
+    assert result["return_mean"] > 400
+
+
+def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: Path) -> None:
+    running = start("plot", solved[0], "--output", "curve.png")
+    assert running.wait() == 0, running.output
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_resume_continues_exactly(solved: tuple[Path, str], start: Start, tmp_path: Path) -> None:
+    """With the budget used up already, what is loaded is saved again: all of it must be as it was."""
+    first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run")
+    assert first.wait() == 3, first.output  # the budget ended without the target
+    before = newest_checkpoint(tmp_path / "run")
+    files = {name: (before / name).read_bytes() for name in ("learner.safetensors", "parameters.safetensors")}
+    steps = summary(tmp_path / "run")["env_steps"]
+
+    idle = start("resume", "run")
+    assert idle.wait() == 3, idle.output
+    again = newest_checkpoint(tmp_path / "run")
+    assert again.name == before.name
+    assert {name: (again / name).read_bytes() for name in files} == files
+    assert summary(tmp_path / "run")["env_steps"] == steps
+
+    further = start("resume", "run", "--env-steps", 60000)
+    assert further.wait() == 3, further.output
+    result = summary(tmp_path / "run")
+    assert result["env_steps"] >= 60000
+    assert int(newest_checkpoint(tmp_path / "run").name) == result["updates"] > int(before.name)
+    rows = list(csv.DictReader((tmp_path / "run" / "metrics.csv").open()))
+    assert [int(row["env_steps"]) for row in rows] == sorted(int(row["env_steps"]) for row in rows)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_everything_with_a_checkpoint(start: Start, tmp_path: Path, number: signal.Signals) -> None:
+    running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS)
+    running.expect(r"updates .*/s")
+    running.process.send_signal(number)
+    assert running.wait() == 1
+    running.expect("continue with: daedalus resume stopped-run")
+    assert newest_checkpoint(tmp_path / "stopped-run").name.isdigit()
+    assert not processes_mentioning("stopped-run")
+    assert nobody_listens(running.output)
+
+
+def test_children_do_not_outlive_a_killed_launcher(start: Start) -> None:
+    running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
+    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    running.expect(r"updates .*/s")
+    running.process.kill()
+    until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))
+
+
+def test_a_killed_actor_is_replaced_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
+    running = start(
+        "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 1_500_000
+    )
+    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    running.expect(r"updates .*/s")
+    (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
+    os.kill(victim, signal.SIGKILL)
+    running.expect("actor-1 was killed by signal 9; started again")
+    assert running.wait() == 0, running.output
+    result = summary(tmp_path / "run")
+    assert result["env_steps"] >= 1_500_000
+    assert result["solved"]
+
+
+def test_an_environment_of_the_users_own_is_found_in_the_working_directory(start: Start, tmp_path: Path) -> None:
+    source = (Path(__file__).parent.parent / "counting_environment.py").read_text()
+    (tmp_path / "my_module.py").write_text(source)
+    running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, "--run-dir", "own")
+    assert running.wait() == 0, running.output
+    result = summary(tmp_path / "own")
+    assert result["env_steps"] >= 2000
+    assert result["solved"] is False
+    parameters = safetensors.numpy.load_file(newest_checkpoint(tmp_path / "own") / "parameters.safetensors")
+    assert all(np.isfinite(array).all() for array in parameters.values())

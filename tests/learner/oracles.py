@@ -1,0 +1,76 @@
+"""The papers' sums written out, in plain Python, for one environment of one rollout. Slow and obvious.
+
+gamma is the discount factor, V the values [T+1] and r the rewards [T], as in the papers. Rows that only reset are
+no part of any sum: an episode's rows end where it ends.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stream:
+    """The rows of one environment."""
+
+    r: Sequence[float]  # [T]
+    V: Sequence[float]  # [T+1]
+    log_ratios: Sequence[float]  # [T], log pi - log mu
+    terminated: Sequence[bool]  # [T]
+    truncated: Sequence[bool]  # [T]
+    valid: Sequence[bool]  # [T]
+
+    @property
+    def rows(self) -> list[int]:
+        """The rows that count."""
+        return [t for t in range(len(self.r)) if self.valid[t]]
+
+
+def horizon(x: Stream, t: int) -> int:
+    """h: rows t to h - 1 are what the rollout holds of t's episode from t on."""
+    ends = [k for k in range(t, len(x.r)) if x.terminated[k] or x.truncated[k]]
+    return ends[0] + 1 if ends else len(x.r)
+
+
+def bootstrap(x: Stream, k: int) -> float:
+    """V(s_k), which is 0 where the environment ended the episode at row k - 1."""
+    return 0.0 if x.terminated[k - 1] else x.V[k]
+
+
+def n_step_return(x: Stream, gamma: float, t: int, n: int) -> float:
+    """G_{t:t+n} = r_t + gamma r_{t+1} + ... + gamma^n V(s_{t+n}). Sutton & Barto (2018), equation 7.1."""
+    h = min(t + n, horizon(x, t))
+    return math.fsum(gamma ** (k - t) * x.r[k] for k in range(t, h)) + gamma ** (h - t) * bootstrap(x, h)
+
+
+def lambda_return(x: Stream, gamma: float, lam: float, t: int) -> float:
+    """G_t = (1 - lambda) sum_n lambda^(n-1) G_{t:t+n} + lambda^(h-t-1) G_{t:h}. Sutton & Barto (2018), 12.3."""
+    last = horizon(x, t) - t
+    shorter = (1.0 - lam) * math.fsum(lam ** (n - 1) * n_step_return(x, gamma, t, n) for n in range(1, last))
+    return shorter + lam ** (last - 1) * n_step_return(x, gamma, t, last)
+
+
+def rho(x: Stream, t: int, clip: float) -> float:
+    return min(clip, math.exp(x.log_ratios[t]))
+
+
+def vtrace(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s: int) -> float:
+    """v_s = V(x_s) + sum_t gamma^(t-s) (prod_{i=s}^{t-1} c_i) delta_t V. Espeholt et al. (2018), equation 1."""
+
+    def delta(t: int) -> float:
+        return rho(x, t, rho_bar) * (x.r[t] + gamma * bootstrap(x, t + 1) - x.V[t])
+
+    def c(i: int) -> float:
+        return lam * rho(x, i, c_bar)  # remark 2
+
+    return x.V[s] + math.fsum(
+        gamma ** (t - s) * math.prod(c(i) for i in range(s, t)) * delta(t) for t in range(s, horizon(x, s))
+    )
+
+
+def vtrace_advantage(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s: int) -> float:
+    """rho_s (r_s + gamma v_{s+1} - V(x_s)), section 4.2; v_{s+1} mixed with V(x_{s+1}) by lambda."""
+    inside = s + 1 < horizon(x, s)
+    following = vtrace(x, gamma, lam, rho_bar, c_bar, s + 1) if inside else bootstrap(x, s + 1)
+    mixed = (1.0 - lam) * bootstrap(x, s + 1) + lam * following
+    return rho(x, s, rho_bar) * (x.r[s] + gamma * mixed - x.V[s])

@@ -1,0 +1,175 @@
+"""learner/fleet.py: who takes part, under which identity, and what was taken of them."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+from building import SPACES, identity, joined_fleet
+
+from learner.fleet import Fleet, SequenceWindow
+from protocol.messages import Join
+from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+
+WINDOW = 1024
+HUGE = 2**62
+
+
+class NaiveWindow:
+    """Every number ever taken, in one set."""
+
+    def __init__(self) -> None:
+        self.taken: set[int] = set()
+
+    @property
+    def low(self) -> int:
+        """All below are taken or given up for lost."""
+        return max(0, max(self.taken, default=-1) - WINDOW + 1)
+
+    def __contains__(self, sequence: int) -> bool:
+        return sequence in self.taken or sequence < self.low
+
+    @property
+    def gaps(self) -> int:
+        return self.low - sum(sequence < self.low for sequence in self.taken)
+
+
+NEAR = st.integers(0, 40)
+ANYWHERE = st.one_of(NEAR, NEAR, st.integers(0, 3000), st.sampled_from([HUGE, HUGE - 1, HUGE - WINDOW, 2**63 - 1]))
+
+
+@given(st.lists(st.tuples(ANYWHERE, st.booleans()), max_size=60))
+def test_the_window_takes_what_a_set_of_all_numbers_would(steps: list[tuple[int, bool]]) -> None:
+    window, naive, last = SequenceWindow(), NaiveWindow(), 0
+    for number, from_here in steps:
+        sequence = min(last + number if from_here else number, 2**63 - 1)
+        last = sequence
+        assert (sequence in window) == (sequence in naive)
+        if sequence not in window:
+            window.add(sequence)
+            naive.taken.add(sequence)
+        assert sequence in window
+        assert window.gaps == naive.gaps
+    for probe in {probe for taken in naive.taken for probe in (taken - WINDOW, taken - 1, taken + 1) if probe >= 0}:
+        assert (probe in window) == (probe in naive)
+
+
+def test_the_window_remembers_no_more_than_it_may_reorder() -> None:
+    window = SequenceWindow()
+    for sequence in range(0, 20 * WINDOW, 2):  # every second one is lost
+        window.add(sequence)
+    assert len(window._above) <= WINDOW
+    in_order = SequenceWindow()
+    for sequence in range(20 * WINDOW):
+        in_order.add(sequence)
+    assert (in_order.low, in_order.gaps, len(in_order._above)) == (20 * WINDOW, 0, 0)
+
+
+def test_a_huge_jump_gives_up_all_that_was_passed() -> None:
+    window = SequenceWindow()
+    window.add(3)
+    window.add(HUGE)
+    assert window.gaps == HUGE - WINDOW + 1 - 1
+    assert HUGE - WINDOW in window
+    assert HUGE - WINDOW + 1 not in window
+
+
+# --------------------------------------------------------------------------------------------- joining
+
+OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=ChoiceSpace(count=2))
+
+
+def test_the_first_actor_with_spaces_decides_them() -> None:
+    fleet = Fleet(1, None)
+    assert fleet.join(Join(actor="a", incarnation=1), 0.0) is None
+    assert fleet.spaces is None
+    assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 0.0) is None
+    assert fleet.spaces == SPACES
+
+
+def test_other_spaces_are_refused_and_both_are_named() -> None:
+    fleet = joined_fleet("a")
+    refusal = fleet.join(Join(actor="b", incarnation=1, spaces=OTHER, environments=1), 0.0)
+    assert refusal is not None
+    assert refusal.code == "mismatch"
+    assert str(OTHER) in refusal.reason
+    assert str(SPACES) in refusal.reason
+    assert fleet.spaces == SPACES
+    assert "b" not in fleet.actors
+
+
+def test_the_spaces_of_a_checkpoint_hold() -> None:
+    refusal = Fleet(1, SPACES).join(Join(actor="a", incarnation=1, spaces=OTHER, environments=1), 0.0)
+    assert refusal is not None
+    assert refusal.code == "mismatch"
+
+
+def test_a_number_of_environments_out_of_range_is_refused() -> None:
+    for environments in (0, 4097, 2**62):
+        fleet = Fleet(1, None)
+        refusal = fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=environments), 0.0)
+        assert refusal is not None
+        assert refusal.code == "malformed"
+        assert (fleet.spaces, fleet.actors) == (None, {})
+
+
+def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected() -> None:
+    fleet = joined_fleet("a")
+    actor = fleet.expected(identity("a"))
+    assert actor is fleet.actors["a"]
+    actor.sequences.add(0)
+    assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
+    assert fleet.expected(identity("a")) is None
+    assert fleet.expected(identity("a", incarnation=2)) is None  # not before it has told its spaces
+    assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=3), 0.0) is None
+    assert fleet.expected(identity("a")) is None
+    assert fleet.expected(identity("a", incarnation=2)) is actor
+    assert 0 not in actor.sequences
+    assert actor.lives == 2
+
+
+def test_joining_again_in_the_same_life_forgets_nothing() -> None:
+    fleet = joined_fleet("a")
+    fleet.actors["a"].sequences.add(0)
+    assert fleet.join(Join(actor="a", incarnation=1), 1.0) is None
+    assert 0 in fleet.actors["a"].sequences
+    assert fleet.actors["a"].lives == 1
+    assert fleet.expected(identity("a")) is not None
+
+
+def test_an_actor_never_heard_of_is_not_expected() -> None:
+    assert joined_fleet("a").expected(identity("b")) is None
+
+
+def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
+    fleet = joined_fleet("a", "b")
+    fleet.join(Join(actor="c", incarnation=1), 0.0)
+    fleet.set_present("c", True)
+    fleet.set_present("d", True)
+    fleet.join(Join(actor="e", incarnation=1, spaces=SPACES, environments=1), 0.0)
+    assert fleet.live == {"a", "b"}
+    fleet.set_present("a", False)
+    assert fleet.live == {"b"}
+
+
+def test_seeds_differ_by_actor_life_start_and_run_and_are_otherwise_the_same() -> None:
+    def seeds(run_seed: int) -> dict[tuple[str, int, int], int]:
+        fleet = Fleet(run_seed, None)
+        found = {}
+        for life in (1, 2):
+            for name in ("a", "b"):
+                fleet.join(Join(actor=name, incarnation=life), 0.0)
+                for start in (0, 500):
+                    found[name, life, start] = fleet.seed_for(name, start)
+        return found
+
+    assert seeds(1) == seeds(1)
+    assert len({*seeds(1).values(), *seeds(2).values()}) == 16
+
+
+def test_statuses_tell_of_each_actor_by_name() -> None:
+    fleet = joined_fleet("b", "a")
+    fleet.actors["b"].rejected["stale"] += 2
+    fleet.actors["b"].accepted = 5
+    fleet.set_present("b", False)
+    first, second = fleet.statuses(3.0)
+    assert (first.actor, first.alive, first.seconds_since_seen, first.environments) == ("a", True, 3.0, 3)
+    assert (second.actor, second.alive, second.rollouts_accepted) == ("b", False, 5)
+    assert second.rollouts_rejected == {"stale": 2}

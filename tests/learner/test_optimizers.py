@@ -1,0 +1,97 @@
+"""learner/optimizers.py against torch's own, and against the paper's formula written out."""
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import nn
+from torch.testing import assert_close
+
+from learner.optimizers import Adam, FlatParameters, RmsProp
+
+
+def network() -> nn.Sequential:
+    torch.manual_seed(3)
+    return nn.Sequential(nn.Linear(4, 5), nn.Tanh(), nn.Linear(5, 2))
+
+
+def gradients(steps: int, size: int) -> list[torch.Tensor]:
+    """Of very different sizes, and none in some places for a while."""
+    random = torch.Generator().manual_seed(9)
+    scales = 10.0 ** torch.linspace(-6.0, 2.0, size)
+    return [
+        torch.randn(size, generator=random) * scales * (torch.rand(size, generator=random) > 0.2) for _ in range(steps)
+    ]
+
+
+@pytest.mark.parametrize("epsilon", [1e-8, 1e-5, 1e-2])
+def test_adam_is_torchs_adam(epsilon: float) -> None:
+    size = 40
+    ours = torch.linspace(-1.0, 1.0, size)
+    theirs = nn.Parameter(ours.clone())
+    adam, reference = Adam(size, epsilon), torch.optim.Adam([theirs], eps=epsilon)
+    for step, gradient in enumerate(gradients(200, size)):
+        rate = 1e-2 * (1.0 - step / 200)
+        adam.step(ours, gradient, rate)
+        reference.param_groups[0]["lr"] = rate
+        theirs.grad = gradient.clone()
+        reference.step()
+        assert_close(ours, theirs.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_rmsprop_has_its_epsilon_inside_the_root() -> None:
+    size, epsilon, decay, rate = 6, 1e-1, 0.9, 0.01
+    ours = torch.linspace(-1.0, 1.0, size)
+    theta, g = ours.tolist(), [0.0] * size
+    rmsprop = RmsProp(size, epsilon, decay)
+    for gradient in gradients(50, size):
+        rmsprop.step(ours, gradient, rate)
+        for i, d in enumerate(gradient.tolist()):
+            g[i] = decay * g[i] + (1.0 - decay) * d * d
+            theta[i] -= rate * d / math.sqrt(g[i] + epsilon)
+        assert ours.tolist() == pytest.approx(theta, rel=1e-5, abs=1e-6)
+
+
+def test_flat_parameters_keep_the_values() -> None:
+    module, same = network(), network()
+    FlatParameters(module.parameters())
+    for ours, theirs in zip(module.parameters(), same.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_the_module_sees_a_step_in_the_flat_vector() -> None:
+    module, observations = network(), torch.ones(3, 4)
+    flat = FlatParameters(module.parameters())
+    before = module(observations)
+    flat.values.zero_()
+    assert torch.equal(module(observations), torch.zeros_like(before))
+    flat.values[-2:] = torch.tensor([7.0, 8.0])  # the last bias
+    assert torch.equal(module(observations), torch.tensor([7.0, 8.0]).expand(3, 2))
+
+
+def test_backward_fills_the_flat_gradients_again_and_again() -> None:
+    module = network()
+    reference = copy.deepcopy(module)
+    flat = FlatParameters(module.parameters())
+    for scale in (1.0, -3.0):
+        flat.gradients.zero_()
+        (scale * module(torch.ones(3, 4))).square().sum().backward()
+        reference.zero_grad()
+        (scale * reference(torch.ones(3, 4))).square().sum().backward()
+        expected = [parameter.grad.flatten() for parameter in reference.parameters() if parameter.grad is not None]
+        assert_close(flat.gradients, torch.cat(expected))
+
+
+@pytest.mark.parametrize("max_norm", [0.5, 1e6])
+def test_clipping_is_torchs(max_norm: float) -> None:
+    module = network()
+    reference = copy.deepcopy(module)
+    flat = FlatParameters(module.parameters())
+    for each in (module, reference):
+        each(torch.ones(3, 4)).square().sum().mul(10.0).backward()
+    norm = nn.utils.clip_grad_norm_(reference.parameters(), max_norm)
+    assert_close(flat.clip_gradients(max_norm), norm)
+    for ours, theirs in zip(module.parameters(), reference.parameters(), strict=True):
+        assert ours.grad is not None
+        assert_close(ours.grad, theirs.grad)

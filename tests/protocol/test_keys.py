@@ -1,0 +1,45 @@
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from protocol import keys
+
+names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", fullmatch=True)
+offline = settings(max_examples=50, deadline=None, derandomize=True)
+
+
+@offline
+@given(name=names)
+def test_a_good_name_is_returned_as_it_is(name: str) -> None:
+    assert keys.check_name(name, "run") == name
+
+
+@pytest.mark.parametrize(
+    "name", ["", "a/b", "*", "a*", "**", "$", "a$", "-a", ".a", "_a", "a b", "a\n", "é", "a?", "a#", "x" * 65]
+)
+def test_a_name_that_cannot_be_one_chunk_of_a_key_is_refused_by_what_it_is(name: str) -> None:
+    with pytest.raises(ValueError, match="actor name"):
+        keys.check_name(name, "actor name")
+
+
+@offline
+@given(run=names, actor=names)
+def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) -> None:
+    made = [
+        keys.join(run),
+        keys.program(run, actor),
+        keys.rollouts(run, actor),
+        keys.snapshots(run),
+        keys.presence(run, actor),
+        keys.learner(run),
+        keys.status(run),
+    ]
+    assert len(set(made)) == len(made)
+    assert all(key.startswith(f"daedalus/{run}/") for key in made)
+
+
+@offline
+@given(run=names, actor=names)
+def test_the_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
+    assert keys.last_chunk(keys.presence(run, actor)) == actor
+    assert keys.last_chunk(keys.rollouts(run, actor)) == actor

@@ -1,0 +1,94 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.messages import Rollout, RolloutIdentity
+
+T, E, K = 3, 2, 1
+
+
+def rollout(**changed: np.ndarray) -> Rollout:
+    arrays: dict[str, Any] = {
+        "observations": np.zeros((T + 1, E, 4), np.float32),
+        "actions": np.zeros((T, E), np.int64),
+        "behaviour_log_probs": np.zeros((T, E), np.float32),
+        "rewards": np.zeros((T, E), np.float32),
+        "terminated": np.zeros((T, E), np.bool_),
+        "truncated": np.zeros((T, E), np.bool_),
+        "valid": np.ones((T, E), np.bool_),
+        "episode_returns": np.zeros(K, np.float32),
+        "episode_lengths": np.ones(K, np.int32),
+    }
+    identity = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
+    return Rollout(identity=identity, policy_version=0, **(arrays | changed))
+
+
+def test_a_rollout_tells_its_rows_and_environments() -> None:
+    made = rollout()
+    assert (made.rows, made.environments) == (T, E)
+
+
+def test_as_many_episodes_may_end_as_there_are_rows() -> None:
+    rollout(episode_returns=np.zeros(T * E, np.float32), episode_lengths=np.ones(T * E, np.int32))
+
+
+def test_a_rollout_without_ended_episodes_is_a_rollout() -> None:
+    rollout(episode_returns=np.zeros(0, np.float32), episode_lengths=np.zeros(0, np.int32))
+
+
+ROW_ARRAYS = ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid")
+
+
+@pytest.mark.parametrize("name", ROW_ARRAYS)
+@pytest.mark.parametrize("shape", [(T,), (T + 1, E), (T, E + 1), (E, T), (T, E, 1), (0, E), ()])
+def test_an_array_of_rows_with_another_shape_than_actions_is_named(name: str, shape: tuple[int, ...]) -> None:
+    dtype = getattr(rollout(), name).dtype
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        rollout(**{name: np.zeros(shape, dtype)})
+
+
+@pytest.mark.parametrize("name", [*ROW_ARRAYS, "episode_returns"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float64])
+def test_an_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
+    right = getattr(rollout(), name)
+    with pytest.raises(ValueError, match=f"^{name} must be {right.dtype}"):
+        rollout(**{name: right.astype(dtype)})
+
+
+@pytest.mark.parametrize("shape", [(T, E, 4), (T + 2, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), ()])
+def test_observations_need_a_row_more_than_actions(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="^observations must be"):
+        rollout(observations=np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
+def test_actions_of_another_rank_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="^actions must be"):
+        rollout(actions=np.zeros(shape, np.int64))
+
+
+@pytest.mark.parametrize(("rows", "environments"), [(0, E), (T, 0)])
+def test_an_empty_rollout_is_refused(rows: int, environments: int) -> None:
+    with pytest.raises(ValueError, match="at least one row and one environment"):
+        rollout(actions=np.zeros((rows, environments), np.int64))
+
+
+@pytest.mark.parametrize("name", ["actions", "episode_lengths"])
+def test_what_counts_must_be_integers(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}.* integers"):
+        rollout(**{name: getattr(rollout(), name).astype(np.float32)})
+
+
+@pytest.mark.parametrize("shape", [(), (K + 1,), (K, 1)])
+def test_returns_and_lengths_of_episodes_go_together(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="episode_returns and episode_lengths"):
+        rollout(episode_returns=np.zeros(shape, np.float32))
+    with pytest.raises(ValueError, match="episode_returns and episode_lengths"):
+        rollout(episode_lengths=np.zeros(shape, np.int32))
+
+
+def test_more_episodes_than_rows_are_refused() -> None:
+    many = T * E + 1
+    with pytest.raises(ValueError, match="more episodes ended"):
+        rollout(episode_returns=np.zeros(many, np.float32), episode_lengths=np.ones(many, np.int32))

@@ -1,0 +1,72 @@
+"""The arrows between the packages, and what nothing that is read may do."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("protocol", "policy", "actor", "learner", "launch")
+ALLOWED = {
+    "protocol": {"protocol"},
+    "policy": {"protocol", "policy"},
+    "actor": {"protocol", "policy", "actor"},
+    "learner": {"protocol", "policy", "learner"},
+    "launch": {"protocol", "learner", "launch"},
+}
+EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
+
+
+def sources(package: str) -> list[tuple[Path, ast.Module]]:
+    paths = sorted((ROOT / package).rglob("*.py"))
+    assert paths
+    return [(path, ast.parse(path.read_text())) for path in paths]
+
+
+def imported(tree: ast.Module) -> set[str]:
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_along_the_arrows_only(package: str) -> None:
+    for path, tree in sources(package):
+        ours = {name.split(".")[0] for name in imported(tree)} & set(PACKAGES)
+        assert ours <= ALLOWED[package], path
+
+
+def test_zenoh_is_imported_in_one_file() -> None:
+    users = {path.name for package in PACKAGES for path, tree in sources(package) if "zenoh" in imported(tree)}
+    assert users == {"zenoh_transport.py"}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_nothing_that_executes_what_it_reads_is_used(package: str) -> None:
+    for path, tree in sources(package):
+        assert not {name.split(".")[0] for name in imported(tree)} & EXECUTING, path
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                assert ast.unparse(node.func) not in {"eval", "exec", "torch.load", "yaml.load", "np.load"}, path
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("actor.__main__", {"torch", "learner", "launch"}),
+        ("actor.evaluator", {"torch", "learner", "launch", "zenoh"}),
+        ("learner.__main__", {"torch", "actor", "launch", "gymnasium"}),
+        ("launch.train", {"torch", "actor", "gymnasium", "zenoh", "onnxruntime"}),
+        ("protocol.codec", {"torch", "zenoh", "policy"}),
+    ],
+)
+def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
+    program = f"import sys, {module}; print('\\n'.join(sys.modules))"
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert not absent & set(output.splitlines())
