@@ -58,7 +58,9 @@ def save_checkpoint(
         "counters": counters,
     }
     write_sealed(directory, files, content)
-    for old in checkpoints(run_directory)[keep:]:
+    # A damaged one of a higher version may be there: the learner then went on from an earlier one.
+    others = [other for other in checkpoints(run_directory) if other != directory]
+    for old in others[keep - 1 :]:
         shutil.rmtree(old, ignore_errors=True)
     return directory
 

@@ -12,6 +12,7 @@ import numpy as np
 from protocol.messages import Join, Refusal, RolloutIdentity
 from protocol.spec import ActorStatus, Spaces
 
+_REMEMBERED_LIVES = 8
 _REORDERING = 1024  # sequence numbers that may arrive out of order before the missing ones are given up
 
 
@@ -50,11 +51,16 @@ class Actor:
     environments: int = 0  # 0 until it has joined with its spaces
     present: bool = False
     last_seen: float = 0.0
-    sequences: SequenceWindow = field(default_factory=SequenceWindow)
+    windows: dict[int, SequenceWindow] = field(default_factory=dict)  # by incarnation, the newest last
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     env_steps: int = 0
     policy_lag: int = 0  # of its newest rollout
+
+    @property
+    def sequences(self) -> SequenceWindow:
+        """What was taken of its newest incarnation."""
+        return self.windows[self.incarnation]
 
 
 class Fleet:
@@ -85,8 +91,11 @@ class Fleet:
         if actor.incarnation != join.incarnation:
             actor.incarnation = join.incarnation
             actor.lives += 1
-            actor.sequences = SequenceWindow()
             actor.environments = 0
+            # A life that comes back, after another that used its name, has what it sent remembered.
+            actor.windows[join.incarnation] = actor.windows.pop(join.incarnation, SequenceWindow())
+            while len(actor.windows) > _REMEMBERED_LIVES:
+                del actor.windows[next(iter(actor.windows))]
         if join.spaces is not None:
             actor.environments = join.environments
         return None

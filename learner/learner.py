@@ -71,7 +71,7 @@ class Learner:
         entropy = masked_mean(entropies, batch.valid)
         loss = policy_term + self._spec.value_coefficient * value_term - self.entropy_bonus(progress) * entropy
         with torch.no_grad():
-            spread = masked_mean(targets.advantages.square(), batch.valid).sqrt()
+            centred = targets.advantages - masked_mean(targets.advantages, batch.valid)
             metrics = [
                 policy_term.detach(),
                 value_term.detach(),
@@ -79,7 +79,7 @@ class Learner:
                 explained_variance(values[:-1], targets.values, batch.valid),
                 torch.zeros(()),  # the gradient's norm, once there is one
                 masked_mean(values[:-1], batch.valid),
-                spread,
+                masked_mean(centred.square(), batch.valid).sqrt(),
             ]
         return loss, metrics
 
@@ -131,7 +131,8 @@ class Learner:
 
     def state(self) -> dict[str, Tensor]:
         """Everything beyond the parameters that decides the next update: optimiser statistics, random state."""
-        statistics = {f"optimizer/{name}": value for name, value in self._optimizer.statistics.items()}
+        kind = self._spec.optimizer
+        statistics = {f"{kind}/{name}": value for name, value in self._optimizer.statistics.items()}
         return {"torch_random_state": torch.get_rng_state(), **statistics}
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
@@ -147,7 +148,7 @@ class Learner:
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(parameters[name].copy()))
         for name, statistic in self._optimizer.statistics.items():
-            saved = state.get(f"optimizer/{name}")
+            saved = state.get(f"{self._spec.optimizer}/{name}")
             if saved is None or saved.shape != statistic.shape:
                 raise ValueError("the checkpoint holds the statistics of another optimiser")
             statistic.copy_(saved)

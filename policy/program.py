@@ -45,6 +45,8 @@ def export_program(network: ActorCritic, observation: ArraySpace) -> bytes:
             program,
             dynamo=False,
             export_params=False,
+            # Without this the exporter makes one input of parameters that hold the same numbers, as new biases do.
+            keep_initializers_as_inputs=True,
             opset_version=_OPSET,
             input_names=[OBSERVATIONS],
             output_names=[LOGITS],

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import safetensors.numpy
-from pydantic import ValidationError
 
 from policy.sealed import DamagedError, SealedDirectory
 from protocol.spec import RunSpec, Spaces
@@ -50,5 +49,5 @@ def read_policy(directory: Path) -> SavedPolicy:
             program=sealed.read(PROGRAM_FILE),
             weights=safetensors.numpy.load(sealed.read(PARAMETERS_FILE)),
         )
-    except (KeyError, TypeError, ValidationError, safetensors.SafetensorError) as error:
+    except (KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
         raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None

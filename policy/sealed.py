@@ -35,13 +35,26 @@ def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, An
         for name, data in {**files, _MANIFEST: manifest, _SEAL: seal}.items():
             _write_synced(beside / name, data)
         _sync_directory(beside)
-        if directory.exists():  # the same version again, after a resume: the older one gives way
-            shutil.rmtree(directory)
-        os.replace(beside, directory)
+        _put_in_place(beside, directory)
         _sync_directory(directory.parent)
     except OSError:
         shutil.rmtree(beside, ignore_errors=True)
         raise
+
+
+def _put_in_place(beside: Path, directory: Path) -> None:
+    """Renames; what was there under that name (the same version, saved again) stays if that fails."""
+    if not directory.exists():
+        os.replace(beside, directory)
+        return
+    aside = directory.with_name(f".{directory.name}.{os.getpid()}.replaced")
+    os.replace(directory, aside)
+    try:
+        os.replace(beside, directory)
+    except OSError:
+        os.replace(aside, directory)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 class SealedDirectory:

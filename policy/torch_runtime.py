@@ -15,19 +15,23 @@ class TorchRuntime:
     def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
         torch.set_num_threads(1)
         self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
-        self._acting = [name for name, _ in self._network.named_parameters() if not name.startswith("value_head")]
+        self._parameters = dict(self._network.named_parameters())
+        self._acting = [name for name in self._parameters if not name.startswith("value_head")]
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """See PolicyRuntime. The value head plays no part in acting and may be absent."""
         missing = [name for name in self._acting if name not in weights]
         if missing:
             raise PolicyError(f"the snapshot lacks the weights {missing[0]!r} of the network")
-        try:
-            # Copied: torch wants memory that it may write to, and a snapshot's is read-only.
-            tensors = {name: torch.from_numpy(array.copy()) for name, array in weights.items()}
-            self._network.load_state_dict(tensors, strict=False)
-        except RuntimeError as error:
-            raise PolicyError(f"weights do not fit the network: {error}") from None
+        for name, parameter in self._parameters.items():
+            if name in weights and weights[name].shape != tuple(parameter.shape):
+                raise PolicyError(
+                    f"weights {name!r} are {weights[name].shape}, the network wants {tuple(parameter.shape)}"
+                )
+        for name, parameter in self._parameters.items():
+            if name in weights:
+                # Copied: torch wants memory that it may write to, and a snapshot's is read-only.
+                parameter.copy_(torch.from_numpy(weights[name].copy()))
 
     def act(self, observations: np.ndarray, random: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
         """See PolicyRuntime."""

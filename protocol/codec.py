@@ -241,7 +241,10 @@ def _read_arrays(
         flat = np.frombuffer(body, np.uint8, math.prod(shape) * dtype.itemsize, offset)
         if dtype == np.bool_ and flat.size and flat.max() > 1:
             raise ProtocolError(f"array {name!r} has a truth value that is neither 0 nor 1")
-        array = flat.view(dtype).reshape(shape)
+        try:
+            array = flat.view(dtype).reshape(shape)
+        except ValueError:  # sides whose product is more than numpy counts to, beside one of 0
+            raise ProtocolError(f"array {name!r} has no proper shape") from None
         array.flags.writeable = False
         arrays[name] = array
     return arrays

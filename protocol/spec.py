@@ -16,7 +16,7 @@ UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 class Specification(BaseModel):
     """Base of every specification: immutable, and strict about names it does not know."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 # ---------------------------------------------------------------------------------------------- spaces

@@ -9,6 +9,7 @@ threads that carry everybody else's traffic too.
 """
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -84,11 +85,17 @@ class Transport(Protocol):
 
 
 class _MemoryRequest:
-    def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes], None]) -> None:
+    def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes | None], None]) -> None:
         self.key, self.payload = key, payload
-        self._on_answer: Callable[[bytes], None] | None = on_answer
+        self._on_answer: Callable[[bytes | None], None] | None = on_answer
 
     def reply(self, payload: bytes) -> None:
+        self._answer(payload)
+
+    def __del__(self) -> None:
+        self._answer(None)  # forgotten by who served it
+
+    def _answer(self, payload: bytes | None) -> None:
         on_answer, self._on_answer = self._on_answer, None
         if on_answer is not None:
             on_answer(payload)
@@ -146,24 +153,26 @@ class MemoryTransport:
         answers: list[bytes] = []
         answered = threading.Semaphore(0)
 
-        def on_answer(answer: bytes) -> None:
-            answers.append(answer)
+        def on_answer(answer: bytes | None) -> None:
+            if answer is not None:
+                answers.append(answer)
             answered.release()
 
         handlers = self._handlers(key)
         for served, handler in handlers:
             handler(_MemoryRequest(served, payload, on_answer))
+        deadline = time.monotonic() + timeout
         for _ in handlers:
-            answered.acquire(timeout=timeout)
-        return answers
+            answered.acquire(timeout=max(deadline - time.monotonic(), 0.0))
+        return list(answers)
 
     def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
-        """See Transport. An answer that never comes is the server's end closing, so no timer is kept."""
+        """See Transport. Within a process no answer is lost, so no timer is kept for one."""
         handlers = self._handlers(key)
         if not handlers:
             on_answer(None)
-        for _, handler in handlers[:1]:
-            handler(_MemoryRequest(key, payload, on_answer))
+        for served, handler in handlers[:1]:
+            handler(_MemoryRequest(served, payload, on_answer))
 
     def _handlers(self, key: str) -> list[tuple[str, Callable[[Request], None]]]:
         return [
@@ -212,4 +221,5 @@ class MemoryTransport:
                 return
             self._network.ends.remove(self)
         for key in self._announced:
-            self._tell(key, False)
+            if not any(key in end._announced for end in self._ends()):
+                self._tell(key, False)

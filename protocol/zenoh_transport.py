@@ -11,9 +11,10 @@ What Zenoh needs to be held to (measured, see docs/results.md):
   - A router waits half a second for peers it could scout before it opens, unless told not to.
 """
 
+import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import zenoh
 
@@ -78,6 +79,14 @@ def _opening_error(text: str, listen_on: list[str], connect_to: list[str]) -> Tr
     return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
 
 
+@contextlib.contextmanager
+def _as_transport_error(what: str) -> Iterator[None]:
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"cannot {what}: {error}") from None
+
+
 class _ZenohRequest:
     """One query of Zenoh's; finalised as soon as it is answered or forgotten."""
 
@@ -126,17 +135,22 @@ class ZenohTransport:
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
-        self._declared.append(
-            self._session.declare_queryable(key, lambda query: handler(_ZenohRequest(query, key)), complete=True)
-        )
+        with _as_transport_error(f"serve {key}"):
+            self._declared.append(
+                self._session.declare_queryable(key, lambda query: handler(_ZenohRequest(query, key)), complete=True)
+            )
 
     def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
-        try:
-            replies = self._session.get(key, payload=payload, timeout=timeout, target=zenoh.QueryTarget.ALL)
+        with _as_transport_error(f"ask {key}"):
+            replies = self._session.get(
+                key,
+                payload=payload,
+                timeout=timeout,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # else one answer for each key, of all that serve it
+            )
             return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot ask {key}: {error}") from None
 
     def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
         """See Transport."""
@@ -149,11 +163,8 @@ class ZenohTransport:
         def on_end() -> None:
             on_answer(first[0] if first else None)
 
-        try:
-            querier = self._querier(key, timeout)
-            querier.get(zenoh.handlers.Callback(on_reply, on_end), payload=payload)
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot send to {key}: {error}") from None
+        with _as_transport_error(f"send to {key}"):
+            self._querier(key, timeout).get(zenoh.handlers.Callback(on_reply, on_end), payload=payload)
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
         with self._lock:
@@ -165,20 +176,21 @@ class ZenohTransport:
 
     def publish(self, key: str, payload: bytes) -> None:
         """See Transport."""
-        try:
-            with self._lock:
-                publisher = self._publishers.get(key)
-                if publisher is None:
-                    publisher = self._session.declare_publisher(
-                        key,
-                        congestion_control=zenoh.CongestionControl.DROP,
-                        priority=zenoh.Priority.DATA_HIGH,
-                        express=True,
-                    )
-                    self._publishers[key] = publisher
-            publisher.put(payload)
-        except zenoh.ZError as error:
-            raise TransportError(f"cannot publish {key}: {error}") from None
+        with _as_transport_error(f"publish {key}"):
+            self._publisher(key).put(payload)
+
+    def _publisher(self, key: str) -> zenoh.Publisher:
+        with self._lock:
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                publisher = self._session.declare_publisher(
+                    key,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=zenoh.Priority.DATA_HIGH,
+                    express=True,
+                )
+                self._publishers[key] = publisher
+            return publisher
 
     def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """See Transport."""
@@ -188,12 +200,14 @@ class ZenohTransport:
             inbox.put(sample.payload)
             on_news()
 
-        self._declared.append(self._session.declare_subscriber(key, on_sample))
+        with _as_transport_error(f"follow {key}"):
+            self._declared.append(self._session.declare_subscriber(key, on_sample))
         return inbox
 
     def announce(self, key: str) -> None:
         """See Transport."""
-        self._declared.append(self._session.liveliness().declare_token(key))
+        with _as_transport_error(f"announce {key}"):
+            self._declared.append(self._session.liveliness().declare_token(key))
 
     def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
@@ -201,8 +215,9 @@ class ZenohTransport:
         def on_sample(sample: zenoh.Sample) -> None:
             on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        # Without history a token declared just after the subscriber is missed now and then.
-        self._declared.append(self._session.liveliness().declare_subscriber(key, on_sample, history=True))
+        with _as_transport_error(f"watch {key}"):
+            # Without history a token declared just after the subscriber is missed now and then.
+            self._declared.append(self._session.liveliness().declare_subscriber(key, on_sample, history=True))
 
     def close(self) -> None:
         """See Transport."""

@@ -60,8 +60,8 @@ def make_rollout(
         "terminated": terminated,
         "truncated": truncated,
         "valid": valid,
-        "episode_returns": np.array([1.5, -2.0], np.float32),
-        "episode_lengths": np.array([4, 9], np.int32),
+        "episode_returns": np.array([-1.5], np.float32),
+        "episode_lengths": np.array([4], np.int32),
     }
     return Rollout(identity=who or identity(), policy_version=version, **{**content, **replaced})
 

@@ -1,8 +1,8 @@
 """learner/fleet.py: who takes part, under which identity, and what was taken of them."""
 
+from building import SPACES, identity, joined_fleet
 from hypothesis import given
 from hypothesis import strategies as st
-from building import SPACES, identity, joined_fleet
 
 from learner.fleet import Fleet, SequenceWindow
 from protocol.messages import Join
@@ -112,8 +112,8 @@ def test_a_number_of_environments_out_of_range_is_refused() -> None:
 
 def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected() -> None:
     fleet = joined_fleet("a")
-    actor = fleet.expected(identity("a"))
-    assert actor is fleet.actors["a"]
+    actor = fleet.actors["a"]
+    assert fleet.expected(identity("a")) is actor
     actor.sequences.add(0)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
     assert fleet.expected(identity("a")) is None

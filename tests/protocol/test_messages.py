@@ -58,13 +58,13 @@ def test_an_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
 
 @pytest.mark.parametrize("shape", [(T, E, 4), (T + 2, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), ()])
 def test_observations_need_a_row_more_than_actions(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="^observations must be"):
+    with pytest.raises(ValueError, match=r"^observations must be"):
         rollout(observations=np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
 def test_actions_of_another_rank_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="^actions must be"):
+    with pytest.raises(ValueError, match=r"^actions must be"):
         rollout(actions=np.zeros(shape, np.int64))
 
 

@@ -51,7 +51,7 @@ def test_a_field_that_is_not_known_is_refused_by_its_name(
     specification: type[Specification], fields: dict[str, Any]
 ) -> None:
     specification.model_validate(fields)
-    with pytest.raises(ValidationError, match="entropy_bonsu\n.*not permitted"):
+    with pytest.raises(ValidationError, match=r"entropy_bonsu\n.*not permitted"):
         specification.model_validate({**fields, "entropy_bonsu": 1})
 
 

@@ -1,0 +1,191 @@
+"""learner/checkpoint.py: what was saved comes back whole, or is not used."""
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from building import SPACES, run_spec
+
+from learner.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from policy.saved_policy import checkpoints, read_policy
+from policy.sealed import DamagedError
+
+SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
+COUNTERS = {"env_steps": 12, "returns": [1.5, -2.25], "rollouts_rejected": {"stale": 3}}
+
+
+def parameters(version: int) -> dict[str, np.ndarray]:
+    return {"layer.weight": np.full((2, 3), version, np.float32), "layer.bias": np.arange(3, dtype=np.float32)}
+
+
+def state(version: int) -> dict[str, torch.Tensor]:
+    return {"optimizer/mean": torch.full((9,), version / 3), "optimizer/steps": torch.tensor(version)}
+
+
+def save(run: Path, version: int, keep: int = 9, **replaced: Any) -> Path:
+    content: dict[str, Any] = {
+        "spec": SPEC,
+        "spaces": SPACES,
+        "program": b"program of " + bytes([version]),
+        "parameters": parameters(version),
+        "state": state(version),
+        "counters": COUNTERS,
+    }
+    return save_checkpoint(run, policy_version=version, keep=keep, **{**content, **replaced})
+
+
+def no_warning(text: str) -> None:
+    raise AssertionError(text)
+
+
+def names(run: Path) -> list[str]:
+    return sorted(entry.name for entry in (run / "checkpoints").iterdir())
+
+
+def flip(path: Path, place: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    save(tmp_path, 7)
+    loaded = load_newest(tmp_path, no_warning)
+    assert loaded.policy.policy_version == 7
+    assert loaded.policy.spec == SPEC
+    assert loaded.policy.spaces == SPACES
+    assert loaded.policy.program == b"program of \x07"
+    assert loaded.counters == COUNTERS
+    assert loaded.policy.weights.keys() == parameters(7).keys()
+    for name, array in parameters(7).items():
+        np.testing.assert_array_equal(loaded.policy.weights[name], array)
+    assert loaded.state.keys() == state(7).keys()
+    for name, value in state(7).items():
+        assert torch.equal(loaded.state[name], value)
+        assert loaded.state[name].dtype == value.dtype
+
+
+def test_the_newest_is_loaded(tmp_path: Path) -> None:
+    for version in (9, 10, 2):
+        save(tmp_path, version)
+    assert load_newest(tmp_path, no_warning).policy.policy_version == 10
+
+
+def test_a_damaged_newest_is_named_and_the_one_before_it_is_used(tmp_path: Path) -> None:
+    save(tmp_path, 1)
+    flip(save(tmp_path, 2) / "parameters.safetensors", -1)
+    warnings: list[str] = []
+    assert load_newest(tmp_path, warnings.append).policy.policy_version == 1
+    assert len(warnings) == 1
+    assert "0000000002" in warnings[0]
+    assert "parameters.safetensors" in warnings[0]
+
+
+def test_without_a_whole_one_there_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DamagedError, match="no checkpoint"):
+        load_newest(tmp_path, no_warning)
+    for version in (1, 2):
+        flip(save(tmp_path, version) / "seal", 0)
+    warnings: list[str] = []
+    with pytest.raises(DamagedError, match="no checkpoint"):
+        load_newest(tmp_path, warnings.append)
+    assert len(warnings) == 2
+
+
+FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]
+
+
+def test_these_are_the_files_of_a_checkpoint(tmp_path: Path) -> None:
+    assert sorted(entry.name for entry in save(tmp_path, 1).iterdir()) == FILES
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_no_damage_to_any_file_goes_unnoticed(name: str, tmp_path: Path) -> None:
+    path = save(tmp_path, 1) / name
+    whole = path.read_bytes()
+    places = {0, 8, len(whole) // 3, len(whole) // 2, len(whole) - 1}
+    damaged = [whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :] for place in places]
+    damaged += [whole[: len(whole) // 2], whole[:-1], b"", whole + b"\0", bytes(len(whole))]
+    for data in damaged:
+        path.write_bytes(data)
+        with pytest.raises(DamagedError):
+            load_checkpoint(path.parent)
+    path.unlink()
+    with pytest.raises(DamagedError):
+        load_checkpoint(path.parent)
+    path.write_bytes(whole)
+    load_checkpoint(path.parent)
+
+
+def test_an_evaluator_reads_the_policy_though_the_optimisers_state_is_damaged(tmp_path: Path) -> None:
+    directory = save(tmp_path, 1)
+    flip(directory / "learner.safetensors", 20)
+    assert read_policy(directory).policy_version == 1
+
+
+def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+    for version in range(1, 6):
+        save(tmp_path, version, keep=2)
+    assert names(tmp_path) == ["0000000004", "0000000005"]
+
+
+def test_what_was_just_saved_is_kept_though_a_damaged_one_has_a_higher_version(tmp_path: Path) -> None:
+    save(tmp_path, 10)
+    flip(save(tmp_path, 20) / "seal", 0)
+    saved = save(tmp_path, 11, keep=1)  # a learner that went on from 10
+    assert saved.is_dir()
+    assert load_newest(tmp_path, lambda _: None).policy.policy_version == 11
+
+
+def test_the_same_version_may_be_saved_again(tmp_path: Path) -> None:
+    save(tmp_path, 1)
+    save(tmp_path, 1, counters={"env_steps": 99})
+    assert names(tmp_path) == ["0000000001"]
+    assert load_newest(tmp_path, no_warning).counters == {"env_steps": 99}
+
+
+def test_what_a_crash_left_half_written_is_no_checkpoint(tmp_path: Path) -> None:
+    save(tmp_path, 1)
+    (tmp_path / "checkpoints" / ".0000000002.123.partial").mkdir()
+    assert [directory.name for directory in checkpoints(tmp_path)] == ["0000000001"]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("written", range(6))  # three files, manifest, seal, and the directory itself
+def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
+    version: int, written: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 1)
+    fsync, left = os.fsync, iter(range(written))
+
+    def filling(descriptor: int) -> None:
+        if next(left, None) is None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(descriptor)
+
+    monkeypatch.setattr("policy.sealed.os.fsync", filling)
+    with pytest.raises(OSError, match="No space left"):
+        save(tmp_path, version, keep=1, counters={})
+    monkeypatch.undo()
+    assert names(tmp_path) == ["0000000001"]
+    assert load_newest(tmp_path, no_warning).counters == COUNTERS
+
+
+def test_a_rename_that_fails_leaves_the_last_good_one_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 1)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("policy.sealed.os.replace", refuse)
+    with pytest.raises(OSError, match="Input/output"):
+        save(tmp_path, 2, keep=1)
+    monkeypatch.undo()
+    assert names(tmp_path) == ["0000000001"]
+    assert load_newest(tmp_path, no_warning).policy.policy_version == 1

@@ -1,0 +1,334 @@
+"""learner/intake.py: every way in which a rollout can be wrong, and that each is taken at most once."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, make_rollout, run_spec
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from learner.fleet import Fleet
+from learner.intake import Intake, Rejected, acknowledgement
+from protocol.codec import encode
+from protocol.messages import Farewell, Join, Rollout
+from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+
+VERSION, MAX_LAG = 10, 4
+
+
+class Desk:
+    """An intake with its fleet of `a` and `b`, at one policy version."""
+
+    def __init__(self, **training: Any) -> None:
+        self.fleet = joined_fleet("a", "b")
+        self.intake = Intake(run_spec(max_policy_lag=MAX_LAG, **training), EPOCH, self.fleet)
+
+    def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Rollout | Rejected:
+        return self.intake.judge(sender, self.intake.read(sender, data), VERSION, now)
+
+    def memory(self) -> list[Any]:
+        """All that the fleet knows, but for what a rejection is to leave: when it was, and the count of it."""
+        told = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
+        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None} for each in told]]
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def good(**replaced: Any) -> Rollout:
+    return make_rollout(**{"version": VERSION, **replaced})
+
+
+def assert_rejected(desk: Desk, data: bytes, cause: str, reason: str = "", sender: str = "a") -> Rejected:
+    """Rejected for that cause and counted under it, with no other trace; the right rollout is welcome after it."""
+    before = desk.memory()
+    verdict = desk.receive(data, sender)
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == cause
+    assert reason in verdict.reason
+    assert desk.memory() == before
+    if sender in desk.fleet.actors:
+        assert desk.fleet.actors[sender].rejected == {cause: 1}
+    assert isinstance(desk.receive(encode(good(who=identity(sequence=1000)))), Rollout)
+    return verdict
+
+
+def with_value(name: str, value: float) -> Rollout:
+    """A good rollout, but for one number of one array."""
+    array = getattr(good(), name).copy()
+    array.flat[-1] = value
+    return good(**{name: array})
+
+
+# ------------------------------------------------------------------------------------------- acceptance
+
+
+def test_a_good_rollout_is_accepted_as_it_was_sent(desk: Desk) -> None:
+    rollout = good(version=VERSION - 2)
+    verdict = desk.receive(encode(rollout), now=5.0)
+    assert isinstance(verdict, Rollout)
+    assert verdict.identity == rollout.identity
+    np.testing.assert_array_equal(verdict.observations, rollout.observations)
+    actor = desk.fleet.actors["a"]
+    assert (actor.accepted, actor.policy_lag, actor.last_seen) == (1, 2, 5.0)
+    assert not actor.rejected
+    assert acknowledgement(verdict, VERSION).verdict == "accepted"
+    assert acknowledgement(verdict, VERSION).policy_version == VERSION
+
+
+def test_actors_count_their_sequences_apart(desk: Desk) -> None:
+    for actor in ("a", "b"):
+        assert isinstance(desk.receive(encode(good(who=identity(actor))), actor), Rollout)
+
+
+def test_a_lag_up_to_the_bound_is_accepted(desk: Desk) -> None:
+    assert isinstance(desk.receive(encode(good(version=VERSION - MAX_LAG))), Rollout)
+
+
+def test_the_sender_is_told_the_reason_and_not_a_novel(desk: Desk) -> None:
+    verdict = Rejected(verdict="fenced", cause="epoch", reason="x" * 9000)
+    answer = acknowledgement(verdict, VERSION)
+    assert (answer.verdict, answer.reason, answer.policy_version) == ("fenced", "x" * 500, VERSION)
+
+
+# -------------------------------------------------------------------------------------------- malformed
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"DAED", b"nonsense of some length, no message", encode(good())[:-1], encode(good()) + b"\0"],
+    ids=["empty", "too short", "nonsense", "cut", "too long"],
+)
+def test_what_is_no_message_is_malformed(desk: Desk, data: bytes) -> None:
+    assert assert_rejected(desk, data, "malformed").verdict == "rejected"
+
+
+def test_another_message_is_no_rollout(desk: Desk) -> None:
+    assert_rejected(desk, encode(Farewell(learner_epoch=EPOCH, reason="")), "malformed", "not a rollout")
+
+
+@pytest.mark.parametrize(
+    "rollout",
+    [
+        good(rows=ROWS - 1),
+        good(rows=ROWS + 1),
+        good(environments=ENVIRONMENTS - 1),
+        good(environments=ENVIRONMENTS + 1),
+        good(shape=(4,)),
+        good(shape=(3, 1)),
+        good(observations=np.zeros((ROWS + 1, ENVIRONMENTS, 3), np.uint8)),
+    ],
+    ids=["T too small", "T too large", "E too small", "E too large", "shape", "more dimensions", "dtype"],
+)
+def test_other_sizes_and_dtypes_are_malformed(desk: Desk, rollout: Rollout) -> None:
+    assert_rejected(desk, encode(rollout), "malformed", "observations are")
+
+
+def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(desk: Desk) -> None:
+    bomb = good(rows=4000, environments=500, observations=np.zeros((4001, 500, 3), np.float32))
+    assert_rejected(desk, encode(bomb), "malformed", "the limit is")
+
+
+@pytest.mark.parametrize("action", [-1, SPACES.action.count, 2**31 - 1])
+def test_an_action_out_of_range_is_malformed(desk: Desk, action: int) -> None:
+    actions = good().actions.astype(np.int32)
+    actions[-1, -1] = action
+    assert_rejected(desk, encode(good(actions=actions)), "malformed", "action")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["observations", "behaviour_log_probs", "rewards", "episode_returns"])
+def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(desk: Desk, name: str, value: float) -> None:
+    assert_rejected(desk, encode(with_value(name, value)), "malformed", name)
+
+
+def test_a_log_probability_above_0_is_malformed(desk: Desk) -> None:
+    assert_rejected(desk, encode(with_value("behaviour_log_probs", 0.01)), "malformed", "log-probability")
+
+
+def test_a_log_probability_that_rounding_put_above_0_is_accepted(desk: Desk) -> None:
+    assert isinstance(desk.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
+
+
+def test_a_policy_version_yet_to_come_is_malformed(desk: Desk) -> None:
+    assert_rejected(desk, encode(good(version=VERSION + 1)), "malformed", "yet to come")
+
+
+@given(st.data())
+def test_whatever_is_done_to_its_bytes_there_is_a_verdict(data: st.DataObject) -> None:
+    message = bytearray(encode(good()))
+    for place in data.draw(st.lists(st.integers(0, len(message) - 1), min_size=1, max_size=4)):
+        message[place] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.sampled_from([None, None, data.draw(st.integers(0, len(message)))]))
+    assert isinstance(Desk().receive(bytes(message[:cut])), Rollout | Rejected)
+
+
+# ------------------------------------------------------------------------- whose it is, and when it was made
+
+
+def test_another_epoch_is_fenced(desk: Desk) -> None:
+    verdict = assert_rejected(desk, encode(good(who=identity(epoch=EPOCH - 1))), "epoch")
+    assert acknowledgement(verdict, VERSION).verdict == "fenced"
+
+
+def test_a_sender_that_never_joined_is_fenced(desk: Desk) -> None:
+    assert assert_rejected(desk, encode(good(who=identity("z"))), "unknown_actor", sender="z").verdict == "fenced"
+    assert "z" not in desk.fleet.actors
+
+
+def test_nobody_is_known_before_there_are_spaces() -> None:
+    intake = Intake(run_spec(), EPOCH, Fleet(1, None))
+    verdict = intake.read("a", encode(good()))
+    assert isinstance(verdict, Rejected)
+    assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
+
+
+@pytest.mark.parametrize("incarnation", [0, 2])
+def test_an_incarnation_that_never_joined_is_fenced(desk: Desk, incarnation: int) -> None:
+    verdict = assert_rejected(desk, encode(good(who=identity(incarnation=incarnation))), "unknown_actor")
+    assert verdict.verdict == "fenced"
+
+
+def test_a_superseded_incarnation_is_fenced(desk: Desk) -> None:
+    desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    verdict = desk.receive(encode(good()))
+    assert isinstance(verdict, Rejected)
+    assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
+    assert isinstance(desk.receive(encode(good(who=identity(incarnation=2)))), Rollout)
+
+
+def test_a_life_that_joins_again_after_another_has_nothing_taken_twice(desk: Desk) -> None:
+    data = encode(good())
+    assert isinstance(desk.receive(data), Rollout)
+    for incarnation in (2, 1):
+        desk.fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    assert isinstance(desk.receive(data), Rejected)
+
+
+def test_nobody_can_send_in_anothers_name(desk: Desk) -> None:
+    verdict = assert_rejected(desk, encode(good(who=identity("b"))), "unknown_actor", sender="a")
+    assert verdict.verdict == "fenced"
+    assert not desk.fleet.actors["b"].rejected
+    assert isinstance(desk.receive(encode(good(who=identity("b"))), "b"), Rollout)
+
+
+def test_a_duplicate_is_rejected(desk: Desk) -> None:
+    assert isinstance(desk.receive(encode(good())), Rollout)
+    assert assert_rejected(desk, encode(good()), "duplicate").verdict == "rejected"
+
+
+def test_a_stale_rollout_is_rejected_once_and_a_duplicate_from_then_on(desk: Desk) -> None:
+    data = encode(good(version=VERSION - MAX_LAG - 1))
+    verdicts = [desk.receive(data), desk.receive(data)]
+    assert [verdict.cause for verdict in verdicts if isinstance(verdict, Rejected)] == ["stale", "duplicate"]
+    assert desk.fleet.actors["a"].accepted == 0
+
+
+def test_a2c_takes_the_newest_version_only_whatever_lag_is_allowed() -> None:
+    desk = Desk(algorithm="a2c")
+    late = desk.receive(encode(good(version=VERSION - 1)))
+    assert isinstance(late, Rejected)
+    assert late.cause == "stale"
+    assert isinstance(desk.receive(encode(good(who=identity(sequence=1)))), Rollout)
+
+
+# ---------------------------------------------------------------------------------------- at most once
+
+TINY = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=ChoiceSpace(count=4))
+NAMES = st.sampled_from(["a", "b"])
+SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([2**62, 2**62 - 1500, 2**63 - 1]))
+
+
+class Traffic(RuleBasedStateMachine):
+    """Rollouts that come late, twice, out of order, from lives that are over; held against a set of all taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fleet = Fleet(1, None)
+        self.intake = Intake(run_spec(rows=1, max_policy_lag=2), EPOCH, self.fleet)
+        self.version = 0
+        self.incarnations = {"a": 0, "b": 0}  # the newest that joined; counts up from 1
+        self.taken: dict[tuple[str, int], set[int]] = {}
+        self.accepted: list[tuple[str, int, int]] = []
+        self.sent: list[tuple[str, Rollout]] = []
+
+    @rule(name=NAMES)
+    def a_new_life_joins(self, name: str) -> None:
+        self.incarnations[name] += 1
+        self._join(name)
+
+    @precondition(lambda self: any(self.incarnations.values()))
+    @rule(name=NAMES)
+    def a_life_joins_again(self, name: str) -> None:
+        if self.incarnations[name]:
+            self._join(name)
+
+    def _join(self, name: str) -> None:
+        join = Join(actor=name, incarnation=self.incarnations[name], spaces=TINY, environments=1)
+        assert self.fleet.join(join, 0.0) is None
+
+    @rule()
+    def an_update_is_made(self) -> None:
+        self.version += 1
+
+    @rule(
+        name=NAMES,
+        key=st.sampled_from(["own", "own", "own", "a", "b"]),
+        older=st.sampled_from([0, 0, 0, 1]),
+        sequence=SEQUENCES,
+        lag=st.sampled_from([0, 0, 1, 2, 3, -1]),
+        epoch=st.sampled_from([EPOCH, EPOCH, EPOCH, EPOCH + 1]),
+    )
+    def a_rollout_comes(self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int) -> None:
+        who = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
+        version = max(self.version - lag, 0)
+        rollout = make_rollout(who, version=version, rows=1, environments=1, shape=(1,))
+        sender = name if key == "own" else key
+        self.sent.append((sender, rollout))
+        self._deliver(sender, rollout)
+
+    @precondition(lambda self: self.sent)
+    @rule(data=st.data())
+    def an_old_one_comes_again(self, data: st.DataObject) -> None:
+        self._deliver(*data.draw(st.sampled_from(self.sent)))
+
+    def _deliver(self, sender: str, rollout: Rollout) -> None:
+        verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, 0.0)
+        expected = self._expected(sender, rollout)
+        assert (verdict.cause if isinstance(verdict, Rejected) else "") == expected
+        who = rollout.identity
+        if expected in ("", "stale"):
+            self.taken.setdefault((who.actor, who.incarnation), set()).add(who.sequence)
+        if isinstance(verdict, Rollout):
+            self.accepted.append((who.actor, who.incarnation, who.sequence))
+
+    def _expected(self, sender: str, rollout: Rollout) -> str:
+        """The cause for which it must be rejected, or nothing."""
+        who = rollout.identity
+        if not self.incarnations[sender]:
+            return "unknown_actor"
+        if who.learner_epoch != EPOCH:
+            return "epoch"
+        if who.actor != sender or who.incarnation != self.incarnations[sender]:
+            return "unknown_actor"
+        taken = self.taken.get((who.actor, who.incarnation), set())
+        if who.sequence in taken or who.sequence <= max(taken, default=0) - 1024:
+            return "duplicate"
+        if rollout.policy_version > self.version:
+            return "malformed"
+        return "stale" if self.version - rollout.policy_version > 2 else ""
+
+    @invariant()
+    def each_was_accepted_at_most_once(self) -> None:
+        assert len(set(self.accepted)) == len(self.accepted)
+        for name, actor in self.fleet.actors.items():
+            assert actor.accepted == sum(accepted[0] == name for accepted in self.accepted)
+
+
+TestTraffic = Traffic.TestCase
+TestTraffic.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

@@ -1,0 +1,115 @@
+"""learner/progress.py: one line on a terminal, lines now and then elsewhere."""
+
+import io
+from types import SimpleNamespace
+
+import pytest
+
+from learner.progress import Progress
+
+CLEAR = "\r\x1b[K"
+
+
+class Screen(io.StringIO):
+    """A terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    """Stands where the test puts it."""
+
+    now = 100.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr("learner.progress.time", SimpleNamespace(monotonic=lambda: clock.now))
+    return clock
+
+
+def row(env_steps: int, **known: float) -> dict[str, float]:
+    return {
+        "wall_seconds": 2.0,
+        "env_steps": env_steps,
+        "env_steps_per_second": 1234.0,
+        "updates_per_second": 56.0,
+        "policy_lag_mean": 0.75,
+        "actors": 2,
+        **known,
+    }
+
+
+def test_a_terminal_has_one_line_that_is_rewritten() -> None:
+    screen = Screen()
+    progress = Progress(screen, 1000)
+    progress.show(row(100))
+    progress.show(row(200))
+    first, second = screen.getvalue().split(CLEAR)[1:]
+    assert "100 (10 %)" in first
+    assert "200 (20 %)" in second
+    assert "\n" not in screen.getvalue()
+
+
+def test_what_is_said_stays_and_begins_a_line_of_its_own() -> None:
+    screen = Screen()
+    progress = Progress(screen, 1000)
+    progress.say("one")
+    progress.show(row(100))
+    progress.say("two")
+    progress.say("three")
+    lines = screen.getvalue().split("\n")
+    assert lines[0] == "one"
+    assert lines[1].startswith(CLEAR)
+    assert lines[2:] == ["two", "three", ""]
+
+
+def test_the_end_leaves_the_line_as_it_is_once() -> None:
+    screen = Screen()
+    progress = Progress(screen, 1000)
+    progress.show(row(100))
+    progress.end()
+    progress.end()
+    assert screen.getvalue().count("\n") == 1
+    assert screen.getvalue().endswith("\n")
+
+
+def test_elsewhere_a_line_comes_after_1_second_and_then_every_5(clock: Clock) -> None:
+    stream = io.StringIO()
+    progress = Progress(stream, 1000)
+    shown = []
+    for tenths in range(0, 121):
+        clock.now = 100.0 + tenths / 10
+        before = stream.getvalue()
+        progress.show(row(tenths))
+        if stream.getvalue() != before:
+            shown.append(tenths)
+    assert shown == [10, 60, 110]
+    assert stream.getvalue().count("\n") == 3
+    assert "\r" not in stream.getvalue()
+    assert "\x1b" not in stream.getvalue()
+
+
+def test_elsewhere_the_end_adds_no_empty_line(clock: Clock) -> None:
+    stream = io.StringIO()
+    progress = Progress(stream, 1000)
+    clock.now += 2.0
+    progress.show(row(100))
+    progress.end()
+    progress.say("done")
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 2
+    assert lines[1] == "done"
+
+
+def test_the_line_tells_the_return_once_there_is_one() -> None:
+    screen = Screen()
+    progress = Progress(screen, 2_000_000)
+    progress.show(row(1_500_000))
+    assert "return       -" in screen.getvalue()
+    progress.show(row(1_500_000, episode_return_mean=475.25))
+    line = screen.getvalue().split(CLEAR)[-1]
+    for part in ("return   475.2", "1,500,000 (75 %)", "1,234/s", "56/s", "lag 0.8", "actors 2"):
+        assert part in line

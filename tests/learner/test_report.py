@@ -1,0 +1,116 @@
+"""learner/report.py: what a run tells of itself."""
+
+import json
+
+import numpy as np
+import pytest
+from building import EPOCH, joined_fleet, make_rollout, run_spec
+
+from learner.counters import RunCounters
+from learner.learner import METRICS
+from learner.metrics import COLUMNS
+from learner.report import RateMeter, episode_statistics, metrics_row, run_status, summary
+
+EVERYTHING = np.ones((6, 3), np.bool_)
+
+
+def trained_counters(*returns: float) -> RunCounters:
+    """After one update from 18 env_steps, 2 versions late."""
+    counters = RunCounters(100)
+    episodes = {
+        "episode_returns": np.array(returns, np.float32),
+        "episode_lengths": np.full(len(returns), 7, np.int32),
+    }
+    rollout = make_rollout(version=3, valid=EVERYTHING, **episodes)
+    counters.accepted(rollout, 180)
+    counters.trained([rollout], 5)
+    return counters
+
+
+def test_rates_are_since_the_last_look() -> None:
+    counters = trained_counters()
+    meter = RateMeter(counters, 10.0)
+    assert meter.rates == {}
+    counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4)
+    expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
+    assert meter.look(counters, 12.0) == expected
+    assert meter.rates == expected
+    assert set(meter.look(counters, 13.0).values()) == {0.0}
+
+
+def test_two_looks_at_once_divide_by_no_0() -> None:
+    meter = RateMeter(trained_counters(), 10.0)
+    assert meter.look(trained_counters(), 10.0)["env_steps_per_second"] == 0.0
+
+
+def test_episode_statistics_are_those_of_the_newest_episodes() -> None:
+    assert episode_statistics(RunCounters(3)) == {}
+    assert episode_statistics(trained_counters(1.0, 2.0, 6.0)) == pytest.approx(
+        {
+            "episode_return_mean": 3.0,
+            "episode_return_std": np.std([1.0, 2.0, 6.0]),
+            "episode_return_min": 1.0,
+            "episode_return_max": 6.0,
+            "episode_length_mean": 7.0,
+        }
+    )
+
+
+def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
+    counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
+    counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
+    fleet.set_present("b", False)
+    rates = RateMeter(counters, 0.0).look(counters, 1.0)
+    learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
+    row = metrics_row(counters, fleet, rates, learning, 9.5)
+    assert set(row) == set(COLUMNS)
+    assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 18, 1)
+    assert (row["actors"], row["rollouts_rejected"], row["policy_lag_max"]) == (1, 3, 2)
+
+
+def test_a_row_at_the_start_leaves_out_what_is_unknown() -> None:
+    row = metrics_row(RunCounters(3), joined_fleet(), {}, {}, 0.0)
+    assert set(row) < set(COLUMNS)
+    assert "episode_return_mean" not in row
+
+
+def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
+    counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
+    spec = run_spec(algorithm="a3c", env_steps=1000)
+    status = run_status("run", EPOCH, spec, counters, fleet, {}, 10.0, 25.0)
+    assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
+    assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
+    assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
+    assert [actor.actor for actor in status.actors] == ["a", "b"]
+
+
+def test_the_summary_is_json_and_counts_bytes_by_the_step() -> None:
+    made = summary(
+        "run",
+        run_spec(algorithm="a3c", seed=4),
+        trained_counters(4.0),
+        solved=True,
+        finished=True,
+        seconds_to_target=3.5,
+        wall_seconds=4.5,
+        env_steps_per_second=4.0,
+    )
+    assert json.loads(json.dumps(made)) == made
+    assert made["rollout_bytes_per_env_step"] == 10.0
+    assert (made["solved"], made["seconds_to_target"], made["seed"]) == (True, 3.5, 4)
+    assert (made["policy_lag_mean"], made["policy_lag_max"], made["episode_return_mean"]) == (2.0, 2, 4.0)
+
+
+def test_the_summary_of_a_run_that_did_nothing_divides_by_no_0() -> None:
+    made = summary(
+        "run",
+        run_spec(),
+        RunCounters(3),
+        solved=False,
+        finished=False,
+        seconds_to_target=None,
+        wall_seconds=0.0,
+        env_steps_per_second=0.0,
+    )
+    assert made["rollout_bytes_per_env_step"] == 0.0
+    assert made["episode_return_mean"] is None

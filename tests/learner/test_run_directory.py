@@ -1,0 +1,145 @@
+"""learner/run_directory.py: what is written there reproduces the run."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from building import run_spec
+from hypothesis import given
+from hypothesis import strategies as st
+
+from learner import run_directory
+from learner.settings import SettingsError, read_preset
+from learner.settings import run_spec as run_spec_of
+from protocol.spec import RunSpec
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+ABOVE_0 = st.floats(0.0, 1e9, exclude_min=True)
+UNIT = st.floats(0.0, 1.0)
+JSON = st.recursive(
+    st.booleans() | st.integers(-(2**60), 2**60) | FINITE | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> RunSpec:
+    def some(**strategies: st.SearchStrategy[Any]) -> dict[str, Any]:
+        """Any of the settings; the others have their defaults."""
+        return draw(st.fixed_dictionaries({}, optional=strategies))
+
+    return RunSpec.model_validate(
+        {
+            "environment": {
+                "id": draw(st.text(min_size=1, max_size=9)),
+                **some(
+                    kwargs=st.dictionaries(st.text(max_size=5), JSON, max_size=3),
+                    max_episode_steps=st.integers(1, 10**9),
+                    reward_scale=ABOVE_0,
+                ),
+            },
+            "policy": some(hidden=st.lists(st.integers(1, 999), min_size=1, max_size=8)),
+            "collection": some(actors=st.integers(1, 99), window=st.integers(1, 64)),
+            "training": some(
+                algorithm=st.sampled_from(["a2c", "a3c", "impala"]),
+                target_return=FINITE,
+                learning_rate=st.floats(0.0, 1.0, exclude_min=True),
+                learning_rate_final=UNIT,
+                entropy_bonus_final=UNIT,
+                optimizer_epsilon=ABOVE_0,
+                stop_when_solved=st.booleans(),
+            ),
+            "service": some(log_seconds=ABOVE_0),
+        }
+    )
+
+
+@given(specs())
+def test_config_toml_reads_back_as_the_same_run(tmp_path_factory: pytest.TempPathFactory, spec: RunSpec) -> None:
+    directory = tmp_path_factory.mktemp("run")
+    run_directory.write_config(directory, spec)
+    assert run_directory.read_config(directory) == spec
+
+
+def test_config_toml_is_complete(tmp_path: Path) -> None:
+    run_directory.write_config(tmp_path, run_spec())
+    text = (tmp_path / run_directory.CONFIG).read_text()
+    assert "discount_factor = 0.99" in text
+    assert "checkpoint_seconds = 60.0" in text
+
+
+def test_config_toml_is_a_preset_too(tmp_path: Path) -> None:
+    run_directory.create(tmp_path, run_spec(algorithm="a3c", seed=9))
+    again = run_spec_of(read_preset(str(tmp_path / run_directory.CONFIG)))
+    assert again == run_spec(algorithm="a3c", seed=9)
+
+
+def test_a_new_run_directory_says_what_the_run_is_and_what_it_ran_on(tmp_path: Path) -> None:
+    run_directory.create(tmp_path / "runs" / "new", run_spec())
+    assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == ["config.toml", "versions.json"]
+    versions = run_directory.read_json(tmp_path / "runs" / "new" / run_directory.VERSIONS)
+    assert {"python", "torch", "numpy", "eclipse-zenoh"} <= versions.keys()
+
+
+def test_an_existing_run_directory_is_refused_and_left_alone(tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    run_directory.create(directory, run_spec(seed=1))
+    with pytest.raises(SettingsError, match=r"exists: continue it with `daedalus resume .*run`"):
+        run_directory.create(directory, run_spec(seed=2))
+    assert run_directory.read_config(directory).training.seed == 1
+
+
+def test_an_empty_directory_will_do_and_a_file_will_not(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    run_directory.create(tmp_path / "empty", run_spec())
+    (tmp_path / "file").touch()
+    with pytest.raises(SettingsError, match="exists"):
+        run_directory.create(tmp_path / "file", run_spec())
+    with pytest.raises(SettingsError, match="Not a directory"):
+        run_directory.create(tmp_path / "file" / "run", run_spec())
+
+
+def test_what_is_no_run_directory_is_said_to_be_none(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
+        run_directory.read_config(tmp_path)
+
+
+def test_json_reads_back_and_damage_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "summary.json"
+    run_directory.write_json(path, {"solved": True, "seconds": 1.5})
+    assert run_directory.read_json(path) == {"solved": True, "seconds": 1.5}
+    path.write_text(path.read_text()[:9])
+    with pytest.raises(SettingsError, match="is damaged"):
+        run_directory.read_json(path)
+    with pytest.raises(SettingsError, match="No such file"):
+        run_directory.read_json(tmp_path / "none.json")
+
+
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "summary.json"
+    run_directory.write_json(path, {"run": 1})
+
+    def refuse(*_: object) -> None:
+        raise OSError("the power failed")
+
+    monkeypatch.setattr("learner.run_directory.os.replace", refuse)
+    with pytest.raises(OSError, match="power"):
+        run_directory.write_json(path, {"run": 2})
+    assert json.loads(path.read_text()) == {"run": 1}
+
+
+def test_a_default_directory_is_named_after_the_run() -> None:
+    directory = run_directory.default_directory("ALE/Pong-v5", run_spec(algorithm="a3c", seed=4))
+    assert directory.parent == Path("runs")
+    assert directory.name.startswith("ALE-Pong-v5-a3c-s4-")
+
+
+def test_another_budget_changes_nothing_else() -> None:
+    spec = run_spec(algorithm="a3c", target_return=2.0)
+    longer = run_directory.with_budget(spec, 5_000_000)
+    assert longer.training.env_steps == 5_000_000
+    assert run_directory.with_budget(longer, spec.training.env_steps) == spec
+    with pytest.raises(SettingsError, match=r"training\.env_steps"):
+        run_directory.with_budget(spec, 0)

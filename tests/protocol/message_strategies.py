@@ -1,0 +1,140 @@
+"""Hypothesis strategies for every kind of message."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from wire_format import DTYPES, bits
+
+from protocol.messages import (
+    Acknowledgement,
+    Farewell,
+    Join,
+    Program,
+    Refusal,
+    Rollout,
+    RolloutIdentity,
+    Snapshot,
+    StatusReport,
+    Welcome,
+)
+from protocol.spec import (
+    ActorStatus,
+    ArraySpace,
+    ChoiceSpace,
+    CollectionSpec,
+    EnvironmentSpec,
+    PolicySpec,
+    RunSpec,
+    RunStatus,
+    ServiceSpec,
+    Spaces,
+    TrainingSpec,
+)
+
+text = st.text(max_size=20)
+counters = st.integers(0, 2**63 - 1)
+positive = st.integers(1, 10_000)
+floats = st.floats(allow_nan=False, allow_infinity=False)
+generators = st.integers(0, 2**32).map(np.random.default_rng)
+spaces = st.builds(
+    Spaces,
+    observation=st.builds(
+        ArraySpace, shape=st.lists(positive, max_size=4).map(tuple), dtype=st.sampled_from(["float32", "uint8"])
+    ),
+    action=st.builds(ChoiceSpace, count=st.integers(1, 65_536)),
+)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | floats | text,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
+    max_leaves=6,
+)
+run_specs = st.builds(
+    RunSpec,
+    environment=st.builds(
+        EnvironmentSpec,
+        id=st.text(min_size=1, max_size=20),
+        kwargs=st.dictionaries(text, json_values, max_size=3),
+        max_episode_steps=st.none() | positive,
+        reward_scale=st.floats(1e-6, 1e6),
+    ),
+    policy=st.builds(
+        PolicySpec,
+        hidden=st.lists(positive, min_size=1, max_size=8).map(tuple),
+        activation=st.sampled_from(["tanh", "relu"]),
+    ),
+    collection=st.builds(CollectionSpec, actors=positive, window=st.integers(1, 64)),
+    training=st.builds(
+        TrainingSpec,
+        algorithm=st.sampled_from(["a2c", "a3c", "impala"]),
+        seed=st.integers(0, 2**32 - 1),
+        target_return=st.none() | floats,
+        discount_factor=st.floats(0, 1),
+        learning_rate_final=st.none() | st.floats(0, 1),
+    ),
+    service=st.builds(ServiceSpec, log_seconds=st.floats(0.01, 100)),
+)
+actor_statuses = st.builds(
+    ActorStatus,
+    actor=text,
+    seconds_since_seen=floats,
+    rollouts_rejected=st.dictionaries(text, counters, max_size=3),
+    **dict.fromkeys(("environments", "rollouts_accepted", "env_steps", "policy_lag"), counters),
+)
+statuses = st.builds(
+    RunStatus,
+    episode_return_mean=st.none() | floats,
+    actors=st.lists(actor_statuses, max_size=3).map(tuple),
+    **dict.fromkeys(("run", "algorithm", "environment"), text),
+    **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), counters),
+    **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), floats),
+)
+
+
+@st.composite
+def rollouts(draw: st.DrawFn) -> Rollout:
+    random = draw(generators)
+    rows, environments = draw(st.integers(1, 5)), draw(st.integers(1, 4))
+    episodes = draw(st.integers(0, rows * environments))
+    observation = (rows + 1, environments, *draw(st.lists(st.integers(1, 5), min_size=1, max_size=3)))
+    shape = (rows, environments)
+    return Rollout(
+        identity=draw(
+            st.builds(RolloutIdentity, actor=text, incarnation=counters, sequence=counters, learner_epoch=counters)
+        ),
+        policy_version=draw(counters),
+        observations=bits(random, draw(st.sampled_from(["<f4", "|u1"])), observation),
+        actions=bits(random, draw(st.sampled_from(["|u1", "<u2", "<i4", "<i8"])), shape),
+        behaviour_log_probs=bits(random, "<f4", shape),
+        rewards=bits(random, "<f4", shape),
+        terminated=bits(random, "|b1", shape),
+        truncated=bits(random, "|b1", shape),
+        valid=bits(random, "|b1", shape),
+        episode_returns=bits(random, "<f4", (episodes,)),
+        episode_lengths=bits(random, "<i4", (episodes,)),
+    )
+
+
+@st.composite
+def snapshots(draw: st.DrawFn) -> Snapshot:
+    random = draw(generators)
+    shapes = st.lists(st.integers(0, 6), max_size=4).map(tuple)
+    layout = draw(st.dictionaries(text, st.tuples(st.sampled_from(DTYPES), shapes), max_size=6))
+    weights = {name: bits(random, dtype, shape) for name, (dtype, shape) in layout.items()}
+    return Snapshot(learner_epoch=draw(counters), policy_version=draw(counters), program=draw(text), weights=weights)
+
+
+KINDS: dict[type, st.SearchStrategy[Any]] = {
+    Join: st.builds(
+        Join, actor=text, incarnation=counters, spaces=st.none() | spaces, environments=st.integers(0, 4096)
+    ),
+    Welcome: st.builds(Welcome, run=text, learner_epoch=counters, seed=counters, spec=run_specs),
+    Refusal: st.builds(Refusal, reason=text),
+    Program: st.builds(Program, hash=text, model=st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))),
+    Rollout: rollouts(),
+    Acknowledgement: st.builds(Acknowledgement, reason=text, policy_version=counters),
+    Snapshot: snapshots(),
+    Farewell: st.builds(Farewell, learner_epoch=counters, reason=text),
+    StatusReport: st.builds(StatusReport, status=statuses),
+}
+messages = st.one_of(*KINDS.values())

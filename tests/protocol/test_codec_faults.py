@@ -1,0 +1,190 @@
+"""One fault at a time: each is refused by a reason that names it."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from wire_format import (
+    LIMITS,
+    SAMPLES,
+    SNAPSHOT,
+    WELCOME,
+    decoded_or_refused,
+    some_rollout,
+    unwire,
+    wire,
+    wire_header,
+)
+
+from protocol.codec import PROTOCOL_VERSION, ProtocolError, VersionMismatchError, decode, encode
+from protocol.messages import (
+    Farewell,
+    Join,
+    Message,
+    Refusal,
+)
+
+Edit = Callable[[dict[str, Any]], object]
+SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
+    "unknown kind": (lambda c: c.update(kind="Pickle"), "unknown kind"),
+    "kind of another type": (lambda c: c.update(kind=["Snapshot"]), "unknown kind"),
+    "field missing": (lambda c: c["fields"].pop("program"), "field 'program' is missing"),
+    "field unknown": (lambda c: c["fields"].update(extra=1), "unknown field 'extra'"),
+    "text for a number": (lambda c: c["fields"].update(learner_epoch="1"), "'learner_epoch' must be int, not str"),
+    "bool for a number": (lambda c: c["fields"].update(learner_epoch=True), "'learner_epoch' must be int, not bool"),
+    "float for a number": (lambda c: c["fields"].update(learner_epoch=1.0), "'learner_epoch' must be int, not float"),
+    "nil for a number": (lambda c: c["fields"].update(learner_epoch=None), "'learner_epoch' must be int"),
+    "number for text": (lambda c: c["fields"].update(program=1), "'program' must be str, not int"),
+    "negative number": (lambda c: c["fields"].update(policy_version=-1), "from 0 to"),
+    "number of 64 bits": (lambda c: c["fields"].update(policy_version=2**63), "from 0 to"),
+    "fields not a map": (lambda c: c.update(fields=[]), "wrong type"),
+    "arrays not a list": (lambda c: c.update(arrays={}), "wrong type"),
+    "size not a number": (lambda c: c.update(size="24"), "wrong type"),
+    "size a bool": (lambda c: c.update(size=True), "wrong type"),
+    "size negative": (lambda c: c.update(size=-8), "wrong type"),
+    "header entry missing": (lambda c: c.pop("size"), "exactly kind, fields, arrays and size"),
+    "header entry unknown": (lambda c: c.update(more=1), "exactly kind, fields, arrays and size"),
+    "array nobody knows": (lambda c: c["arrays"][0].__setitem__(0, "gradients/w"), "has no array 'gradients/w'"),
+    "array twice": (lambda c: c["arrays"][1].__setitem__(0, "weights/w"), "distinct"),
+    "array name a number": (lambda c: c["arrays"][0].__setitem__(0, 1), "distinct strings"),
+    "array without a shape": (lambda c: c["arrays"][0].pop(), "a name, a dtype and a shape"),
+    "array a map": (lambda c: c["arrays"].__setitem__(0, {}), "a name, a dtype and a shape"),
+    "dtype float64": (lambda c: c["arrays"][0].__setitem__(1, "<f8"), "does not travel"),
+    "dtype object": (lambda c: c["arrays"][0].__setitem__(1, "|O"), "does not travel"),
+    "dtype big-endian": (lambda c: c["arrays"][0].__setitem__(1, ">f4"), "does not travel"),
+    "dtype a list": (lambda c: c["arrays"][0].__setitem__(1, ["<f4"]), "does not travel"),
+    "shape a number": (lambda c: c["arrays"][0].__setitem__(2, 4), "no proper shape"),
+    "side negative": (lambda c: c["arrays"][0].__setitem__(2, [-2, -2]), "no proper shape"),
+    "side -1": (lambda c: c["arrays"][0].__setitem__(2, [2, -1]), "no proper shape"),
+    "side a float": (lambda c: c["arrays"][0].__setitem__(2, [2.0, 2]), "no proper shape"),
+    "side NaN": (lambda c: c["arrays"][0].__setitem__(2, [float("nan"), 2]), "no proper shape"),
+    "side a bool": (lambda c: c["arrays"][0].__setitem__(2, [True, 4]), "no proper shape"),
+    "side too long": (lambda c: c["arrays"][0].__setitem__(2, [2**40, 2]), "no proper shape"),
+    "too many dimensions": (lambda c: c["arrays"][0].__setitem__(2, [1] * 9), "no proper shape"),
+    "shape larger than the body": (lambda c: c["arrays"][0].__setitem__(2, [2, 200]), "the body declares 24"),
+    "product of sides huge": (lambda c: c["arrays"][0].__setitem__(2, [1 << 26] * 8), "the body declares 24"),
+    "size less than the arrays": (lambda c: c.update(size=16), "the body declares 16"),
+    "size beyond the limit": (lambda c: c.update(size=LIMITS.max_bytes + 8), "the limit is"),
+    "size of 64 bits": (lambda c: c.update(size=2**64 - 1), "the limit is"),
+}
+
+
+@pytest.mark.parametrize("fault", SNAPSHOT_FAULTS)
+def test_a_header_with_one_fault_is_refused_by_that_fault(fault: str) -> None:
+    edit, reason = SNAPSHOT_FAULTS[fault]
+    _, content, body = unwire(SAMPLES["snapshot"])
+    edit(content)
+    with pytest.raises(ProtocolError, match=reason):
+        decode(wire(content, body), LIMITS)
+
+
+@pytest.mark.parametrize("sides", [[0] + [1 << 26] * 3, [1 << 26] * 3 + [0], [1 << 26] * 7 + [0]])
+def test_an_empty_array_with_huge_sides_is_refused_or_empty(sides: list[int]) -> None:
+    _, content, _ = unwire(SAMPLES["snapshot"])
+    content.update(arrays=[["weights/w", "<f4", sides]], size=0)
+    decoded_or_refused(wire(content))
+
+
+@pytest.mark.parametrize("message", [Join(actor="a", incarnation=1), WELCOME, SNAPSHOT, some_rollout()])
+def test_every_field_is_needed_and_no_other_is_known(message: Message) -> None:
+    flags, content, body = unwire(encode(message))
+    for name in content["fields"]:
+        less = copy.deepcopy(content)
+        del less["fields"][name]
+        with pytest.raises(ProtocolError, match=f"field '{name}' is missing"):
+            decode(wire(less, body, flags=flags), LIMITS)
+    content["fields"]["typo"] = None
+    with pytest.raises(ProtocolError, match="unknown field 'typo'"):
+        decode(wire(content, body, flags=flags), LIMITS)
+
+
+def test_faults_within_a_nested_message_are_named_by_their_path() -> None:
+    flags, content, body = unwire(SAMPLES["rollout"])
+    for identity, reason in (
+        (1, "'identity' must be a map"),
+        ({**content["fields"]["identity"], "sequence": True}, "'identity.sequence' must be int, not bool"),
+        ({**content["fields"]["identity"], "x": 1}, "unknown field 'identity.x'"),
+        ({"actor": "a"}, "field 'identity.incarnation' is missing"),
+    ):
+        content["fields"]["identity"] = identity
+        with pytest.raises(ProtocolError, match=reason):
+            decode(wire(content, body, flags=flags), LIMITS)
+
+
+def test_every_array_of_a_rollout_is_needed() -> None:
+    rollout = some_rollout()
+    for name in ("observations", "actions", "valid", "episode_lengths"):
+        flags, content, body = unwire(encode(rollout))
+        for entry in content["arrays"]:
+            entry[0] = f"not_{name}" if entry[0] == name else entry[0]
+        with pytest.raises(ProtocolError, match=f"array '{name}' is missing"):
+            decode(wire(content, body, flags=flags), LIMITS)
+
+
+def test_an_array_beyond_the_expected_is_refused() -> None:
+    _, content, _ = unwire(encode(Farewell(learner_epoch=1, reason="")))
+    content.update(arrays=[["extra", "|u1", [8]]], size=8)
+    with pytest.raises(ProtocolError, match="Farewell has no array 'extra'"):
+        decode(wire(content, bytes(8)), LIMITS)
+
+
+def test_a_body_with_room_that_no_array_takes_is_refused() -> None:
+    _, content, body = unwire(SAMPLES["snapshot"])
+    content["size"] += 8
+    with pytest.raises(ProtocolError, match="the arrays take 24 bytes, the body declares 32"):
+        decode(wire(content, body + bytes(8)), LIMITS)
+
+
+def test_shapes_that_do_not_fit_together_are_refused_by_the_messages_own_check() -> None:
+    flags, content, body = unwire(SAMPLES["rollout"])
+    content["arrays"][1][2] = [4, 8]
+    with pytest.raises(ProtocolError, match="Rollout: observations must be"):
+        decode(wire(content, body, flags=flags), LIMITS)
+
+
+@pytest.mark.parametrize("code", ["other", "", 1, None, ["mismatch"]])
+def test_a_choice_outside_its_list_is_refused(code: Any) -> None:
+    _, content, _ = unwire(encode(Refusal(code="mismatch", reason="")))
+    content["fields"]["code"] = code
+    with pytest.raises(ProtocolError, match="'code' must be one of mismatch"):
+        decode(wire(content), LIMITS)
+
+
+@pytest.mark.parametrize("spec", [None, 1, [], {}, {"environment": {"id": "x"}, "typo": 1}])
+def test_a_specification_that_does_not_hold_is_refused(spec: Any) -> None:
+    _, content, _ = unwire(encode(WELCOME))
+    content["fields"]["spec"] = spec
+    with pytest.raises(ProtocolError, match="Welcome: "):
+        decode(wire(content), LIMITS)
+
+
+@pytest.mark.parametrize("value", [2, 255])
+def test_a_truth_value_is_0_or_1(value: int) -> None:
+    _, content, _ = unwire(SAMPLES["snapshot"])
+    content.update(arrays=[["weights/w", "|b1", [8]]], size=8)
+    decode(wire(content, bytes([0, 1] * 4)), LIMITS)
+    with pytest.raises(ProtocolError, match="'weights/w' has a truth value that is neither 0 nor 1"):
+        decode(wire(content, bytes([0, 1, 0, 1, 0, 1, 0, value])), LIMITS)
+
+
+def test_the_header_must_be_a_map() -> None:
+    for content in (None, 1, "x", [], {}):
+        with pytest.raises(ProtocolError, match="exactly kind, fields, arrays and size"):
+            decode(wire(content), LIMITS)
+
+
+def test_unknown_flags_and_magic_are_refused() -> None:
+    _, content, body = unwire(SAMPLES["snapshot"])
+    with pytest.raises(ProtocolError, match="unknown flags 2"):
+        decode(wire(content, body, flags=2), LIMITS)
+    with pytest.raises(ProtocolError, match="not a message of this protocol"):
+        decode(b"HTTP" + SAMPLES["snapshot"][4:], LIMITS)
+
+
+@pytest.mark.parametrize("version", [0, 2, 65_535])
+def test_another_version_is_named_beside_our_own(version: int) -> None:
+    for data in (wire({}, version=version), wire_header(b"\xc1 of the future", version=version)):
+        with pytest.raises(VersionMismatchError, match=rf"version {version}, this one {PROTOCOL_VERSION}:") as refused:
+            decode(data, LIMITS)
+        assert refused.value.theirs == version

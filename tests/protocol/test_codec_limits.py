@@ -1,0 +1,145 @@
+"""What a message may cost its reader before it is refused."""
+
+import dataclasses
+import struct
+import tracemalloc
+
+import msgpack
+import numpy as np
+import pytest
+import zstandard
+from wire_format import (
+    LIMITS,
+    PREFIX,
+    SAMPLES,
+    SNAPSHOT,
+    WELCOME,
+    decoded_or_refused,
+    unwire,
+    wire,
+    wire_header,
+)
+
+from protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from protocol.messages import (
+    Farewell,
+    Snapshot,
+)
+
+
+def peak_bytes(data: bytes, limits: Limits) -> int:
+    """The most memory that refusing `data` took."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProtocolError):
+            decode(data, limits)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def zeros_frame(size: int, *, declared: bool) -> bytes:
+    """A zstd frame of `size` zeros, made without ever holding them."""
+    compressor = zstandard.ZstdCompressor().compressobj(size=size if declared else -1)
+    chunk = bytes(1 << 20)
+    return b"".join(compressor.compress(chunk) for _ in range(size >> 20)) + compressor.flush()
+
+
+BOMB = 256 << 20
+SMALL = Limits(max_bytes=1 << 20, max_header_bytes=4096, max_arrays=4)
+
+
+def bomb(frame: bytes, size: int) -> bytes:
+    _, content, _ = unwire(SAMPLES["snapshot"])
+    content.update(arrays=[["weights/w", "|u1", [size]]], size=size)
+    return wire(content, frame, flags=1)
+
+
+def test_a_frame_that_declares_more_than_the_header_is_not_unpacked() -> None:
+    frame = zeros_frame(BOMB, declared=True)
+    assert len(frame) < 1 << 20
+    assert peak_bytes(bomb(frame, 1 << 16), SMALL) < 2 << 20
+    assert peak_bytes(bomb(frame, BOMB), SMALL) < 2 << 20
+
+
+def test_a_frame_that_declares_nothing_is_not_unpacked() -> None:
+    assert peak_bytes(bomb(zeros_frame(BOMB, declared=False), 1 << 16), SMALL) < 2 << 20
+
+
+def test_a_frame_that_lies_about_its_size_is_unpacked_no_further() -> None:
+    frame = zeros_frame(BOMB, declared=True)
+    lie = frame.replace(struct.pack("<I", BOMB), struct.pack("<I", 1 << 16), 1)
+    assert lie != frame
+    assert zstandard.frame_content_size(lie) == 1 << 16
+    assert peak_bytes(bomb(lie, 1 << 16), SMALL) < 2 << 20
+
+
+def test_a_frame_that_holds_less_than_it_declares_is_refused() -> None:
+    frame = zstandard.ZstdCompressor().compress(bytes(1 << 16))
+    for body in (frame[:-4], frame + frame, frame + b"x", b"", b"not zstd", bytes(8)):
+        with pytest.raises(ProtocolError):
+            decode(bomb(body, 1 << 16), LIMITS)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"\xdd\xff\xff\xff\xff",  # list of 2^32 - 1
+        b"\xdf\xff\xff\xff\xff",  # map
+        b"\xdb\xff\xff\xff\xff",  # text
+        b"\xc6\xff\xff\xff\xff",  # bytes
+        b"\xc9\xff\xff\xff\xff\x01",  # extension
+        b"\xdd\x00\xff\xff\xff" * 100,  # lists in lists
+        b"\xc4\x04abcd",  # bytes at all
+        b"\xd6\x01abcd",  # an extension at all
+        b"\xd6\xffabcd",  # a timestamp
+        b"\xa2\xff\xff",  # text that is not UTF-8
+        b"\xc1",  # never used
+        b"\x91" * 4000,  # deep
+        b"\x81\xa1a" * 1300,  # deep
+        b"\x81\x90\x01",  # a list for a key
+        b"\x81\x01\x01",  # a number for a key
+        b"\x80\x80",  # two values
+    ],
+)
+def test_a_header_that_declares_the_moon_costs_nothing(header: bytes) -> None:
+    assert peak_bytes(wire_header(header), SMALL) < 1 << 20
+
+
+@pytest.mark.parametrize("depth", [100, 254, 255, 400, 500, 511, 512, 2000])
+def test_deep_nesting_is_decoded_or_refused(depth: int) -> None:
+    _, content, _ = unwire(encode(WELCOME))
+    for opening, closing in ((b"\x91", b""), (b"\x81\xa1a", b"")):
+        nested = opening * depth + b"\x01" + closing
+        content["fields"]["spec"]["environment"]["kwargs"] = {"a": "HERE"}
+        header = (msgpack.packb(content) or b"").replace(b"\xa4HERE", nested)
+        decoded_or_refused(wire_header(header))
+
+
+def test_a_header_beyond_its_limit_is_not_read() -> None:
+    _, content, _ = unwire(encode(Farewell(learner_epoch=1, reason="x" * 5000)))
+    with pytest.raises(ProtocolError, match=r"the header declares .* the limit is 4096"):
+        decode(wire(content), SMALL)
+    with pytest.raises(ProtocolError, match="the header declares 4294967295 bytes"):
+        decode(PREFIX.pack(b"DAED", PROTOCOL_VERSION, 0, 2**32 - 1), SMALL)
+
+
+def test_more_arrays_than_the_limit_are_refused() -> None:
+    many = {f"w{index}": np.zeros(1, np.float32) for index in range(5)}
+    data = encode(dataclasses.replace(SNAPSHOT, weights=many))
+    decode(data, LIMITS)
+    with pytest.raises(ProtocolError, match="5 arrays, the limit is 4"):
+        decode(data, SMALL)
+
+
+def test_a_body_at_the_limit_is_accepted_and_one_beyond_it_refused() -> None:
+    limits = Limits(max_bytes=4096)
+    for count, kind in ((1024, Snapshot), (1026, None)):
+        data = encode(dataclasses.replace(SNAPSHOT, weights={"w": np.zeros(count, np.float32)}))
+        if kind is None:
+            with pytest.raises(ProtocolError, match="the limit is 4096"):
+                decode(data, limits)
+        else:
+            assert isinstance(decode(data, limits), kind)
+    with pytest.raises(ProtocolError, match=r"a message of .* bytes, the limit is 4096"):
+        decode(SAMPLES["snapshot"] + bytes(5000), limits)

@@ -1,0 +1,138 @@
+"""The wire format once more, written by hand, and a few messages in it: shared by the tests of the codec."""
+
+import contextlib
+import dataclasses
+import struct
+from typing import Any
+
+import msgpack
+import numpy as np
+from hypothesis import settings
+
+from protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from protocol.messages import (
+    Join,
+    Message,
+    Rollout,
+    RolloutIdentity,
+    Snapshot,
+    Welcome,
+)
+from protocol.spec import (
+    ArraySpace,
+    ChoiceSpace,
+    EnvironmentSpec,
+    RunSpec,
+    Spaces,
+)
+
+LIMITS = Limits()
+PREFIX = struct.Struct("<4sHHI")
+DTYPES = ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")
+repeatable = settings(max_examples=60, deadline=None, derandomize=True)
+
+
+def wire(content: Any, body: bytes = b"", *, flags: int = 0, version: int = PROTOCOL_VERSION) -> bytes:
+    """A message from the content of its header."""
+    return wire_header(msgpack.packb(content) or b"", body, flags=flags, version=version)
+
+
+def wire_header(header: bytes, body: bytes = b"", *, flags: int = 0, version: int = PROTOCOL_VERSION) -> bytes:
+    prefix = PREFIX.pack(b"DAED", version, flags, len(header))
+    return prefix + header + bytes(-(len(prefix) + len(header)) % 8) + body
+
+
+def unwire(data: bytes) -> tuple[int, dict[str, Any], bytes]:
+    """Flags, header content and body of a message."""
+    magic, version, flags, length = PREFIX.unpack_from(data)
+    assert (magic, version) == (b"DAED", PROTOCOL_VERSION)
+    end = PREFIX.size + length
+    start = end + -end % 8
+    assert not any(data[end:start])
+    return flags, msgpack.unpackb(data[PREFIX.size : end]), data[start:]
+
+
+def bits(random: np.random.Generator, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Any bit pattern of a dtype, NaNs and infinities among them."""
+    if dtype == "|b1":
+        return random.integers(0, 2, shape).astype(np.bool_)
+    count = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    return np.frombuffer(random.bytes(count), dtype).reshape(shape)
+
+
+def the_same(left: Any, right: Any) -> bool:
+    """Equality of messages, their arrays bit for bit."""
+    if type(left) is not type(right):
+        return False
+    if isinstance(left, np.ndarray):
+        return (left.dtype, left.shape, left.tobytes()) == (right.dtype, right.shape, right.tobytes())
+    if isinstance(left, dict):
+        return left.keys() == right.keys() and all(the_same(left[key], right[key]) for key in left)
+    if dataclasses.is_dataclass(left):
+        names = [field.name for field in dataclasses.fields(left)]
+        return all(the_same(getattr(left, name), getattr(right, name)) for name in names)
+    return left == right
+
+
+def arrays_of(message: Message) -> list[np.ndarray]:
+    values = [getattr(message, field.name) for field in dataclasses.fields(message)]
+    values += [array for value in values if isinstance(value, dict) for array in value.values()]
+    return [value for value in values if isinstance(value, np.ndarray)]
+
+
+def decoded_or_refused(data: bytes, limits: Limits = LIMITS) -> None:
+    """Anything but a message or a ProtocolError fails the test that calls this."""
+    with contextlib.suppress(ProtocolError):
+        assert isinstance(decode(data, limits), Message)
+
+
+IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=2, learner_epoch=3)
+JOIN = Join(
+    actor="a",
+    incarnation=7,
+    spaces=Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2)),
+)
+SNAPSHOT = Snapshot(
+    learner_epoch=1,
+    policy_version=2,
+    program="abc",
+    weights={"w": np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), "b": np.array([1, 2, 3], np.uint8)},
+)
+WELCOME = Welcome(run="r", learner_epoch=1, seed=1, spec=RunSpec(environment=EnvironmentSpec(id="x")))
+STATUS = wire(  # every field of a status, as another implementation could write it
+    {
+        "kind": "StatusReport",
+        "fields": {
+            "status": {
+                **dict.fromkeys(("run", "algorithm", "environment"), "x"),
+                **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), 1),
+                **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second"), 1.0),
+                "policy_lag_mean": 0.0,
+                "episode_return_mean": None,
+                "actors": [],
+            }
+        },
+        "arrays": [],
+        "size": 0,
+    }
+)
+
+
+def some_rollout() -> Rollout:
+    rows = np.zeros((8, 4))
+    return Rollout(
+        identity=IDENTITY,
+        policy_version=5,
+        observations=np.zeros((9, 4, 3), np.float32),
+        actions=rows.astype(np.int64),
+        behaviour_log_probs=rows.astype(np.float32),
+        rewards=rows.astype(np.float32),
+        terminated=rows.astype(np.bool_),
+        truncated=rows.astype(np.bool_),
+        valid=rows.astype(np.bool_),
+        episode_returns=np.zeros(1, np.float32),
+        episode_lengths=np.zeros(1, np.int32),
+    )
+
+
+SAMPLES = {"join": encode(JOIN), "snapshot": encode(SNAPSHOT), "rollout": encode(some_rollout()), "status": STATUS}
