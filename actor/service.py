@@ -43,7 +43,7 @@ class _LearnerLostError(Exception):
 
 
 class _OverError(Exception):
-    """Told to stop, or the run is over."""
+    """Told to stop, or the run is over; the message says which."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +74,8 @@ class ActorService:
         self._inboxes: dict[str, Inbox] = {}  # by run
         self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
         self._snapshot: Snapshot | None = None  # the newest of this learner epoch
+        self._learner_epoch = -1
+        self._sequence = 0  # of the next rollout to this learner epoch
 
     def run(self) -> None:
         """Plays until stopped or until the learner says that the run is over.
@@ -87,8 +89,8 @@ class ActorService:
                     self._take_part(self._find_learner())
                 except _LearnerLostError:
                     self._say("the learner went away; looking for it again")
-        except _OverError:
-            pass
+        except _OverError as error:
+            self._say(str(error))
         finally:
             if self._made is not None:
                 self._made[1].close()
@@ -99,6 +101,7 @@ class ActorService:
         """Asks for a learner until one answers."""
         deadline = None if self._config.timeout is None else time.monotonic() + self._config.timeout
         pause, told = _FIRST_RETRY_SECONDS, False
+        self._learner_left = False
         while True:
             welcome = self._join(self._config.run, Join(actor=self._config.name, incarnation=self._config.incarnation))
             if welcome is not None:
@@ -111,7 +114,7 @@ class ActorService:
                 self._say("waiting for a learner")
                 told = True
             if self._stop.wait(pause):
-                raise _OverError
+                raise _OverError("stopped")
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
 
     def _join(self, run: str, join: Join) -> Welcome | None:
@@ -129,7 +132,7 @@ class ActorService:
         refusal = answers[0]
         assert isinstance(refusal, Refusal)
         if refusal.code == "finished":
-            raise _OverError
+            raise _OverError("the run is over")
         raise ActorError(f"the learner refused this actor: {refusal.reason}")
 
     def _ask(self, key: str, payload: bytes = b"") -> list[bytes]:
@@ -165,8 +168,11 @@ class ActorService:
         if confirmed is None or confirmed.learner_epoch != welcome.learner_epoch:
             raise _LearnerLostError
         with self._changed:
-            self._uploader = Uploader(window=welcome.spec.collection.window)
-            self._learner_left = False
+            if welcome.learner_epoch == self._learner_epoch:  # the network failed, and not the learner
+                self._uploader.send_again()
+            else:
+                self._uploader = Uploader(window=welcome.spec.collection.window)
+                self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         self._snapshot = None
         self._say(
             f"joined run {welcome.run!r} as {self._config.name!r}: {environments.count} x {welcome.spec.environment.id}"
@@ -200,7 +206,7 @@ class ActorService:
             reward_scale=welcome.spec.environment.reward_scale,
             seed=welcome.seed,
         )
-        sequence, loaded = 0, -1
+        loaded = -1
         while True:
             if self._snapshot.policy_version != loaded:
                 collector.load(self._snapshot.weights)
@@ -208,15 +214,15 @@ class ActorService:
             identity = RolloutIdentity(
                 actor=self._config.name,
                 incarnation=self._config.incarnation,
-                sequence=sequence,
+                sequence=self._sequence,
                 learner_epoch=welcome.learner_epoch,
             )
             payload = encode(collector.collect(identity, loaded))
             self._wait(lambda: self._uploader.has_room)
             with self._changed:
-                self._uploader.add(sequence, payload)
+                self._uploader.add(self._sequence, payload)
             self._send_due(welcome.run)
-            sequence += 1
+            self._sequence += 1
             if welcome.spec.synchronous:
                 self._await_snapshot(welcome, newer_than=loaded)
             else:
@@ -267,8 +273,7 @@ class ActorService:
     def _take_news(self, welcome: Welcome, data: bytes) -> None:
         news = self._decode(data)
         if isinstance(news, Farewell) and news.learner_epoch == welcome.learner_epoch:
-            self._say(f"the run is over: {news.reason}")
-            raise _OverError
+            raise _OverError(f"the run is over: {news.reason}")
         if not isinstance(news, Snapshot):
             return
         if news.learner_epoch != welcome.learner_epoch:
@@ -297,8 +302,10 @@ class ActorService:
 
     def _check(self) -> None:
         """Raises if there is a reason to stop playing."""
-        if self._stop.is_set() or self._uploader.over == "finished":
-            raise _OverError
+        if self._stop.is_set():
+            raise _OverError("stopped")
+        if self._uploader.over == "finished":
+            raise _OverError("the run is over")
         if self._learner_left or self._uploader.over == "fenced":
             raise _LearnerLostError
 
@@ -333,7 +340,8 @@ class ActorService:
 
     def _on_learner(self, _key: str, present: bool) -> None:
         with self._changed:
-            self._learner_left = not present
+            # Whoever is there next may be another: to be asked.
+            self._learner_left = self._learner_left or not present
             self._changed.notify_all()
 
     def _notify(self) -> None:

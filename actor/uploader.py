@@ -40,6 +40,11 @@ class Uploader:
         """Takes in a rollout; it is due at once."""
         self.in_flight[sequence] = _InFlight(payload)
 
+    def send_again(self) -> None:
+        """Makes all of them due: answers may have been lost with a connection."""
+        for rollout in self.in_flight.values():
+            rollout.send_at, rollout.attempts = 0.0, 0
+
     def due(self, now: float) -> list[tuple[int, bytes]]:
         """Those to send now, oldest first; each is then awaited until `answered`."""
         ready = []

@@ -62,6 +62,8 @@ def save_checkpoint(
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         shutil.rmtree(old, ignore_errors=True)
+    for unfinished in directory.parent.glob(".*"):  # what a crash left
+        shutil.rmtree(unfinished, ignore_errors=True)
     return directory
 
 

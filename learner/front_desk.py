@@ -34,6 +34,7 @@ class FrontDesk:
         self._lock = lock
         self._snapshot = encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
         self._programs: dict[str, bytes] = {}
+        self._over = False
 
     def join(self, data: bytes, now: float) -> bytes:
         """The answer to a Join: Welcome, or Refusal with the reason. Wakes who waits for actors."""
@@ -43,6 +44,8 @@ class FrontDesk:
             return encode(Refusal(code="mismatch", reason=str(error)))
         if not isinstance(message, Join):
             return encode(Refusal(code="malformed", reason="only actors that ask to join belong here"))
+        if self._over:
+            return encode(Refusal(code="finished", reason="the run is over"))
         with self._lock:
             refusal = self._fleet.join(message, now)
             if refusal is not None:
@@ -64,6 +67,11 @@ class FrontDesk:
     def offer_snapshot(self, encoded: bytes) -> None:
         """Has the newest snapshot ready, as the bytes that were published."""
         self._snapshot = encoded
+
+    def close(self, farewell: bytes) -> None:
+        """Lets nobody in any more, and answers with a farewell where there were snapshots."""
+        self._over = True
+        self._snapshot = farewell
 
     def snapshot(self) -> bytes:
         """The answer to a query for the newest snapshot."""

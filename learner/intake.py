@@ -41,8 +41,7 @@ class Intake:
     def read(self, sender: str, data: bytes) -> Rollout | Rejected:
         """Decodes what `sender` put on its key, and holds its content against the specification.
 
-        Takes the time it takes, changes nothing, and needs no lock: what it reads of the fleet only ever
-        goes from unknown to known.
+        Takes the time it takes, changes nothing, and needs no lock: `judge` looks again at what may have changed.
         """
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
         if spaces is None or actor is None or not actor.environments:
@@ -53,6 +52,9 @@ class Intake:
             return Rejected(verdict="rejected", cause="malformed", reason=str(error))
         if not isinstance(rollout, Rollout):
             return Rejected(verdict="rejected", cause="malformed", reason="not a rollout")
+        stranger = self._stranger(sender, rollout)
+        if stranger is not None:
+            return stranger
         fault = self._fault(rollout, spaces, actor)
         return Rejected(verdict="rejected", cause="malformed", reason=fault) if fault else rollout
 
@@ -70,12 +72,10 @@ class Intake:
         return verdict
 
     def _judge(self, sender: str, rollout: Rollout, policy_version: int) -> Rollout | Rejected:
-        identity = rollout.identity
-        if identity.learner_epoch != self._epoch:
-            return Rejected(verdict="fenced", cause="epoch", reason="meant for another life of the learner")
-        actor = self._fleet.expected(identity)
-        if identity.actor != sender or actor is None:
-            return Rejected(verdict="fenced", cause="unknown_actor", reason="another life of this actor has joined")
+        stranger = self._stranger(sender, rollout)
+        if stranger is not None:
+            return stranger
+        identity, actor = rollout.identity, self._fleet.actors[sender]
         if identity.sequence in actor.sequences:
             return Rejected(verdict="rejected", cause="duplicate", reason="was taken before")
         lag = policy_version - rollout.policy_version
@@ -89,6 +89,15 @@ class Intake:
                 reason=f"policy lag {lag}, at most {self._max_lag} is allowed",
             )
         return rollout
+
+    def _stranger(self, sender: str, rollout: Rollout) -> Rejected | None:
+        """Why a rollout is from or for another life than those that run now, or None."""
+        identity = rollout.identity
+        if identity.learner_epoch != self._epoch:
+            return Rejected(verdict="fenced", cause="epoch", reason="meant for another life of the learner")
+        if identity.actor != sender or self._fleet.expected(identity) is None:
+            return Rejected(verdict="fenced", cause="unknown_actor", reason="another life of this actor has joined")
+        return None
 
     def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
         """What the specification and the actor's own word allow a rollout to unpack to."""

@@ -26,7 +26,7 @@ def policy_gradient_loss(log_probs: Tensor, advantages: Tensor, valid: Tensor) -
 
 
 def value_loss(values: Tensor, targets: Tensor, valid: Tensor, kind: Literal["mse", "huber"]) -> Tensor:
-    """Mean of (V - G)^2, or of its Huber form (quadratic within 1, linear beyond); G is a constant.
+    """Mean of (V - G)^2, or the Huber loss (half of that within 1, linear beyond); G is a constant.
 
     The squared error carries no half: the coefficient of 0.5 that is usual belongs to the sum of the losses.
     """

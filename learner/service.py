@@ -176,7 +176,7 @@ class LearnerService:
     def _take_batch(self, version: int) -> Taken:
         with self._changed:
             taken = self._buffer.take(self._fleet.live, version)
-            if not taken.rollouts:
+            if not taken.rollouts and not taken.stale:
                 self._changed.wait(_HEARTBEAT_SECONDS)
                 taken = self._buffer.take(self._fleet.live, version)
             for rollout in taken.stale:
@@ -251,24 +251,25 @@ class LearnerService:
             sender = keys.last_chunk(request.key)
             content = self._intake.read(sender, request.payload)
             with self._changed:
+                if self._spec.synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content):
+                    content = Rejected(
+                        verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor"
+                    )
                 verdict = self._intake.judge(sender, content, self._version, time.monotonic())
                 if isinstance(verdict, Rollout):
-                    verdict = self._store(verdict, len(request.payload))
-                if isinstance(verdict, Rejected):
+                    self._store(verdict, len(request.payload))
+                else:
                     self._counters.rollouts_rejected[verdict.cause] += 1
                 answer = acknowledgement(verdict, self._version)
             request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
 
-    def _store(self, rollout: Rollout, size: int) -> Rollout | Rejected:
+    def _store(self, rollout: Rollout, size: int) -> None:
         """Puts a rollout into the buffer, waiting for room: the late answer is what holds its sender back."""
         while not self._buffer.has_room_for(rollout) and not self._over:
-            if self._spec.synchronous:
-                return Rejected(verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor")
             self._changed.wait(_HEARTBEAT_SECONDS)
         self._buffer.add(rollout)
         self._counters.accepted(rollout, size)
         self._changed.notify_all()
-        return rollout
 
     def _offer_program(self, learner: "Learner") -> None:
         self._program = learner.program()
@@ -299,7 +300,7 @@ class LearnerService:
             self._changed.notify_all()
         reason = "the learner was stopped" if self._stop.is_set() else "the learner has finished"
         farewell = encode(Farewell(learner_epoch=self._epoch, reason=reason))
-        self._desk.offer_snapshot(farewell)
+        self._desk.close(farewell)
         self._transport.publish(keys.snapshots(self._run), farewell)
 
     # --------------------------------------------------------------------------------------- what it leaves

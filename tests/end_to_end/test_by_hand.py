@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Running, until
+from processes import Running, until
 
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)

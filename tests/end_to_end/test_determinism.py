@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from conftest import LIMIT, Running
+from processes import LIMIT, Running
 
 from actor.service import ActorConfig, ActorService
 from learner import run_directory

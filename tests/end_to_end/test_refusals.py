@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable, Iterator
 
 import pytest
-from conftest import Running, until
+from processes import Running, until
 
 from protocol import keys
 from protocol.codec import PROTOCOL_VERSION, Limits, decode, encode

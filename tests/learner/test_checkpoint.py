@@ -175,17 +175,23 @@ def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
     assert load_newest(tmp_path, no_warning).counters == COUNTERS
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("aside", [False, True])
 def test_a_rename_that_fails_leaves_the_last_good_one_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    version: int, aside: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save(tmp_path, 1)
+    rename = os.replace
 
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
+    def refusing(source: Path, target: Path) -> None:
+        """Puts no directory in the place of another: the one before it may be put aside and back."""
+        if source.name.endswith(".partial") or not aside:
+            raise OSError(errno.EIO, "Input/output error")
+        rename(source, target)
 
-    monkeypatch.setattr("policy.sealed.os.replace", refuse)
+    monkeypatch.setattr("policy.sealed.os.replace", refusing)
     with pytest.raises(OSError, match="Input/output"):
-        save(tmp_path, 2, keep=1)
+        save(tmp_path, version, keep=1, counters={})
     monkeypatch.undo()
     assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path, no_warning).policy.policy_version == 1
+    assert load_newest(tmp_path, no_warning).counters == COUNTERS

@@ -134,6 +134,14 @@ def test_joining_again_in_the_same_life_forgets_nothing() -> None:
     assert fleet.expected(identity("a")) is not None
 
 
+def test_lives_without_end_are_not_all_remembered() -> None:
+    fleet = joined_fleet("a")
+    for incarnation in range(1000):
+        fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=3), 0.0)
+        fleet.actors["a"].sequences.add(0)
+    assert len(fleet.actors["a"].windows) <= 8
+
+
 def test_an_actor_never_heard_of_is_not_expected() -> None:
     assert joined_fleet("a").expected(identity("b")) is None
 

@@ -252,24 +252,25 @@ class Traffic(RuleBasedStateMachine):
         self.fleet = Fleet(1, None)
         self.intake = Intake(run_spec(rows=1, max_policy_lag=2), EPOCH, self.fleet)
         self.version = 0
-        self.incarnations = {"a": 0, "b": 0}  # the newest that joined; counts up from 1
+        self.lives = {"a": 0, "b": 0}  # incarnations count up from 1
+        self.incarnations = {"a": 0, "b": 0}  # the one that joined last
         self.taken: dict[tuple[str, int], set[int]] = {}
         self.accepted: list[tuple[str, int, int]] = []
-        self.sent: list[tuple[str, Rollout]] = []
+        self.sent: list[tuple[str, Rollout]] = []  # those that were accepted
 
     @rule(name=NAMES)
     def a_new_life_joins(self, name: str) -> None:
-        self.incarnations[name] += 1
-        self._join(name)
+        self.lives[name] += 1
+        self._join(name, self.lives[name])
 
-    @precondition(lambda self: any(self.incarnations.values()))
-    @rule(name=NAMES)
-    def a_life_joins_again(self, name: str) -> None:
-        if self.incarnations[name]:
-            self._join(name)
+    @rule(name=NAMES, older=st.integers(0, 2))
+    def a_life_joins_again(self, name: str, older: int) -> None:
+        if self.lives[name] > older:
+            self._join(name, self.lives[name] - older)
 
-    def _join(self, name: str) -> None:
-        join = Join(actor=name, incarnation=self.incarnations[name], spaces=TINY, environments=1)
+    def _join(self, name: str, incarnation: int) -> None:
+        self.incarnations[name] = incarnation
+        join = Join(actor=name, incarnation=incarnation, spaces=TINY, environments=1)
         assert self.fleet.join(join, 0.0) is None
 
     @rule()
@@ -288,13 +289,11 @@ class Traffic(RuleBasedStateMachine):
         who = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
         version = max(self.version - lag, 0)
         rollout = make_rollout(who, version=version, rows=1, environments=1, shape=(1,))
-        sender = name if key == "own" else key
-        self.sent.append((sender, rollout))
-        self._deliver(sender, rollout)
+        self._deliver(name if key == "own" else key, rollout)
 
     @precondition(lambda self: self.sent)
     @rule(data=st.data())
-    def an_old_one_comes_again(self, data: st.DataObject) -> None:
+    def an_accepted_one_comes_again(self, data: st.DataObject) -> None:
         self._deliver(*data.draw(st.sampled_from(self.sent)))
 
     def _deliver(self, sender: str, rollout: Rollout) -> None:
@@ -306,6 +305,7 @@ class Traffic(RuleBasedStateMachine):
             self.taken.setdefault((who.actor, who.incarnation), set()).add(who.sequence)
         if isinstance(verdict, Rollout):
             self.accepted.append((who.actor, who.incarnation, who.sequence))
+            self.sent.append((sender, rollout))
 
     def _expected(self, sender: str, rollout: Rollout) -> str:
         """The cause for which it must be rejected, or nothing."""
@@ -331,4 +331,4 @@ class Traffic(RuleBasedStateMachine):
 
 
 TestTraffic = Traffic.TestCase
-TestTraffic.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+TestTraffic.settings = settings(max_examples=300, stateful_step_count=40, deadline=None)

@@ -1,0 +1,251 @@
+"""The actor against a learner that is played by the test, over the memory transport."""
+
+import queue
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from processes import LIMIT
+
+from actor.service import ActorConfig, ActorError, ActorService
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import program_hash
+from protocol import keys
+from protocol.codec import Limits, decode, encode
+from protocol.messages import Acknowledgement, Farewell, Join, Message, Program, Refusal, Rollout, Snapshot, Welcome
+from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
+from protocol.transport import MemoryNetwork, MemoryTransport, Request
+
+SPEC = RunSpec.model_validate(
+    {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
+)
+SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+NETWORK = ActorCritic(PolicySpec(), SPACES)
+MODEL = export_program(NETWORK, SPACES.observation)
+
+
+class ScriptedLearner:
+    """Answers joins and programs; hands every rollout to the test, which answers it."""
+
+    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1) -> None:
+        self.transport = MemoryTransport(network)
+        self.epoch, self.spec = epoch, spec
+        self.joins: queue.Queue[Join] = queue.Queue()
+        self.rollouts: queue.Queue[Request] = queue.Queue()
+        self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
+        self.refusal: Refusal | None = None
+        self.transport.announce(keys.learner("r"))
+        self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
+        self.transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot))
+        self.transport.serve(keys.program("r", "*"), self._program)
+        self.transport.serve(keys.join("r"), self._join)
+
+    def _join(self, request: Request) -> None:
+        message = decode(request.payload, Limits())
+        assert isinstance(message, Join)
+        self.joins.put(message)
+        answer: Message = Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)
+        request.reply(encode(self.refusal or answer))
+
+    def _program(self, request: Request) -> None:
+        request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
+
+    def publish(self, version: int, *, push: bool = True) -> None:
+        weights = {name: parameter.detach().numpy() for name, parameter in NETWORK.named_parameters()}
+        self.snapshot = encode(
+            Snapshot(learner_epoch=self.epoch, policy_version=version, program=program_hash(MODEL), weights=weights)
+        )
+        if push:
+            self.transport.publish(keys.snapshots("r"), self.snapshot)
+
+    def receive(self) -> tuple[Rollout, Request]:
+        request = self.rollouts.get(timeout=LIMIT)
+        rollout = decode(request.payload, Limits())
+        assert isinstance(rollout, Rollout)
+        return rollout, request
+
+
+def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
+    request.reply(encode(Acknowledgement(verdict=verdict, policy_version=version)))  # type: ignore[arg-type]
+
+
+class RunningActor:
+    def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
+        self.stop = threading.Event()
+        self.said: list[str] = []
+        self.error: Exception | None = None
+        self.transport = MemoryTransport(network)
+        config = ActorConfig(name="a", incarnation=7, timeout=timeout)
+        self._service = ActorService(config, self.transport, self.stop, self.said.append)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._service.run()
+        except Exception as error:
+            self.error = error
+
+    def join(self) -> None:
+        self._thread.join(LIMIT)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def actor(network: MemoryNetwork) -> Iterator[RunningActor]:
+    running = RunningActor(network)
+    yield running
+    running.stop.set()
+    running.join()
+
+
+def test_it_joins_twice_first_to_ask_then_with_what_it_found(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    actor = RunningActor(network)
+    asked, counted_in = learner.joins.get(timeout=LIMIT), learner.joins.get(timeout=LIMIT)
+    assert asked.spaces is None
+    assert (counted_in.spaces, counted_in.environments) == (SPACES, 2)
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    first, second = learner.receive(), learner.receive()
+    assert [first[0].identity.sequence, second[0].identity.sequence] == [0, 1]
+    assert first[0].policy_version == 3
+    assert learner.rollouts.empty()  # two are unanswered: no third, however long this test thinks
+    acknowledge(first[1], "accepted")
+    assert learner.receive()[0].identity.sequence == 2
+
+
+def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    rollout, request = learner.receive()
+    assert learner.receive()[0].identity.sequence == 1
+    acknowledge(request, "busy")
+    again, _ = learner.receive()
+    assert again.identity == rollout.identity
+    np.testing.assert_array_equal(again.observations, rollout.observations)
+
+
+def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    versions = []
+    for version in (5, 6, 7, 8):
+        rollout, request = learner.receive()
+        versions.append(rollout.policy_version)
+        learner.publish(version)
+        acknowledge(request, "accepted", version)
+    assert versions[0] == 0
+    assert versions == sorted(versions)
+    assert versions[-1] >= 5
+
+
+def test_synchronous_it_waits_for_the_next_version_and_asks_if_the_push_was_lost(network: MemoryNetwork) -> None:
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    learner.publish(1, push=False)
+    acknowledge(request, "accepted", 1)
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()
+
+
+def test_synchronous_a_rejected_rollout_is_replaced_under_the_same_version(network: MemoryNetwork) -> None:
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    acknowledge(request, "rejected")
+    again, _ = learner.receive()
+    assert (again.identity.sequence, again.policy_version) == (1, 0)
+    actor.stop.set()
+    actor.join()
+
+
+@pytest.mark.parametrize("how", ["fenced", "left"])
+def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+    first = ScriptedLearner(network)
+    first.publish(4)
+    _, request = first.receive()
+    if how == "fenced":
+        first.epoch = 2
+        first.publish(0, push=False)
+        acknowledge(request, "fenced")
+        second = first
+    else:
+        first.transport.close()
+        second = ScriptedLearner(network, epoch=2)
+        second.publish(0)
+    while (received := second.receive())[0].identity.learner_epoch == 1:
+        acknowledge(received[1], "fenced")
+    assert received[0].identity.sequence == 0
+    assert any("went away" in text for text in actor.said)
+
+
+@pytest.mark.parametrize("how", ["farewell", "finished"])
+def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    if how == "farewell":
+        learner.transport.publish(keys.snapshots("r"), encode(Farewell(learner_epoch=1, reason="solved")))
+        acknowledge(request, "accepted")
+    else:
+        acknowledge(request, "finished")
+    actor.join()
+    assert actor.error is None
+    assert actor.said[-1].startswith("the run is over")
+
+
+def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    learner.transport.publish(keys.snapshots("r"), b"\xff" * 100)
+    acknowledge(request, "accepted")
+    _, request = learner.receive()
+    acknowledge(request, "accepted")
+    learner.receive()
+    assert any("ignored a message" in text for text in actor.said)
+
+
+def test_a_refusal_ends_it_with_the_reason(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    learner.refusal = Refusal(code="mismatch", reason="its environment has 3 choices")
+    actor = RunningActor(network)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "its environment has 3 choices" in str(actor.error)
+
+
+def test_two_learners_ask_for_a_choice(network: MemoryNetwork) -> None:
+    for run in ("one", "two"):
+        transport = MemoryTransport(network)
+        welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
+        transport.serve(keys.join(run), lambda request, welcome=welcome: request.reply(welcome))
+    actor = RunningActor(network)
+    actor.join()
+    assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
+
+
+def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
+    actor = RunningActor(network, timeout=0.05)
+    actor.join()
+    assert "no learner answered within 0.05 s" in str(actor.error)

@@ -1,0 +1,77 @@
+"""Which rollouts are sent when, and what each answer changes."""
+
+from actor.uploader import Uploader
+from protocol.messages import Acknowledgement
+
+
+def answer(verdict: str, version: int = 0) -> Acknowledgement:
+    return Acknowledgement(verdict=verdict, policy_version=version)  # type: ignore[arg-type]
+
+
+def test_a_rollout_is_due_at_once_and_then_awaited() -> None:
+    uploader = Uploader(window=2)
+    uploader.add(0, b"a")
+    assert uploader.due(now=10.0) == [(0, b"a")]
+    assert uploader.due(now=99.0) == []
+    assert uploader.next_due() is None
+
+
+def test_the_window_has_room_again_once_an_answer_is_final() -> None:
+    uploader = Uploader(window=2)
+    uploader.add(0, b"a")
+    uploader.add(1, b"b")
+    assert not uploader.has_room
+    uploader.answered(0, answer("busy"), 0.0)
+    assert not uploader.has_room
+    uploader.answered(0, answer("accepted", 5), 0.0)
+    assert uploader.has_room
+    assert uploader.newest_version == 5
+
+
+def test_busy_and_silence_send_again_later_each_time_later() -> None:
+    for last in (answer("busy"), None):
+        uploader = Uploader(window=1)
+        uploader.add(0, b"a")
+        waits = []
+        for _ in range(12):
+            uploader.due(1000.0)
+            uploader.answered(0, last, 100.0)
+            due = uploader.next_due()
+            assert due is not None
+            waits.append(due - 100.0)
+        assert waits == sorted(waits)
+        assert 0 < waits[0] < waits[-1] <= 0.5
+        assert uploader.due(100.0) == []
+        assert uploader.due(101.0) == [(0, b"a")]
+
+
+def test_after_a_lost_connection_all_are_sent_again() -> None:
+    uploader = Uploader(window=2)
+    uploader.add(0, b"a")
+    uploader.add(1, b"b")
+    uploader.due(1.0)
+    uploader.send_again()
+    assert uploader.due(1.0) == [(0, b"a"), (1, b"b")]
+
+
+def test_answers_to_what_is_not_in_flight_change_nothing() -> None:
+    uploader = Uploader(window=1)
+    uploader.answered(3, answer("finished", 9), 0.0)
+    assert not uploader.over
+    assert not uploader.verdicts
+
+
+def test_rejection_asks_for_a_replacement_and_acceptance_does_not() -> None:
+    uploader = Uploader(window=2)
+    for sequence, verdict in enumerate(("rejected", "accepted")):
+        uploader.add(sequence, b"a")
+        uploader.answered(sequence, answer(verdict), 0.0)
+        assert uploader.must_replace == (verdict == "rejected")
+
+
+def test_fenced_and_finished_end_it() -> None:
+    for verdict in ("fenced", "finished"):
+        uploader = Uploader(window=1)
+        uploader.add(0, b"a")
+        uploader.answered(0, answer(verdict), 0.0)
+        assert uploader.over == verdict
