@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 from actor import options
 from actor.environments import UnplayableError
-from actor.service import ActorConfig, ActorError, ActorService
+from actor.learner_link import ActorError
+from actor.service import ActorConfig, ActorService
 from policy.runtime import PolicyError
 from protocol.process import exit_with_parent, stop_on_signals
 from protocol.transport import Transport, TransportError

@@ -8,17 +8,16 @@ from typing import Literal
 
 from actor.collector import Collector
 from actor.environments import VectorEnvironment, make_environments
+from actor.learner_link import LearnerLink, OverError
 from actor.uploader import Uploader
-from policy.runtime import OnnxRuntime, PolicyRuntime, program_hash
+from policy.runtime import OnnxRuntime, PolicyRuntime
 from protocol import keys
-from protocol.codec import Limits, ProtocolError, VersionMismatchError, decode, encode
+from protocol.codec import Limits, ProtocolError, decode, encode
 from protocol.messages import (
     Acknowledgement,
     Farewell,
     Join,
     Message,
-    Program,
-    Refusal,
     RolloutIdentity,
     Snapshot,
     Welcome,
@@ -26,24 +25,15 @@ from protocol.messages import (
 from protocol.spec import EnvironmentSpec, Spaces
 from protocol.transport import Inbox, Transport, TransportError
 
-_LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
-_ANSWER_SECONDS = 5.0  # a query without an answer by then has none
+_ANSWER_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
 _ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
 _DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks for it
-_FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+_FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be just about to have one
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
-
-
-class ActorError(Exception):
-    """The actor cannot take part; the message says why and what to do."""
 
 
 class _LearnerLostError(Exception):
     """The learner went away, or lives another life; join again."""
-
-
-class _OverError(Exception):
-    """Told to stop, or the run is over; the message says which."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,12 +58,15 @@ class ActorService:
         self._transport = transport
         self._stop = stop
         self._say = say
+        self._link = LearnerLink(transport, say)
         self._changed = threading.Condition()  # guards what the transport's threads touch: the next two
         self._uploader = Uploader(window=1)
         self._learner_left = False
+        self._run = ""  # the one that it takes part in
         self._inboxes: dict[str, Inbox] = {}  # by run
         self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
         self._snapshot: Snapshot | None = None  # the newest of this learner epoch
+        self._news_at = 0.0  # when it came
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout to this learner epoch
 
@@ -89,74 +82,25 @@ class ActorService:
                     self._take_part(self._find_learner())
                 except _LearnerLostError:
                     self._say("the learner went away; looking for it again")
-        except _OverError as error:
+        except OverError as error:
             self._say(str(error))
         finally:
             if self._made is not None:
                 self._made[1].close()
 
-    # ----------------------------------------------------------------------------------------- joining
+    # ----------------------------------------------------------------------------------------- playing
 
     def _find_learner(self) -> Welcome:
-        """Asks for a learner until one answers."""
-        deadline = None if self._config.timeout is None else time.monotonic() + self._config.timeout
-        pause, told = _FIRST_RETRY_SECONDS, False
         self._learner_left = False
-        while True:
-            welcome = self._join(self._config.run, Join(actor=self._config.name, incarnation=self._config.incarnation))
-            if welcome is not None:
-                return welcome
-            if deadline is not None and time.monotonic() > deadline:
-                raise ActorError(
-                    f"no learner answered within {self._config.timeout:g} s: is it running, and is the address its own?"
-                )
-            if not told and pause >= _MAX_RETRY_SECONDS:
-                self._say("waiting for a learner")
-                told = True
-            if self._stop.wait(pause):
-                raise _OverError("stopped")
-            pause = min(2 * pause, _MAX_RETRY_SECONDS)
-
-    def _join(self, run: str, join: Join) -> Welcome | None:
-        """One question to the learner of `run`; None if nobody can answer now."""
-        answers = [self._decode(answer) for answer in self._ask(keys.join(run), encode(join))]
-        answers = [answer for answer in answers if isinstance(answer, Welcome | Refusal)]
-        if not answers:
-            return None
-        welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
-        if len(welcomes) > 1:
-            names = ", ".join(sorted(welcome.run for welcome in welcomes))
-            raise ActorError(f"several learners answer here ({names}): choose one with --run")
-        if welcomes:
-            return welcomes[0]
-        refusal = answers[0]
-        assert isinstance(refusal, Refusal)
-        if refusal.code == "finished":
-            raise _OverError("the run is over")
-        raise ActorError(f"the learner refused this actor: {refusal.reason}")
-
-    def _ask(self, key: str, payload: bytes = b"") -> list[bytes]:
-        try:
-            return self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
-        except TransportError:
-            return []
-
-    def _decode(self, data: bytes) -> Message | None:
-        try:
-            return decode(data, _LIMITS)
-        except VersionMismatchError as error:
-            raise ActorError(str(error)) from None
-        except ProtocolError as error:
-            self._say(f"ignored a message: {error}")
-            return None
-
-    # ----------------------------------------------------------------------------------------- playing
+        join = Join(actor=self._config.name, incarnation=self._config.incarnation)
+        return self._link.find(self._config.run, join, self._config.timeout, self._stop)
 
     def _take_part(self, welcome: Welcome) -> None:
         """Makes the environments, is counted in, and plays."""
+        self._run = welcome.run
         environments = self._environments(welcome.spec.environment, welcome)
         self._follow(welcome.run)
-        confirmed = self._join(
+        confirmed = self._link.join(
             welcome.run,
             Join(
                 actor=self._config.name,
@@ -221,24 +165,22 @@ class ActorService:
             self._wait(lambda: self._uploader.has_room)
             with self._changed:
                 self._uploader.add(self._sequence, payload)
-            self._send_due(welcome.run)
+            self._send_due()
             self._sequence += 1
             if welcome.spec.synchronous:
                 self._await_snapshot(welcome, newer_than=loaded)
             else:
                 self._read_inbox(welcome)
+                self._doubt(welcome)
 
     def _runtime(self, welcome: Welcome, snapshot: Snapshot, spaces: Spaces) -> PolicyRuntime:
         if self._config.runtime == "torch":
             from policy.torch_runtime import TorchRuntime  # an actor has no torch unless it asks for it
 
             return TorchRuntime(welcome.spec.policy, spaces)
-        for answer in self._ask(keys.program(welcome.run, snapshot.program)):
-            program = self._decode(answer)
-            if isinstance(program, Program):
-                model = program.model.tobytes()
-                if program_hash(model) == snapshot.program:
-                    return OnnxRuntime(model)
+        model = self._link.program(welcome.run, snapshot.program)
+        if model is not None:
+            return OnnxRuntime(model)
         raise _LearnerLostError
 
     # --------------------------------------------------------------------------------------- snapshots
@@ -248,47 +190,55 @@ class ActorService:
 
         Returns early if the rollout that was to bring it was rejected: another must take its place.
         """
+        first = newer_than < 0
 
         def arrived() -> bool:
             self._read_inbox(welcome)
             return self._snapshot is not None and self._snapshot.policy_version > newer_than
 
-        pause = _FIRST_RETRY_SECONDS if newer_than < 0 else _DOUBT_SECONDS
-        while not self._wait(lambda: arrived() or self._uploader.must_replace, pause):
+        pause = _FIRST_DOUBT_SECONDS if first else _DOUBT_SECONDS
+        while not self._wait(lambda: arrived() or (self._uploader.must_replace and not first), pause):
             pause = min(2 * pause, _DOUBT_SECONDS)
-            self._ask_snapshot(welcome)
+            self._ask_news(welcome)
         with self._changed:
             self._uploader.must_replace = False
 
-    def _ask_snapshot(self, welcome: Welcome) -> None:
-        for answer in self._ask(keys.snapshots(welcome.run)):
-            self._take_news(welcome, answer)
+    def _doubt(self, welcome: Welcome) -> None:
+        """Asks for the newest snapshot if answers tell of one that was pushed and did not arrive."""
+        assert self._snapshot is not None
+        missed = self._uploader.newest_version > self._snapshot.policy_version
+        if missed and time.monotonic() > self._news_at + _DOUBT_SECONDS:
+            self._news_at = time.monotonic()
+            self._ask_news(welcome)
+
+    def _ask_news(self, welcome: Welcome) -> None:
+        for message in self._link.newest(welcome.run):
+            self._take_news(welcome, message)
 
     def _read_inbox(self, welcome: Welcome) -> None:
         news = self._inboxes[welcome.run].take()
-        if news is not None:
-            self._take_news(welcome, news)
+        message = None if news is None else self._link.decode(news)
+        if message is not None:
+            self._take_news(welcome, message)
         self._check()
 
-    def _take_news(self, welcome: Welcome, data: bytes) -> None:
-        news = self._decode(data)
+    def _take_news(self, welcome: Welcome, news: Message) -> None:
         if isinstance(news, Farewell) and news.learner_epoch == welcome.learner_epoch:
-            raise _OverError(f"the run is over: {news.reason}")
+            raise OverError(f"the run is over: {news.reason}")
         if not isinstance(news, Snapshot):
             return
         if news.learner_epoch != welcome.learner_epoch:
             raise _LearnerLostError
         if self._snapshot is None or news.policy_version > self._snapshot.policy_version:
-            self._snapshot = news
+            self._snapshot, self._news_at = news, time.monotonic()
 
     # ----------------------------------------------------------------------------------------- waiting
 
     def _wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
         """Waits until `ready`, sending what falls due meanwhile; False if `timeout` seconds passed first."""
         deadline = None if timeout is None else time.monotonic() + timeout
-        run = next(iter(self._inboxes))
         while True:
-            self._send_due(run)
+            self._send_due()
             with self._changed:
                 self._check()
                 if ready():
@@ -303,14 +253,14 @@ class ActorService:
     def _check(self) -> None:
         """Raises if there is a reason to stop playing."""
         if self._stop.is_set():
-            raise _OverError("stopped")
+            raise OverError("stopped")
         if self._uploader.over == "finished":
-            raise _OverError("the run is over")
+            raise OverError("the run is over")
         if self._learner_left or self._uploader.over == "fenced":
             raise _LearnerLostError
 
-    def _send_due(self, run: str) -> None:
-        key = keys.rollouts(run, self._config.name)
+    def _send_due(self) -> None:
+        key = keys.rollouts(self._run, self._config.name)
         uploader = self._uploader
         with self._changed:
             due = uploader.due(time.monotonic())
@@ -331,7 +281,7 @@ class ActorService:
         answer = None
         if data is not None:
             try:
-                answer = decode(data, _LIMITS)
+                answer = decode(data, _ANSWER_LIMITS)
             except ProtocolError:
                 answer = None
         with self._changed:

@@ -41,7 +41,8 @@ class Uploader:
         self.in_flight[sequence] = _InFlight(payload)
 
     def send_again(self) -> None:
-        """Makes all of them due: answers may have been lost with a connection."""
+        """Begins anew with the same rollouts, all of them due: answers may have been lost with a connection."""
+        self.over, self.must_replace = "", False
         for rollout in self.in_flight.values():
             rollout.send_at, rollout.attempts = 0.0, 0
 

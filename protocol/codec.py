@@ -14,19 +14,18 @@ is held against `Limits`. This file knows no key, no transport and no state.
 """
 
 import dataclasses
-import functools
 import math
 import struct
 import threading
-import types
 import typing
 from typing import Any, cast
 
 import msgpack
 import numpy as np
 import zstandard
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
+from protocol import schema
 from protocol.messages import Message, Program, Rollout
 
 PROTOCOL_VERSION = 1
@@ -78,7 +77,7 @@ def encode(message: Message) -> bytes:
     Raises ValueError for an array whose dtype does not travel: a fault of our own.
     """
     arrays: list[tuple[str, np.ndarray]] = []
-    fields = _pack(message, "", arrays)
+    fields = schema.pack(message, "", arrays)
     body = b"".join(part for name, array in arrays for part in _buffer(name, array))
     content = {
         "kind": type(message).__name__,
@@ -109,7 +108,7 @@ def decode(data: bytes, limits: Limits) -> Message:
     layout = _read_layout(arrays, size, limits)
     buffers = _read_arrays(layout, _plain_body(flags, body, size))
     try:
-        message = _unpack(_KINDS[kind], fields, "", buffers)
+        message = schema.unpack(_KINDS[kind], fields, "", buffers)
     except ValidationError as error:
         raise ProtocolError(f"{kind}: {error.errors()[0]['msg']}") from None
     except ValueError as error:
@@ -132,23 +131,6 @@ def _travelling(name: str, array: np.ndarray) -> np.dtype:
 def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
     data = np.ascontiguousarray(array, dtype=_travelling(name, array)).tobytes()
     return data, bytes(-len(data) % _ALIGNMENT)
-
-
-def _pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[str, Any]:
-    packed: dict[str, Any] = {}
-    for name, annotation in _fields(type(value)).items():
-        item = getattr(value, name)
-        if annotation is np.ndarray:
-            arrays.append((path + name, item))
-        elif _is_array_map(annotation):
-            arrays.extend((f"{path}{name}/{key}", array) for key, array in item.items())
-        elif dataclasses.is_dataclass(annotation):
-            packed[name] = _pack(item, f"{path}{name}.", arrays)
-        elif isinstance(item, BaseModel):
-            packed[name] = item.model_dump(mode="json")
-        else:
-            packed[name] = item
-    return packed
 
 
 # ------------------------------------------------------------------------------------------- reading
@@ -248,64 +230,6 @@ def _read_arrays(
         array.flags.writeable = False
         arrays[name] = array
     return arrays
-
-
-def _unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Builds `cls` from header fields and arrays, taking out of `arrays` what it uses."""
-    values: dict[str, Any] = {}
-    expected = _fields(cls)
-    for name, annotation in expected.items():
-        if annotation is np.ndarray:
-            if path + name not in arrays:
-                raise ValueError(f"array {path + name!r} is missing")
-            values[name] = arrays.pop(path + name)
-        elif _is_array_map(annotation):
-            prefix = f"{path}{name}/"
-            found = [key for key in arrays if key.startswith(prefix)]
-            values[name] = {key[len(prefix) :]: arrays.pop(key) for key in found}
-        elif name not in fields:
-            raise ValueError(f"field {path + name!r} is missing")
-        else:
-            values[name] = _value(annotation, fields[name], path + name, arrays)
-    unknown = [name for name in fields if name not in expected]
-    if unknown:
-        raise ValueError(f"unknown field {path + str(unknown[0])!r}")
-    return cls(**values)
-
-
-def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    if isinstance(annotation, types.UnionType):  # `X | None`
-        if item is None:
-            return None
-        annotation = typing.get_args(annotation)[0]
-    if dataclasses.is_dataclass(annotation):
-        if not isinstance(item, dict):
-            raise ValueError(f"field {path!r} must be a map")
-        return _unpack(typing.cast(type, annotation), item, path + ".", arrays)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation.model_validate(item)
-    if typing.get_origin(annotation) is typing.Literal:
-        if not isinstance(item, str) or item not in typing.get_args(annotation):
-            raise ValueError(f"field {path!r} must be one of {', '.join(typing.get_args(annotation))}")
-        return item
-    if type(item) is not annotation:
-        raise ValueError(f"field {path!r} must be {annotation.__name__}, not {type(item).__name__}")
-    if annotation is int and not 0 <= item < 2**63:
-        raise ValueError(f"field {path!r} must be from 0 to 2^63 - 1")
-    return item
-
-
-# --------------------------------------------------------------------------------------------- shared
-
-
-@functools.cache
-def _fields(cls: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-
-
-def _is_array_map(annotation: Any) -> bool:
-    return typing.get_origin(annotation) is dict and typing.get_args(annotation)[1] is np.ndarray
 
 
 class _Zstd(threading.local):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from processes import LIMIT
 
-from actor.service import ActorConfig, ActorError, ActorService
+from actor.learner_link import ActorError
+from actor.service import ActorConfig, ActorService
 from policy.network import ActorCritic
 from policy.program import export_program
 from policy.runtime import program_hash
@@ -151,6 +152,32 @@ def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: Runnin
     assert versions[0] == 0
     assert versions == sorted(versions)
     assert versions[-1] >= 5
+
+
+def test_it_asks_for_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    rollout, request = learner.receive()
+    learner.publish(1, push=False)
+    while rollout.policy_version == 0:
+        acknowledge(request, "accepted", 1)
+        rollout, request = learner.receive()
+    assert rollout.policy_version == 1
+
+
+def test_fenced_by_the_same_learner_it_joins_again_and_goes_on(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    acknowledge(request, "rejected")
+    _, request = learner.receive()
+    acknowledge(request, "fenced")
+    sequences = []
+    for _ in range(3):
+        rollout, request = learner.receive()
+        acknowledge(request, "accepted")
+        sequences.append(rollout.identity.sequence)
+    assert sequences[-1] >= 3  # counted on: the learner knows the earlier ones
 
 
 def test_synchronous_it_waits_for_the_next_version_and_asks_if_the_push_was_lost(network: MemoryNetwork) -> None:

@@ -1,0 +1,102 @@
+"""What an actor asks of learners: to be found, to be let in, for programs and snapshots. No state, no threads."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from policy.runtime import program_hash
+from protocol import keys
+from protocol.codec import Limits, ProtocolError, VersionMismatchError, decode, encode
+from protocol.messages import Join, Message, Program, Refusal, Welcome
+from protocol.transport import Transport, TransportError
+
+_LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
+_ANSWER_SECONDS = 5.0  # a query without an answer by then has none
+_FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+
+
+class ActorError(Exception):
+    """The actor cannot take part; the message says why and what to do."""
+
+
+class OverError(Exception):
+    """Told to stop, or the run is over; the message says which."""
+
+
+class LearnerLink:
+    """Questions over a transport, their answers decoded."""
+
+    def __init__(self, transport: Transport, say: Callable[[str], None]) -> None:
+        self._transport = transport
+        self._say = say
+
+    def find(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
+        """Asks to join until a learner of `run` (`*`: of any) answers.
+
+        Raises OverError if told to stop; ActorError if refused, or after `timeout` seconds without an answer.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        pause, told = _FIRST_RETRY_SECONDS, False
+        while True:
+            welcome = self.join(run, join)
+            if welcome is not None:
+                return welcome
+            if deadline is not None and time.monotonic() > deadline:
+                raise ActorError(
+                    f"no learner answered within {timeout:g} s: is it running, and is the address its own?"
+                )
+            if not told and pause >= _MAX_RETRY_SECONDS:
+                self._say("waiting for a learner")
+                told = True
+            if stop.wait(pause):
+                raise OverError("stopped")
+            pause = min(2 * pause, _MAX_RETRY_SECONDS)
+
+    def join(self, run: str, join: Join) -> Welcome | None:
+        """One request to join; None if nobody answers now. Raises ActorError or OverError if refused."""
+        answers = self._ask(keys.join(run), encode(join))
+        welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
+        if len(welcomes) > 1:
+            names = ", ".join(sorted(welcome.run for welcome in welcomes))
+            raise ActorError(f"several learners answer here ({names}): choose one with --run")
+        if welcomes:
+            return welcomes[0]
+        for refusal in answers:
+            if isinstance(refusal, Refusal):
+                if refusal.code == "finished":
+                    raise OverError("the run is over")
+                raise ActorError(f"the learner refused this actor: {refusal.reason}")
+        return None
+
+    def program(self, run: str, name: str) -> bytes | None:
+        """The program with that hash; None if nobody has it."""
+        for answer in self._ask(keys.program(run, name)):
+            if isinstance(answer, Program):
+                model = answer.model.tobytes()
+                if program_hash(model) == name:
+                    return model
+        return None
+
+    def newest(self, run: str) -> list[Message]:
+        """The newest snapshot, or the farewell, of a run."""
+        return self._ask(keys.snapshots(run))
+
+    def decode(self, data: bytes) -> Message | None:
+        """The message in `data`; None, and a word about it, if it is damaged.
+
+        Raises ActorError if the learner is of another version.
+        """
+        try:
+            return decode(data, _LIMITS)
+        except VersionMismatchError as error:
+            raise ActorError(str(error)) from None
+        except ProtocolError as error:
+            self._say(f"ignored a message: {error}")
+            return None
+
+    def _ask(self, key: str, payload: bytes = b"") -> list[Message]:
+        try:
+            answers = self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
+        except TransportError:
+            return []
+        return [message for message in map(self.decode, answers) if message is not None]

@@ -1,0 +1,199 @@
+"""The learner's side of the wire: who is let in, what is taken, what is told. The network never waits for learning.
+
+    transport's threads   answer queries at once; rollouts only go onto a byte-bounded queue
+    intake thread         decodes and judges rollouts, answers them, fills the buffer
+
+The main thread takes batches out and publishes snapshots. One condition guards what they share: fleet, buffer,
+counters, and the version that rollouts are held against.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from learner.counters import RunCounters
+from learner.fleet import Fleet
+from learner.front_desk import FrontDesk
+from learner.intake import Intake, Rejected, acknowledgement
+from learner.request_queue import RequestQueue
+from learner.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, Taken
+from policy.runtime import program_hash
+from protocol import keys
+from protocol.codec import encode
+from protocol.messages import Acknowledgement, Farewell, Program, Rollout, Snapshot, StatusReport
+from protocol.spec import RunSpec, RunStatus, Spaces
+from protocol.transport import Request, Transport
+
+HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+_HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
+
+
+class Reception:
+    """Serves one run's actors from `open` to `close`."""
+
+    def __init__(
+        self,
+        run: str,
+        spec: RunSpec,
+        transport: Transport,
+        counters: RunCounters,
+        status: Callable[[Fleet], RunStatus],
+        *,
+        learner_epoch: int,
+        start_version: int,
+        spaces: Spaces | None,
+    ) -> None:
+        """`start_version` and `spaces` are those of the checkpoint that a run continues from, else 0 and None."""
+        self.lock = threading.Condition()
+        self.fleet = Fleet(spec.training.seed, spaces)
+        self._run, self._spec, self._transport = run, spec, transport
+        self._counters, self._status, self._epoch = counters, status, learner_epoch
+        self._version = start_version  # rollouts of it are on-policy
+        self._over = False
+        self._buffer = _buffer(spec)
+        self._intake = Intake(spec, learner_epoch, self.fleet)
+        self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
+        self._requests = RequestQueue(int(spec.service.queue_megabytes * 2**20))
+        self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
+        self._program_hash = ""
+
+    def open(self) -> None:
+        """Lets actors in."""
+        self._judging.start()
+        transport, run, desk = self._transport, self._run, self._desk
+        transport.watch(keys.presence(run, "*"), self._on_presence)
+        transport.serve(keys.rollouts(run, "*"), self._on_rollout)
+        transport.serve(keys.snapshots(run), lambda request: request.reply(desk.snapshot()))
+        transport.serve(
+            keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key)))
+        )
+        transport.serve(keys.status(run), self._on_status)
+        transport.announce(keys.learner(run))
+        # Last: who is let in finds all else there.
+        transport.serve(keys.join(run), lambda request: request.reply(desk.join(request.payload, time.monotonic())))
+
+    def close(self, reason: str) -> None:
+        """Tells the actors that the run is over, and takes nothing more. Idempotent."""
+        with self.lock:
+            if self._over:
+                return
+            self._over = True
+            self.lock.notify_all()
+        farewell = encode(Farewell(learner_epoch=self._epoch, reason=reason))
+        self._desk.close(farewell)
+        self._transport.publish(keys.snapshots(self._run), farewell)
+        self._requests.close()
+        if self._judging.is_alive():
+            self._judging.join(timeout=5.0)
+
+    # ------------------------------------------------------------------------------------ the main thread
+
+    def await_spaces(self, stop: threading.Event, say: Callable[[str], None]) -> Spaces | None:
+        """Waits for an actor that knows the environment's spaces; None if told to stop first."""
+        hint_at: float | None = time.monotonic() + _HINT_SECONDS
+        with self.lock:
+            while self.fleet.spaces is None and not stop.is_set():
+                self.lock.wait(HEARTBEAT_SECONDS)
+                if hint_at is not None and time.monotonic() > hint_at:
+                    say("waiting for the first actor: `daedalus actor --connect ADDRESS` starts one")
+                    hint_at = None
+            return self.fleet.spaces
+
+    def take_batch(self, version: int) -> list[Rollout]:
+        """The rollouts of the next update, counted; none if no batch is complete within a heartbeat.
+
+        `version` is the newest; from here on, rollouts of the one that the update makes are the on-policy ones.
+        """
+        with self.lock:
+            taken = self._take(version)
+            if not taken.rollouts and not taken.stale:
+                self.lock.wait(HEARTBEAT_SECONDS)
+                taken = self._take(version)
+            for rollout in taken.stale:
+                self._counters.rollouts_rejected["stale"] += 1
+                self.fleet.actors[rollout.identity.actor].rejected["stale"] += 1
+            if taken.rollouts:
+                self._counters.trained(taken.rollouts, version)
+                for rollout in taken.rollouts:
+                    steps = int(np.count_nonzero(rollout.valid))
+                    self.fleet.actors[rollout.identity.actor].env_steps += steps
+                self._version = version + 1
+            self.lock.notify_all()
+        return taken.rollouts
+
+    def _take(self, version: int) -> Taken:
+        return self._buffer.take(self.fleet.live, version)
+
+    def offer_program(self, model: bytes) -> None:
+        """Has the policy program ready for those who ask."""
+        self._program_hash = program_hash(model)
+        self._desk.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
+
+    def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
+        """Encodes a snapshot once, for those who follow and for those who ask."""
+        snapshot = encode(
+            Snapshot(
+                learner_epoch=self._epoch,
+                policy_version=policy_version,
+                program=self._program_hash,
+                weights=weights,
+            )
+        )
+        self._desk.offer_snapshot(snapshot)
+        self._transport.publish(keys.snapshots(self._run), snapshot)
+        self._counters.snapshots_published += 1
+
+    # ----------------------------------------------------------------------------- the transport's threads
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        with self.lock:
+            self.fleet.set_present(keys.last_chunk(key), present)
+            self.lock.notify_all()
+
+    def _on_rollout(self, request: Request) -> None:
+        if self._over:
+            request.reply(encode(Acknowledgement(verdict="finished")))
+        elif not self._requests.offer(request):
+            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._version)))
+
+    def _on_status(self, request: Request) -> None:
+        with self.lock:
+            status = self._status(self.fleet)
+        request.reply(encode(StatusReport(status=status)))
+
+    # ----------------------------------------------------------------------------------- the intake thread
+
+    def _judge_requests(self) -> None:
+        while (request := self._requests.take()) is not None:
+            sender = keys.last_chunk(request.key)
+            content = self._intake.read(sender, request.payload)
+            with self.lock:
+                if self._spec.synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content):
+                    content = Rejected(
+                        verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor"
+                    )
+                verdict = self._intake.judge(sender, content, self._version, time.monotonic())
+                if isinstance(verdict, Rollout):
+                    self._store(verdict, len(request.payload))
+                else:
+                    self._counters.rollouts_rejected[verdict.cause] += 1
+                answer = acknowledgement(verdict, self._version)
+            request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
+
+    def _store(self, rollout: Rollout, size: int) -> None:
+        """Puts a rollout into the buffer, waiting for room: the late answer is what holds its sender back."""
+        while not self._buffer.has_room_for(rollout) and not self._over:
+            self.lock.wait(HEARTBEAT_SECONDS)
+        self._buffer.add(rollout)
+        self._counters.accepted(rollout, size)
+        self.lock.notify_all()
+
+
+def _buffer(spec: RunSpec) -> RolloutBuffer:
+    training, actors = spec.training, spec.collection.actors
+    if training.algorithm == "a2c":
+        return BarrierBuffer(actors)
+    default = {"a3c": 1, "impala": actors}[training.algorithm]
+    return StreamBuffer(training.batch_rollouts or default, training.max_policy_lag)

@@ -1,0 +1,90 @@
+"""Messages to plain maps and named arrays, and back: what each field may hold is read off the message's class.
+
+Scalars, strings, nested messages and pydantic models go into the map; arrays are named by their path. Building a
+message checks the type of every field, and says which is wrong. This file knows no bytes.
+"""
+
+import dataclasses
+import functools
+import types
+import typing
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+
+def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[str, Any]:
+    """The fields of a message as a plain map; its arrays are appended to `arrays`, named `path` + field."""
+    packed: dict[str, Any] = {}
+    for name, annotation in _fields(type(value)).items():
+        item = getattr(value, name)
+        if annotation is np.ndarray:
+            arrays.append((path + name, item))
+        elif _is_array_map(annotation):
+            arrays.extend((f"{path}{name}/{key}", array) for key, array in item.items())
+        elif dataclasses.is_dataclass(annotation):
+            packed[name] = pack(item, f"{path}{name}.", arrays)
+        elif isinstance(item, BaseModel):
+            packed[name] = item.model_dump(mode="json")
+        else:
+            packed[name] = item
+    return packed
+
+
+def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Builds `cls` from what `pack` made, taking out of `arrays` what it uses.
+
+    Raises ValueError, naming the field, for anything missing, unknown or of the wrong type.
+    """
+    values: dict[str, Any] = {}
+    expected = _fields(cls)
+    for name, annotation in expected.items():
+        if annotation is np.ndarray:
+            if path + name not in arrays:
+                raise ValueError(f"array {path + name!r} is missing")
+            values[name] = arrays.pop(path + name)
+        elif _is_array_map(annotation):
+            prefix = f"{path}{name}/"
+            found = [key for key in arrays if key.startswith(prefix)]
+            values[name] = {key[len(prefix) :]: arrays.pop(key) for key in found}
+        elif name not in fields:
+            raise ValueError(f"field {path + name!r} is missing")
+        else:
+            values[name] = _value(annotation, fields[name], path + name, arrays)
+    unknown = [name for name in fields if name not in expected]
+    if unknown:
+        raise ValueError(f"unknown field {path + str(unknown[0])!r}")
+    return cls(**values)
+
+
+def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(annotation, types.UnionType):  # `X | None`
+        if item is None:
+            return None
+        annotation = typing.get_args(annotation)[0]
+    if dataclasses.is_dataclass(annotation):
+        if not isinstance(item, dict):
+            raise ValueError(f"field {path!r} must be a map")
+        return unpack(typing.cast(type, annotation), item, path + ".", arrays)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation.model_validate(item)
+    if typing.get_origin(annotation) is typing.Literal:
+        if not isinstance(item, str) or item not in typing.get_args(annotation):
+            raise ValueError(f"field {path!r} must be one of {', '.join(typing.get_args(annotation))}")
+        return item
+    if type(item) is not annotation:
+        raise ValueError(f"field {path!r} must be {annotation.__name__}, not {type(item).__name__}")
+    if annotation is int and not 0 <= item < 2**63:
+        raise ValueError(f"field {path!r} must be from 0 to 2^63 - 1")
+    return item
+
+
+@functools.cache
+def _fields(cls: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _is_array_map(annotation: Any) -> bool:
+    return typing.get_origin(annotation) is dict and typing.get_args(annotation)[1] is np.ndarray
