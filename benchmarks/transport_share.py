@@ -28,12 +28,14 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--env-steps", type=int, default=8_000_000)
     options.add_argument("--preset", default="cartpole")
+    options.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parsed = options.parse_args()
     address = free_address()
     script = str(Path(__file__).with_name("profiled.py"))
     with tempfile.TemporaryDirectory() as folder:
         learner = ["learner", parsed.preset, "--env-steps", parsed.env_steps, "--listen", address]
         learner += ["--run-dir", f"{folder}/run", "--set", "training.stop_when_solved=false"]
+        learner += [word for setting in parsed.set for word in ("--set", setting)]
         actors = [["actor", "--connect", address, "--name", f"actor-{index}", "--quiet"] for index in range(2)]
         processes = []
         for index, words in enumerate([learner, *actors]):

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from learner import run_directory
-from learner.settings import SettingsError, override, preset_names, read_preset, run_spec
+from learner.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from protocol.spec import RunSpec
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -62,8 +62,8 @@ def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
     if (arguments.preset is None) == (arguments.env is None):
         raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
     settings = {"environment": {"id": arguments.env}} if arguments.env else read_preset(arguments.preset)
+    choose_algorithm(settings, arguments.algorithm)
     shortcuts = {
-        ("training", "algorithm"): arguments.algorithm,
         ("training", "seed"): arguments.seed,
         ("training", "env_steps"): arguments.env_steps,
         ("collection", "actors"): arguments.actors,

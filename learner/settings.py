@@ -63,10 +63,31 @@ def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
             section = section.setdefault(key, {})
             if not isinstance(section, dict):
                 raise SettingsError(f"--set {assignment}: {key} is a value, not a section")
-        if value == "none":  # TOML has no word for it
-            section.pop(keys[-1], None)
-        else:
-            section[keys[-1]] = value
+        _assign(section, keys[-1], value)
+
+
+def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
+    """Sets the algorithm, if one is named, and applies what a preset keeps for it in `[for_algorithm.NAME]`.
+
+    Raises SettingsError if that is no table of sections.
+    """
+    training = settings.setdefault("training", {})
+    if algorithm is not None:
+        training["algorithm"] = algorithm
+    tables = settings.pop("for_algorithm", {})
+    table = tables.get(training.get("algorithm"), {}) if isinstance(tables, dict) else tables
+    if not isinstance(table, dict) or not all(isinstance(section, dict) for section in table.values()):
+        raise SettingsError("for_algorithm: write [for_algorithm.NAME.SECTION], such as [for_algorithm.a3c.training]")
+    for section, values in table.items():
+        for key, value in values.items():
+            _assign(settings.setdefault(section, {}), key, value)
+
+
+def _assign(section: dict[str, Any], key: str, value: Any) -> None:
+    if value == "none":  # TOML has no word for it
+        section.pop(key, None)
+    else:
+        section[key] = value
 
 
 def run_spec(settings: dict[str, Any]) -> RunSpec:

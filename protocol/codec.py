@@ -37,7 +37,7 @@ _ALIGNMENT = 8
 _DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
 _COMPRESSED = (Rollout, Program)  # weights are noise to zstd; the rest is small
-_LEVEL = 1  # higher levels gain a few per cent and cost several times the time
+_LEVEL = -1
 _MAX_DIMENSIONS = 8
 
 

@@ -32,7 +32,7 @@ def test_an_actor_that_starts_first_waits_and_says_so(start: Start, address: str
     actor = start("actor", "--connect", address, "--name", "early")
     actor.expect("waiting for the learner")
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000)
-    actor.expect("joined run 'run' as 'early': 64 x CartPole-v1")
+    actor.expect("joined run 'run' as 'early': 128 x CartPole-v1")
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
     actor.expect("the run is over")
@@ -46,7 +46,7 @@ def test_an_actor_that_joins_late_contributes(start: Start, address: str, status
     until(lambda: env_steps(status(), "late") > 0)
     report = status()
     assert report is not None
-    assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 64, "late": 8}
+    assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 128, "late": 8}
     learner.process.terminate()
     assert learner.wait() == 1
 

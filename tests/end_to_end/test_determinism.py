@@ -11,11 +11,11 @@ from actor.service import ActorConfig, ActorService
 from learner import run_directory
 from learner.progress import Progress
 from learner.service import LearnerService, Outcome
-from learner.settings import override, read_preset, run_spec
+from learner.settings import choose_algorithm, override, read_preset, run_spec
 from protocol.spec import RunSpec
 from protocol.transport import MemoryNetwork, MemoryTransport
 
-SETTINGS = ("training.algorithm='a2c'", "training.env_steps=40000", "training.stop_when_solved=false")
+SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
 
 
 def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
@@ -48,10 +48,11 @@ def test_a2c_over_processes_gives_bit_for_bit_the_weights_of_one_process(
     start: Callable[..., Running], tmp_path: Path
 ) -> None:
     settings = read_preset("cartpole")
+    choose_algorithm(settings, "a2c")
     override(settings, SETTINGS)
     assert train_in_one_process(run_spec(settings), tmp_path / "one").finished
     words = [word for setting in SETTINGS for word in ("--set", setting)]
-    running = start("train", "cartpole", *words, "--run-dir", "many")
+    running = start("train", "cartpole", "--algorithm", "a2c", *words, "--run-dir", "many")
     assert running.wait() == 0, running.output
     one, many = checkpoint_files(tmp_path / "one"), checkpoint_files(tmp_path / "many")
     assert one.keys() == {"parameters.safetensors", "learner.safetensors"}
@@ -61,7 +62,8 @@ def test_a2c_over_processes_gives_bit_for_bit_the_weights_of_one_process(
 def test_another_seed_gives_other_weights(tmp_path: Path) -> None:
     """The test above could not fail if nothing depended on anything."""
     settings = read_preset("cartpole")
-    override(settings, (*SETTINGS, "training.env_steps=4000"))
+    choose_algorithm(settings, "a2c")
+    override(settings, (*SETTINGS, "training.env_steps=8000"))
     train_in_one_process(run_spec(settings), tmp_path / "one")
     override(settings, ("training.seed=2",))
     train_in_one_process(run_spec(settings), tmp_path / "two")
