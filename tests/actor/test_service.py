@@ -69,7 +69,7 @@ class ScriptedLearner:
 
 
 def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
-    request.reply(encode(Acknowledgement(verdict=verdict, policy_version=version)))  # type: ignore[arg-type]
+    request.reply(encode(Acknowledgement(verdict=verdict, policy_version=version)))  # type: ignore[arg-type] - one of its literals
 
 
 class RunningActor:

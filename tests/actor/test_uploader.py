@@ -5,7 +5,7 @@ from protocol.messages import Acknowledgement
 
 
 def answer(verdict: str, version: int = 0) -> Acknowledgement:
-    return Acknowledgement(verdict=verdict, policy_version=version)  # type: ignore[arg-type]
+    return Acknowledgement(verdict=verdict, policy_version=version)  # type: ignore[arg-type] - one of its literals
 
 
 def test_a_rollout_is_due_at_once_and_then_awaited() -> None:

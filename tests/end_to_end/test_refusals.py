@@ -37,7 +37,7 @@ def ask(transport: Transport, key: str, payload: bytes) -> Message:
 
 
 def join(**kwargs: object) -> bytes:
-    return encode(Join(actor="stranger", incarnation=1, **kwargs))  # type: ignore[arg-type]
+    return encode(Join(actor="stranger", incarnation=1, **kwargs))  # type: ignore[arg-type] - fields of Join
 
 
 def test_another_protocol_version_is_refused_with_both_named(stranger: Transport) -> None:
