@@ -42,7 +42,8 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A run of the main job, to its end; several tests look at it."""
     folder = tmp_path_factory.mktemp("solved")
     words = ["-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
-    # More than the preset's budget: no two asynchronous runs are alike, and none of these tests is about how fast one learns.
+    # More than the preset's budget: no two asynchronous runs are alike, and these tests are not about how fast one
+    # learns.
     running = Running(
         [sys.executable, *words, "train", "cartpole", "--env-steps", "4000000", "--run-dir", "solved-run"], folder
     )
