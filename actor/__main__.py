@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from actor import options
 from actor.environments import UnplayableError
+from actor.evaluator import Evaluator
 from actor.learner_link import ActorError
 from actor.service import ActorConfig, ActorService
 from policy.runtime import PolicyError
@@ -38,7 +39,8 @@ def main() -> int:
         if transport is None:
             return 0
         try:
-            ActorService(config, transport, stop, say).run()
+            role = Evaluator if arguments.evaluator else ActorService
+            role(config, transport, stop, say).run()
         finally:
             transport.close()
     except (ActorError, UnplayableError, PolicyError, TransportError) as error:

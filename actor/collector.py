@@ -6,7 +6,9 @@ import numpy as np
 
 from actor.environments import VectorEnvironment
 from policy.runtime import PolicyRuntime
+from protocol.frames import FrameStack
 from protocol.messages import Rollout, RolloutIdentity
+from protocol.spec import ArraySpace, EnvironmentSpec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,27 +63,31 @@ class Collector:
         self,
         environments: VectorEnvironment,
         runtime: PolicyRuntime,
+        spec: EnvironmentSpec,
         *,
         rollout_length: int,
-        reward_scale: float,
         seed: int,
     ) -> None:
-        rows, count, spaces = rollout_length, environments.count, environments.spaces
+        rows, count = rollout_length, environments.count
+        observation, action = environments.spaces.observation, environments.spaces.action
         self._environments = environments
         self._runtime = runtime
-        self._reward_scale = np.float32(reward_scale)
+        self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
         environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
         self._random = np.random.default_rng(action_seed)
         self._episodes = EpisodeCounter(count)
+        self._stack = FrameStack(observation, count)
+        self._state = np.zeros((count, runtime.state_size), np.float32)
 
-        self._observations = np.zeros((rows + 1, count, *spaces.observation.shape), spaces.observation.dtype)
-        self._actions = np.zeros((rows, count), np.uint8 if spaces.action.count <= 256 else np.uint16)
+        self._frames = _frames(observation, rows, count)
+        self._initial_state = np.zeros_like(self._state)
+        self._actions = np.zeros((rows, count), np.uint8 if action.count <= 256 else np.uint16)
         self._log_probs = np.zeros((rows, count), np.float32)
         self._rewards = np.zeros((rows, count), np.float32)
         self._terminated = np.zeros((rows, count), np.bool_)
         self._truncated = np.zeros((rows, count), np.bool_)
         self._valid = np.zeros((rows, count), np.bool_)
-        self._observations[rows] = environments.reset(int(environment_seed))
+        self._stack.push(environments.reset(int(environment_seed)), np.ones(count, np.bool_))
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Plays on with these weights from the next rollout."""
@@ -89,23 +95,34 @@ class Collector:
 
     def collect(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
         """T rows more under the weights loaded last, whose version the caller names."""
-        self._observations[0] = self._observations[-1]
+        depth = self._stack.frames.shape[1]
+        self._frames[:depth] = self._stack.frames.swapaxes(0, 1)
+        self._initial_state[:] = self._state
         for row in range(len(self._actions)):
-            actions, self._log_probs[row] = self._runtime.act(self._observations[row], self._random)
+            valid = self._episodes.valid
+            actions, self._log_probs[row], state = self._runtime.act(
+                self._stack.observations, self._state, self._random
+            )
+            frames, rewards, terminated, truncated = self._environments.step(actions)
+            self._frames[depth + row] = frames
             self._actions[row] = actions
-            self._valid[row] = self._episodes.valid
-            observations, rewards, terminated, truncated = self._environments.step(actions)
-            self._observations[row + 1] = observations
             self._rewards[row] = rewards
             self._terminated[row] = terminated
             self._truncated[row] = truncated
+            self._valid[row] = valid
+            # The row after one that only reset is the first of its episode: nothing before it is remembered.
+            self._stack.push(frames, ~valid)
+            self._state = state * valid[:, None]
             self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
+        if self._reward_clip is not None:
+            self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
         self._rewards *= self._reward_scale
         finished = self._episodes.take_finished()
         return Rollout(
             identity=identity,
             policy_version=policy_version,
-            observations=self._observations,
+            frames=self._frames,
+            initial_state=self._initial_state,
             actions=self._actions,
             behaviour_log_probs=self._log_probs,
             rewards=self._rewards,
@@ -115,3 +132,14 @@ class Collector:
             episode_returns=finished.returns,
             episode_lengths=finished.lengths,
         )
+
+
+def _frames(space: ArraySpace, rows: int, environments: int) -> np.ndarray:
+    """Room for a rollout's frames [k-1 + T+1, E, *frame_shape].
+
+    Images lie environment by environment, as they are sent: each beside the one that it differs little from.
+    """
+    length = space.frames + rows
+    if len(space.shape) >= 2:
+        return np.zeros((environments, length, *space.shape), space.dtype).swapaxes(0, 1)
+    return np.zeros((length, environments, *space.shape), space.dtype)

@@ -1,24 +1,23 @@
 """EnvironmentSpec -> vectorised environment, behind one small interface.
 
-All step under gymnasium's NEXT_STEP rule: the step after an episode's end ignores its action and resets.
+All step under gymnasium's NEXT_STEP rule: the step after an episode's end ignores its action and resets. They show
+single frames; stacks are made of them elsewhere (protocol/frames.py). Rewards are the environment's own.
 """
 
-import difflib
-import importlib
-import os
-import sys
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode
 
+from actor.action_table import own_actions
+from actor.pixels import Pixels
+from actor.unplayable import UnplayableError
 from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
 
+__all__ = ["UnplayableError", "VectorEnvironment", "make_environments"]
 
-class UnplayableError(Exception):
-    """The environment cannot be played; the message says why and what to do."""
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class VectorEnvironment(Protocol):
@@ -35,14 +34,14 @@ class VectorEnvironment(Protocol):
         ...
 
     def reset(self, seed: int) -> np.ndarray:
-        """Starts an episode in each; returns observations [E, *observation_shape]."""
+        """Starts an episode in each; returns frames [E, *frame_shape]."""
         ...
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Takes one action [E] in each.
+    def step(self, actions: np.ndarray) -> Step:
+        """Takes one action [E] in each, repeated as the specification says.
 
-        Returns: observations [E, *observation_shape], unscaled rewards [E], terminated [E], truncated [E].
-        Where the last step ended an episode this one only resets: reward 0 and the first observation.
+        Returns: frames [E, *frame_shape], true rewards [E] (summed over the repeats), terminated [E], truncated [E].
+        Where the last step ended an episode this one only resets: reward 0 and the first frame.
         """
         ...
 
@@ -51,18 +50,60 @@ class VectorEnvironment(Protocol):
         ...
 
 
-class GymnasiumEnvironment:
-    """A gymnasium vector environment whose spaces travel."""
+class BareEnvironment(Protocol):
+    """What a backend makes: steps, repeats and cuts episodes as the specification says, with its own spaces."""
 
-    def __init__(self, environment: Any) -> None:
-        self._environment = environment
-        self._spaces = _travelling_spaces(environment)
-        self._start = int(getattr(environment.single_action_space, "start", 0))
+    @property
+    def count(self) -> int:
+        """E."""
+        ...
+
+    @property
+    def observation_space(self) -> gymnasium.Space:
+        """What one of them shows."""
+        ...
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """What one of them takes."""
+        ...
+
+    def reset(self, seed: int) -> np.ndarray:
+        """See VectorEnvironment."""
+        ...
+
+    def step(self, actions: np.ndarray) -> Step:
+        """See VectorEnvironment; actions [E, *action_shape] are the environment's own."""
+        ...
+
+    def close(self) -> None:
+        """See VectorEnvironment."""
+        ...
+
+
+class TransformedEnvironment:
+    """A bare environment seen through a specification's action table and pixel transforms."""
+
+    def __init__(self, bare: BareEnvironment, spec: EnvironmentSpec) -> None:
+        """Raises UnplayableError if the two do not fit."""
+        observation = bare.observation_space
+        if not isinstance(observation, gymnasium.spaces.Box) or not 1 <= len(observation.shape) <= 4:
+            raise UnplayableError(
+                f"observation space {observation} is not supported: it must be a Box of one to four dimensions"
+            )
+        self._bare = bare
+        self._actions = own_actions(spec.action_table, bare.action_space)
+        self._pixels = Pixels(spec, observation)
+        dtype = "uint8" if observation.dtype == np.uint8 else "float32"
+        self._spaces = Spaces(
+            observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
+            action=ChoiceSpace(count=len(self._actions)),
+        )
 
     @property
     def count(self) -> int:
         """See VectorEnvironment."""
-        return self._environment.num_envs
+        return self._bare.count
 
     @property
     def spaces(self) -> Spaces:
@@ -71,92 +112,77 @@ class GymnasiumEnvironment:
 
     def reset(self, seed: int) -> np.ndarray:
         """See VectorEnvironment."""
-        return self._environment.reset(seed=seed)[0]
+        return self._pixels(self._bare.reset(seed))
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: np.ndarray) -> Step:
         """See VectorEnvironment."""
-        if self._start:
-            actions = actions + self._start
-        observations, rewards, terminated, truncated, _ = self._environment.step(actions)
-        return observations, rewards, terminated, truncated
+        frames, rewards, terminated, truncated = self._bare.step(self._actions[actions])
+        return self._pixels(frames), rewards, terminated, truncated
 
     def close(self) -> None:
         """See VectorEnvironment."""
-        self._environment.close()
+        self._bare.close()
 
 
-def make_environments(spec: EnvironmentSpec, count: int) -> VectorEnvironment:
-    """`count` environments of one kind: by the environment's own vector entry point if it has one, else in turn.
+def make_environments(
+    spec: EnvironmentSpec,
+    count: int,
+    *,
+    wrap: str | None = None,
+    render_mode: str | None = None,
+    camera: Callable[[np.ndarray], None] | None = None,
+) -> VectorEnvironment:
+    """`count` environments of one kind, by the backend that the specification names.
+
+    Args:
+      spec: what to play and what to do to it.
+      count: E.
+      wrap: `module:function` (gymnasium.Env -> gymnasium.Env), applied to each before the specification's transforms.
+      render_mode: gymnasium's; "human" opens a window, "rgb_array" is what a camera needs.
+      camera: called with the picture [H, W, 3] uint8 after the reset and after every step of the environment's own,
+        the repeated ones too. One environment only.
+
+    The last three are for the gymnasium backend only.
 
     Raises UnplayableError with one line that says what is wrong and what to do.
     """
-    registered = _registered(spec.id)
-    kwargs: dict[str, Any] = dict(spec.kwargs)
-    if spec.max_episode_steps is not None:
-        kwargs["max_episode_steps"] = spec.max_episode_steps
+    if spec.backend != "gymnasium":
+        _refuse_what_only_gymnasium_does(spec, {"wrap": wrap, "render_mode": render_mode, "camera": camera})
+    bare, rest = _make_bare(spec, count, wrap, render_mode, camera)
     try:
-        if registered.vector_entry_point is not None:
-            environment = gymnasium.make_vec(registered, count, "vector_entry_point", **kwargs)
-        else:
-            environment = gymnasium.make_vec(
-                registered,
-                count,
-                "sync",
-                vector_kwargs={"autoreset_mode": AutoresetMode.NEXT_STEP},
-                disable_env_checker=True,  # it costs a tenth of the speed, and warns on behalf of others
-                **kwargs,
-            )
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise UnplayableError(
-            f"environment {spec.id} needs a package that is not installed: {str(error).splitlines()[0]}"
-        ) from None
-    except Exception as error:  # whatever a user's own environment raises
-        raise UnplayableError(f"environment {spec.id} cannot be made: {type(error).__name__}: {error}") from None
-    if environment.metadata.get("autoreset_mode") is not AutoresetMode.NEXT_STEP:
-        environment.close()
-        raise UnplayableError(
-            f"environment {spec.id} resets by {environment.metadata.get('autoreset_mode')}: "
-            "its vector entry point must follow gymnasium's AutoresetMode.NEXT_STEP"
-        )
-    try:
-        return GymnasiumEnvironment(environment)
+        return TransformedEnvironment(bare, rest)
     except UnplayableError:
-        environment.close()
+        bare.close()
         raise
 
 
-def _registered(environment_id: str) -> EnvSpec:
-    """gymnasium's registration of `[module:]id`; the module may lie in the working directory."""
-    module, _, name = environment_id.rpartition(":")
-    if module:
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise UnplayableError(
-                f"environment {environment_id}: cannot import {module} ({error}): "
-                "it must lie in the working directory or be installed"
-            ) from None
-    try:
-        return gymnasium.spec(name)
-    except gymnasium.error.Error:
-        near = difflib.get_close_matches(name, gymnasium.registry.keys(), 3, 0.5)
-        hint = (
-            f"did you mean {' or '.join(near)}?"
-            if near
-            else "is its package installed and its module named (module:Id)?"
-        )
-        raise UnplayableError(f"unknown environment {name!r}: {hint}") from None
+def _make_bare(
+    spec: EnvironmentSpec,
+    count: int,
+    wrap: str | None,
+    render_mode: str | None,
+    camera: Callable[[np.ndarray], None] | None,
+) -> tuple[BareEnvironment, EnvironmentSpec]:
+    """The backend's environments, and the specification with the transforms that are left to do."""
+    match spec.backend:
+        case "envpool":
+            from actor.envpool_backend import make_envpool  # a backend is imported when it is played
+
+            return make_envpool(spec, count)
+        case "ale":
+            from actor.ale_backend import make_ale
+
+            return make_ale(spec, count)
+        case "gymnasium":
+            from actor.gymnasium_backend import make_gymnasium
+
+            return make_gymnasium(spec, count, wrap=wrap, render_mode=render_mode, camera=camera), spec
 
 
-def _travelling_spaces(environment: Any) -> Spaces:
-    observation, action = environment.single_observation_space, environment.single_action_space
-    if not isinstance(observation, gymnasium.spaces.Box) or not observation.shape:
+def _refuse_what_only_gymnasium_does(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
+    names = [name for name, value in asked.items() if value is not None]
+    if names:
         raise UnplayableError(
-            f"observation space {observation} is not supported: it must be a Box of at least one dimension"
+            f"environment.backend={spec.backend} does not do {' and '.join(names)}: "
+            "leave it out, or play gymnasium's (--set environment.backend=gymnasium)"
         )
-    if not isinstance(action, gymnasium.spaces.Discrete):
-        raise UnplayableError(f"action space {action} is not supported: it must be Discrete")
-    dtype = "uint8" if observation.dtype == np.uint8 else "float32"
-    return Spaces(observation=ArraySpace(shape=observation.shape, dtype=dtype), action=ChoiceSpace(count=int(action.n)))

@@ -1,118 +1,117 @@
-"""`python -m actor.evaluator`: plays a run's newest checkpoint, or a given one, and prints how it does."""
+"""The evaluator: an actor that plays the learner's newest policy greedily, on a schedule, and reports. Contributes
+nothing to the training data. No threads but the transport's.
+"""
 
-import argparse
-import json
-import sys
-from pathlib import Path
+import threading
+import time
+from collections.abc import Callable
 
 import numpy as np
 
-from actor.environments import UnplayableError, make_environments
-from actor.evaluation import Evaluation, environments_for, play_episodes
-from policy.runtime import OnnxRuntime, PolicyError
-from policy.saved_policy import SavedPolicy, checkpoints, read_policy
-from policy.sealed import DamagedError
+from actor.environments import VectorEnvironment, make_environments
+from actor.evaluation import environments_for, play_episodes
+from actor.learner_link import LearnerLink, OverError
+from actor.service import ActorConfig
+from policy.runtime import OnnxRuntime
+from protocol.messages import EvaluationReport, Join, Snapshot, Welcome
+from protocol.spec import Spaces
+from protocol.transport import Transport
 
-DESCRIPTION = """\
-Plays episodes with the policy of a run and reports their returns: true rewards, greedy actions, episodes that
-training never saw. Takes the newest checkpoint, or the one whose folder is named."""
-
-EXAMPLES = """\
-examples:
-  daedalus evaluate runs/cartpole-impala-s1-20261121-101500
-  daedalus evaluate RUN_DIR --episodes 1000 --seed 7 --sampled
-  daedalus evaluate RUN_DIR/checkpoints/0000000143"""
+_DEFAULT_SECONDS = 60.0  # between evaluations where the run does not say
 
 
-def parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus evaluate` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus evaluate",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options.add_argument("directory", type=Path, metavar="RUN_DIR", help="a run directory, or one of its checkpoints")
-    options.add_argument(
-        "--episodes", type=int, default=100, metavar="N", help="episodes to play (default: %(default)s)"
-    )
-    options.add_argument(
-        "--seed", type=int, metavar="S", help="of the environments (default: one that training never used)"
-    )
-    options.add_argument(
-        "--sampled",
-        action="store_true",
-        help="sample the actions, as training does, instead of the most probable",
-    )
-    options.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    return options
+class Evaluator:
+    """One evaluator over one transport."""
 
+    def __init__(
+        self, config: ActorConfig, transport: Transport, stop: threading.Event, say: Callable[[str], None]
+    ) -> None:
+        self._config = config
+        self._stop = stop
+        self._say = say
+        self._link = LearnerLink(transport, say)
 
-def main() -> int:
-    """Runs `daedalus evaluate`. Exit status: 0 done, 1 failed, 2 bad usage."""
-    arguments = parser().parse_args()
-    if arguments.episodes < 1:
-        print(f"daedalus evaluate: --episodes must be at least 1, not {arguments.episodes}", file=sys.stderr)
-        return 2
-    try:
-        policy = _newest(arguments.directory)
-        seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-        evaluation = _evaluate(policy, arguments.episodes, seed, arguments.sampled)
-    except (DamagedError, UnplayableError, PolicyError) as error:
-        print(f"daedalus evaluate: {error}", file=sys.stderr)
-        return 1
-    result = {
-        "policy_version": policy.policy_version,
-        "episodes": len(evaluation.returns),
-        "seed": seed,
-        "actions": "sampled" if arguments.sampled else "greedy",
-        "return_mean": float(evaluation.returns.mean(dtype=np.float64)),
-        "return_std": float(evaluation.returns.std(dtype=np.float64)),
-        "return_min": float(evaluation.returns.min()),
-        "return_max": float(evaluation.returns.max()),
-        "length_mean": float(evaluation.lengths.mean()),
-    }
-    if arguments.json:
-        print(json.dumps(result))
-    else:
-        print(
-            f"{policy.spec.environment.id}, policy version {policy.policy_version}: "
-            f"return {result['return_mean']:.1f} +- {result['return_std']:.1f} "
-            f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
-            f"over {result['episodes']} {result['actions']} episodes"
-        )
-    return 0
+    def run(self) -> None:
+        """Evaluates until stopped or until the run is over.
 
-
-def _newest(directory: Path) -> SavedPolicy:
-    """The policy in a checkpoint, or in the newest whole one of a run."""
-    if (directory / "manifest.json").exists():
-        return read_policy(directory)
-    candidates = checkpoints(directory)
-    if not candidates:
-        raise DamagedError(f"{directory} has no checkpoints: is it a run directory?")
-    for candidate in candidates:
+        Raises ActorError if it is refused, UnplayableError if the environment cannot be made here, PolicyError if the
+        policy cannot be played.
+        """
+        join = Join(actor=self._config.name, incarnation=self._config.incarnation)
         try:
-            return read_policy(candidate)
-        except DamagedError as error:
-            print(f"daedalus evaluate: passed over: {error}", file=sys.stderr)
-    raise DamagedError(f"{directory} has no checkpoint that can be read")
+            while True:
+                self._attend(self._link.find(self._config.run, join, self._config.timeout, self._stop))
+        except OverError as error:
+            self._say(str(error))
+
+    def _attend(self, welcome: Welcome) -> None:
+        """Evaluates for one life of a learner, until it ends."""
+        spec = welcome.spec
+        interval = spec.evaluation.seconds or _DEFAULT_SECONDS
+        episodes = spec.evaluation.episodes
+        self._say(f"run {welcome.run!r}: {episodes} greedy episodes of {spec.environment.id} every {interval:g} s")
+        environment = spec.environment.as_evaluated()
+        made = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
+        try:
+            environments = _Interruptible(made, self._stop)
+            due = time.monotonic() + interval
+            for number in range(2**31):
+                if self._stop.wait(max(due - time.monotonic(), 0.0)):
+                    raise OverError("stopped")
+                due = time.monotonic() + interval
+                # Actors' seeds are one number, these three: no episode of training is played here.
+                seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])
+                if not self._evaluate(welcome, environments, seed):
+                    return
+        finally:
+            made.close()
+
+    def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
+        """One evaluation, from the request to the report; False if the learner is not there any more."""
+        snapshot = self._link.policy_to_evaluate(welcome.run, self._config.name)
+        if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
+            return False
+        model = self._link.program(welcome.run, snapshot.program)
+        if model is None:
+            return False
+        runtime = OnnxRuntime(model)
+        runtime.load(snapshot.weights)
+        evaluation = play_episodes(runtime, environments, welcome.spec.evaluation.episodes, seed, sampled=False)
+        self._say(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
+        self._link.report(
+            welcome.run,
+            EvaluationReport(
+                evaluator=self._config.name,
+                learner_epoch=snapshot.learner_epoch,
+                policy_version=snapshot.policy_version,
+                returns=evaluation.returns,
+                lengths=evaluation.lengths,
+            ),
+        )
+        return True
 
 
-def _evaluate(policy: SavedPolicy, episodes: int, seed: int, sampled: bool) -> Evaluation:
-    environments = make_environments(policy.spec.environment, environments_for(episodes))
-    try:
-        if environments.spaces != policy.spaces:
-            raise UnplayableError(
-                f"environment {policy.spec.environment.id} has {environments.spaces}; "
-                f"the policy was trained on {policy.spaces}: install the version that the run used (versions.json)"
-            )
-        runtime = OnnxRuntime(policy.program)
-        runtime.load(policy.weights)
-        return play_episodes(runtime, environments, episodes, seed, sampled=sampled)
-    finally:
-        environments.close()
+class _Interruptible:
+    """Environments that a request to stop ends in the middle of an episode."""
 
+    def __init__(self, environments: VectorEnvironment, stop: threading.Event) -> None:
+        self._environments, self._stop = environments, stop
 
-if __name__ == "__main__":
-    sys.exit(main())
+    @property
+    def count(self) -> int:
+        return self._environments.count
+
+    @property
+    def spaces(self) -> Spaces:
+        return self._environments.spaces
+
+    def reset(self, seed: int) -> np.ndarray:
+        return self._environments.reset(seed)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        if self._stop.is_set():
+            raise OverError("stopped")
+        return self._environments.step(actions)
+
+    def close(self) -> None:
+        self._environments.close()

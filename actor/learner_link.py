@@ -7,11 +7,23 @@ from collections.abc import Callable
 from policy.runtime import program_hash
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, VersionMismatchError, decode, encode
-from protocol.messages import Join, Message, Program, Refusal, Welcome
+from protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Farewell,
+    Join,
+    Message,
+    Program,
+    Refusal,
+    Snapshot,
+    Welcome,
+)
 from protocol.transport import Transport, TransportError
 
 _LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
 _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
+_UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 
 
@@ -81,6 +93,25 @@ class LearnerLink:
         """The newest snapshot, or the farewell, of a run."""
         return self._ask(keys.snapshots(run))
 
+    def policy_to_evaluate(self, run: str, evaluator: str) -> Snapshot | None:
+        """The newest snapshot, of which the learner keeps a checkpoint until `report`; None if it has none to give.
+
+        Raises OverError if the run is over.
+        """
+        request = encode(EvaluationRequest(evaluator=evaluator))
+        for answer in self._ask(keys.evaluations(run, evaluator), request, _UPDATE_SECONDS):
+            if isinstance(answer, Snapshot):
+                return answer
+            if isinstance(answer, Farewell) or (isinstance(answer, Refusal) and answer.code == "finished"):
+                raise OverError("the run is over")
+        return None
+
+    def report(self, run: str, report: EvaluationReport) -> None:
+        """Tells the learner how a policy played; what it does not take is lost."""
+        for answer in self._ask(keys.evaluations(run, report.evaluator), encode(report), _UPDATE_SECONDS):
+            if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
+                self._say(f"the learner did not take the evaluation: {answer.reason}")
+
     def decode(self, data: bytes) -> Message | None:
         """The message in `data`; None, and a word about it, if it is damaged.
 
@@ -94,9 +125,9 @@ class LearnerLink:
             self._say(f"ignored a message: {error}")
             return None
 
-    def _ask(self, key: str, payload: bytes = b"") -> list[Message]:
+    def _ask(self, key: str, payload: bytes = b"", timeout: float = _ANSWER_SECONDS) -> list[Message]:
         try:
-            answers = self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
+            answers = self._transport.ask(key, payload, timeout=timeout)
         except TransportError:
             return []
         return [message for message in map(self.decode, answers) if message is not None]

@@ -16,7 +16,8 @@ network and all else come from the learner. May start before it, and join or lea
 EXAMPLES = """\
 examples:
   daedalus actor --connect tcp/127.0.0.1:7447
-  daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3"""
+  daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
+  daedalus actor --connect tcp/127.0.0.1:7447 --evaluator"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -41,6 +42,11 @@ def parser() -> argparse.ArgumentParser:
         help="environments to step together (default: what the learner asks for)",
     )
     options.add_argument(
+        "--wrap",
+        metavar="MODULE:FUNCTION",
+        help="your own transform: takes each gymnasium environment and returns the one to play",
+    )
+    options.add_argument(
         "--runtime",
         choices=("onnx", "torch"),
         default="onnx",
@@ -56,6 +62,11 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument(
         "--timeout", type=float, metavar="SECONDS", help="how long to look for a learner (default: for ever)"
+    )
+    options.add_argument(
+        "--evaluator",
+        action="store_true",
+        help="play greedily on the run's schedule and report, instead of gathering experience",
     )
     options.add_argument("--quiet", action="store_true", help="say nothing but errors")
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
@@ -75,6 +86,7 @@ def config(arguments: argparse.Namespace) -> ActorConfig:
         run=arguments.run,
         environments=arguments.envs,
         runtime=arguments.runtime,
+        wrap=arguments.wrap,
         timeout=arguments.timeout,
     )
 

@@ -45,6 +45,7 @@ class ActorConfig:
     run: str = keys.ANY_RUN
     environments: int | None = None  # unset: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
+    wrap: str | None = None  # module:function, applied to each environment
     timeout: float | None = None  # seconds to look for a learner; unset: for ever
 
 
@@ -130,7 +131,7 @@ class ActorService:
             self._made = None
         if self._made is None:
             count = self._config.environments or welcome.spec.collection.envs_per_actor
-            self._made = spec, make_environments(spec, count)
+            self._made = spec, make_environments(spec, count, wrap=self._config.wrap)
         return self._made[1]
 
     def _follow(self, run: str) -> None:
@@ -146,8 +147,8 @@ class ActorService:
         collector = Collector(
             environments,
             self._runtime(welcome, self._snapshot, environments.spaces),
+            welcome.spec.environment,
             rollout_length=welcome.spec.collection.rollout_length,
-            reward_scale=welcome.spec.environment.reward_scale,
             seed=welcome.seed,
         )
         loaded = -1

@@ -45,7 +45,7 @@ def main() -> int:
     return _COMMANDS[command](rest)
 
 
-_MODULES = {"learner": "learner", "actor": "actor", "evaluate": "actor.evaluator"}
+_MODULES = {"learner": "learner", "actor": "actor", "evaluate": "actor.evaluate"}
 
 
 def _train(arguments: list[str]) -> int:

@@ -27,15 +27,16 @@ def start(module: str, *arguments: str, one_thread: bool = False) -> subprocess.
 
 
 class ActorFailedError(Exception):
-    """An actor failed too often."""
+    """An actor, or the evaluator, failed too often."""
 
 
 @dataclass(slots=True)
 class SupervisedActor:
-    """One actor process, started again when it dies."""
+    """One actor process, started again when it dies. The evaluator is one too."""
 
     name: str
     connect: str
+    options: tuple[str, ...] = ()
     restarts: int = 0
     failures: int = 0
     process: subprocess.Popen[bytes] = field(init=False)
@@ -44,7 +45,8 @@ class SupervisedActor:
         self._start()
 
     def _start(self) -> None:
-        self.process = start("actor", "--connect", self.connect, "--name", self.name, "--quiet", one_thread=True)
+        identity = ("--connect", self.connect, "--name", self.name)
+        self.process = start("actor", *identity, "--quiet", *self.options, one_thread=True)
 
     def check(self) -> str | None:
         """Restarts the process if it died; returns what there is to say about that.

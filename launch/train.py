@@ -5,6 +5,7 @@ import json
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -18,11 +19,11 @@ from protocol.process import process_started, stop_on_signals
 from protocol.spec import RunSpec
 
 _POLL_SECONDS = 0.05
-_EVALUATION_EPISODES = 100
 
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
-reached or the budget is used up, then plays 100 greedy episodes with the result."""
+reached or the budget is used up, then plays 100 greedy episodes (evaluation.final_episodes) with the best policy
+that was found, or with the last."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -50,7 +51,7 @@ def train(arguments: list[str]) -> int:
     started = process_started()
     options = _parser("daedalus train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
-    _add_listen(options)
+    _add_where(options)
     parsed = options.parse_args(arguments)
     try:
         spec, directory = resolve(parsed)
@@ -58,7 +59,7 @@ def train(arguments: list[str]) -> int:
     except SettingsError as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
-    return _run(directory, spec, parsed.listen, started, resume=False)
+    return _run(directory, spec, parsed.listen, parsed.wrap, started, resume=False)
 
 
 def resume(arguments: list[str]) -> int:
@@ -67,7 +68,7 @@ def resume(arguments: list[str]) -> int:
     options = _parser("daedalus resume", _RESUME, _RESUME_EXAMPLES)
     options.add_argument("directory", type=Path, metavar="RUN_DIR", help="the run to continue")
     options.add_argument("--env-steps", type=int, metavar="N", help="a new budget (default: the one it had)")
-    _add_listen(options)
+    _add_where(options)
     parsed = options.parse_args(arguments)
     try:
         spec = run_directory.read_config(parsed.directory)
@@ -77,7 +78,7 @@ def resume(arguments: list[str]) -> int:
     except SettingsError as error:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
-    return _run(parsed.directory, spec, parsed.listen, started, resume=True)
+    return _run(parsed.directory, spec, parsed.listen, parsed.wrap, started, resume=True)
 
 
 def _parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -89,15 +90,20 @@ def _parser(name: str, description: str, examples: str) -> argparse.ArgumentPars
     )
 
 
-def _add_listen(options: argparse.ArgumentParser) -> None:
+def _add_where(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--listen",
         metavar="tcp/HOST:PORT",
         help="where more actors may join (default: a free port of this machine)",
     )
+    options.add_argument(
+        "--wrap",
+        metavar="MODULE:FUNCTION",
+        help="your own transform, for this machine's actors: takes each gymnasium environment and returns the one to play",
+    )
 
 
-def _run(directory: Path, spec: RunSpec, listen: str | None, started: float, *, resume: bool) -> int:
+def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, started: float, *, resume: bool) -> int:
     """Everything between the settings and the exit status."""
     stopping = stop_on_signals()
     address = listen or f"tcp/127.0.0.1:{_free_port()}"
@@ -106,13 +112,16 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, started: float, *, 
     actors: list[SupervisedActor] = []
     try:
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
-        actors += [SupervisedActor(name, address) for name in names]
+        options = ("--wrap", wrap) if wrap else ()
+        actors += [SupervisedActor(name, address, options) for name in names]
         training = spec.training
         print(
             f"{spec.environment.id}: {training.algorithm}, seed {training.seed}, {len(actors)} actors"
             f" x {spec.collection.envs_per_actor} environments at {address}; run directory {directory}",
             flush=True,
         )
+        if spec.evaluation.seconds is not None:
+            actors.append(SupervisedActor("evaluator", address, (*options, "--evaluator")))
         status = _watch(learner, actors, stopping)
     except ActorFailedError as error:
         print(f"daedalus train: {error}", file=sys.stderr)
@@ -124,7 +133,7 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, started: float, *, 
         return 1
     if status not in (0, 3):
         return status
-    if not _evaluate(directory):
+    if not _evaluate(directory, spec, wrap, stopping):
         return 1
     _report(directory, spec)
     return status
@@ -145,18 +154,22 @@ def _watch(learner: subprocess.Popen[bytes], actors: list[SupervisedActor], stop
     return 1
 
 
-def _evaluate(directory: Path) -> bool:
-    """Plays the greedy episodes in a process of their own; puts their result into summary.json."""
+def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: threading.Event) -> bool:
+    """Plays the final greedy episodes in a process of their own; puts their result into summary.json."""
     began = time.monotonic()
-    command = [sys.executable, "-P", "-m", "actor.evaluator"]
-    finished = subprocess.run(
-        [*command, str(directory), "--json", "--episodes", str(_EVALUATION_EPISODES)],
-        stdout=subprocess.PIPE,
-        check=False,
-    )
-    if finished.returncode != 0:
-        return False
-    evaluation = json.loads(finished.stdout)
+    command = [sys.executable, "-P", "-m", "actor.evaluate", str(directory), "--json", "--exit-with-parent"]
+    command += ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output)
+        while process.poll() is None and not stopping.wait(_POLL_SECONDS):
+            pass
+        stop([process])
+        if process.returncode != 0:
+            return False
+        output.seek(0)
+        evaluation = json.load(output)
+    for each_episode in ("returns", "lengths"):
+        del evaluation[each_episode]
     summary = run_directory.read_json(directory / run_directory.SUMMARY)
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
@@ -179,7 +192,9 @@ def _report(directory: Path, spec: RunSpec) -> None:
     evaluation = summary["evaluation"]
     print(
         f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
-        f"over {evaluation['episodes']} greedy episodes"
+        f"over {evaluation['episodes']} greedy episodes of the "
+        f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
+        f"on {evaluation['backend']}'s {evaluation['environment']}"
     )
     print(f"all of it lies in {directory}; draw it with: daedalus plot {directory} --output curve.png")
 

@@ -5,7 +5,7 @@ policy/saved_policy.py too; this file adds what learning goes on from.
 """
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,12 @@ def save_checkpoint(
     state: dict[str, Tensor],
     counters: dict[str, Any],
     keep: int,
+    also_keep: Set[Path] = frozenset(),
 ) -> Path:
-    """Writes a checkpoint, then removes all but the newest `keep`. Raises OSError if the disk refuses."""
+    """Writes a checkpoint, then removes all but the newest `keep` and `also_keep`.
+
+    Raises OSError if the disk refuses.
+    """
     directory = run_directory / "checkpoints" / f"{policy_version:010d}"
     files = {
         PROGRAM_FILE: program,
@@ -61,7 +65,8 @@ def save_checkpoint(
     # A damaged one of a higher version may be there: the learner then went on from an earlier one.
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
-        shutil.rmtree(old, ignore_errors=True)
+        if old not in also_keep:
+            shutil.rmtree(old, ignore_errors=True)
     for unfinished in directory.parent.glob(".*"):  # what a crash left
         shutil.rmtree(unfinished, ignore_errors=True)
     return directory

@@ -53,8 +53,8 @@ class RunCounters:
         self.rollout_bytes += size
         self.accepted_env_steps += int(np.count_nonzero(rollout.valid))
 
-    def trained(self, rollouts: Sequence[Rollout], policy_version: int) -> None:
-        """Counts a batch that is about to be learned from."""
+    def trained(self, rollouts: Sequence[Rollout], policy_version: int, updates: int) -> None:
+        """Counts a batch that is about to be learned from, by so many updates."""
         for rollout in rollouts:
             lag = policy_version - rollout.policy_version
             self.policy_lag_sum += lag
@@ -64,7 +64,7 @@ class RunCounters:
             self.episodes += len(rollout.episode_returns)
             self.env_steps += int(np.count_nonzero(rollout.valid))
         self.rollouts_trained += len(rollouts)
-        self.updates += 1
+        self.updates += updates
 
     @property
     def episode_return_mean(self) -> float | None:

@@ -74,35 +74,35 @@ class Fleet:
     def join(self, join: Join, now: float) -> Refusal | None:
         """Takes in an actor; returns why not, if it cannot take part.
 
-        A new incarnation of a known name replaces the old one.
+        A new incarnation of a known name replaces the old one. Who comes without spaces only asks what is played.
         """
-        if join.spaces is not None:
-            if not 1 <= join.environments <= 4096:
-                return Refusal(code="malformed", reason=f"{join.environments} environments: must be 1 to 4096")
-            if self.spaces is not None and join.spaces != self.spaces:
-                return Refusal(
-                    code="mismatch",
-                    reason=f"its environment has {join.spaces}; this run has {self.spaces}: "
-                    "install the same version of the environment",
-                )
-            self.spaces = join.spaces
+        if join.spaces is None:
+            return None
+        if not 1 <= join.environments <= 4096:
+            return Refusal(code="malformed", reason=f"{join.environments} environments: must be 1 to 4096")
+        if self.spaces is not None and join.spaces != self.spaces:
+            return Refusal(
+                code="mismatch",
+                reason=f"its environment has {join.spaces}; this run has {self.spaces}: "
+                "install the same version of the environment",
+            )
+        self.spaces = join.spaces
         actor = self._actor(join.actor)
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
             actor.incarnation = join.incarnation
             actor.lives += 1
-            actor.environments = 0
             # A life that comes back, after another that used its name, has what it sent remembered.
             actor.windows[join.incarnation] = actor.windows.pop(join.incarnation, SequenceWindow())
             while len(actor.windows) > _REMEMBERED_LIVES:
                 del actor.windows[next(iter(actor.windows))]
-        if join.spaces is not None:
-            actor.environments = join.environments
+        actor.environments = join.environments
         return None
 
     def seed_for(self, name: str, start_version: int) -> int:
         """The seed of an actor's environments and samples: its own for each life of it, and after each resume."""
-        entropy = [self._seed, zlib.crc32(name.encode()), self._actor(name).lives, start_version]
+        lives = self.actors[name].lives if name in self.actors else 0
+        entropy = [self._seed, zlib.crc32(name.encode()), lives, start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def set_present(self, name: str, present: bool) -> None:

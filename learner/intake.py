@@ -36,7 +36,8 @@ class Intake:
         self._epoch = learner_epoch
         self._fleet = fleet
         # On-policy learning takes nothing but the newest version.
-        self._max_lag = 0 if spec.synchronous else spec.training.max_policy_lag
+        self._max_lag = 0 if spec.synchronous else spec.training.policy_lag_bound
+        self.state_size = 0  # of the policy's memory; known before any actor has the program
 
     def read(self, sender: str, data: bytes) -> Rollout | Rejected:
         """Decodes what `sender` put on its key, and holds its content against the specification.
@@ -101,21 +102,31 @@ class Intake:
 
     def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
         """What the specification and the actor's own word allow a rollout to unpack to."""
-        observation = math.prod(spaces.observation.shape) * np.dtype(spaces.observation.dtype).itemsize
-        rows = self._spec.collection.rollout_length + 1
-        return Limits(max_bytes=rows * actor.environments * (observation + _ROW_BYTES) + _SLACK_BYTES, max_arrays=16)
+        frame = math.prod(spaces.observation.shape) * np.dtype(spaces.observation.dtype).itemsize
+        rows = self._spec.collection.rollout_length + spaces.observation.frames
+        row_bytes = actor.environments * (frame + _ROW_BYTES)
+        state_bytes = 4 * actor.environments * self.state_size
+        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16)
 
     def _fault(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """What about its content is against the specification, or nothing."""
-        expected = (self._spec.collection.rollout_length + 1, actor.environments, *spaces.observation.shape)
-        if rollout.observations.shape != expected or rollout.observations.dtype != spaces.observation.dtype:
+        space, rows = spaces.observation, self._spec.collection.rollout_length
+        if (rollout.rows, rollout.environments) != (rows, actor.environments):
             return (
-                f"observations are {rollout.observations.dtype} {rollout.observations.shape}, "
-                f"this run has {spaces.observation.dtype} {expected}"
+                f"it has {rollout.rows} rows of {rollout.environments} environments, "
+                f"this run has {rows} of this actor's {actor.environments}"
             )
+        expected = (rows + space.frames, actor.environments, *space.shape)
+        if rollout.frames.shape != expected or rollout.frames.dtype != space.dtype:
+            return (
+                f"frames are {rollout.frames.dtype} {rollout.frames.shape}, "
+                f"this run has {space.dtype} {expected} ({space})"
+            )
+        if rollout.initial_state.shape[1] != self.state_size:
+            return f"its policy remembers {rollout.initial_state.shape[1]} numbers, this run's {self.state_size}"
         if rollout.actions.min() < 0 or rollout.actions.max() >= spaces.action.count:
             return f"an action is not one of {spaces.action}"
-        for name in ("observations", "behaviour_log_probs", "rewards", "episode_returns"):
+        for name in ("frames", "initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
             if not np.isfinite(getattr(rollout, name)).all():
                 return f"{name} has a value that is not finite"
         if (rollout.behaviour_log_probs > 1e-4).any():

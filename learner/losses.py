@@ -25,6 +25,25 @@ def policy_gradient_loss(log_probs: Tensor, advantages: Tensor, valid: Tensor) -
     return -masked_mean(log_probs * advantages.detach(), valid)
 
 
+def clipped_policy_loss(log_ratios: Tensor, advantages: Tensor, valid: Tensor, clip_range: float) -> Tensor:
+    """- mean min(r_t A_t, clip(r_t, 1 - c, 1 + c) A_t): no gain from leaving the trust region, A_t a constant.
+
+    Schulman et al. (2017), equation 7; r_t compares with the policy that the batch found, not with the behaviour
+    policy: V-trace's rho in A_t accounts for that one (Hilton et al. 2022, section 3).
+
+    Args (all [T, B]): log_ratios: log pi(a_t|s_t) minus that of the policy at the batch's start; advantages; valid.
+    """
+    ratios = log_ratios.exp()
+    constants = advantages.detach()
+    clipped = ratios.clamp(1.0 - clip_range, 1.0 + clip_range)
+    return -masked_mean((ratios * constants).minimum(clipped * constants), valid)
+
+
+def clipped_fraction(log_ratios: Tensor, valid: Tensor, clip_range: float) -> Tensor:
+    """The share of valid rows whose ratio left the trust region: near 0 the passes do little, near 1 too much."""
+    return masked_mean(((log_ratios.exp() - 1.0).abs() > clip_range).float(), valid)
+
+
 def value_loss(values: Tensor, targets: Tensor, valid: Tensor, kind: Literal["mse", "huber"]) -> Tensor:
     """Mean of (V - G)^2, or the Huber loss (half of that within 1, linear beyond); G is a constant.
 

@@ -1,10 +1,14 @@
 """Where metrics go: a CSV file, TensorBoard, both, or nowhere."""
 
 import csv
+import io
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 COLUMNS = (
     "wall_seconds",
@@ -30,15 +34,30 @@ COLUMNS = (
     "gradient_norm",
     "value_mean",
     "advantage_std",
+    "clipped_fraction",
+    "evaluation_return_mean",
+    "evaluation_return_std",
+    "evaluation_length_mean",
+    "evaluation_env_steps",
     "learning_rate",
     "entropy_bonus",
 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Details:
+    """What does not fit into a row of numbers and yet tells convergence apart from collapse."""
+
+    returns: Sequence[float] = ()  # of the newest episodes
+    lengths: Sequence[int] = ()
+    action_counts: Sequence[int] = ()  # since the details before
+    picture: np.ndarray | None = None  # what the network saw at one row: uint8 [H, W] or [H, W, 3]
+
+
 class MetricsWriter(Protocol):
     """Takes one row of metrics at a time."""
 
-    def write(self, row: Mapping[str, float]) -> None:
+    def write(self, row: Mapping[str, float], details: Details) -> None:
         """Records a row; its keys are among COLUMNS, and those it lacks are unknown yet."""
         ...
 
@@ -50,7 +69,7 @@ class MetricsWriter(Protocol):
 class NullWriter:
     """Records nothing."""
 
-    def write(self, row: Mapping[str, float]) -> None:
+    def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
 
     def close(self) -> None:
@@ -58,18 +77,19 @@ class NullWriter:
 
 
 class CsvWriter:
-    """One line a row, appended; a resumed run continues its file."""
+    """One line a row, appended; a resumed run continues its file, in the columns that it was begun with."""
 
     def __init__(self, path: Path) -> None:
-        new = not path.exists() or path.stat().st_size == 0
+        begun = _header(path)  # another release may have had other columns
+        self._columns = begun or COLUMNS
         self._file = open(path, "a", newline="", encoding="utf-8")  # noqa: SIM115 - closed in close()
         self._writer = csv.writer(self._file)
-        if new:
+        if not begun:
             self._writer.writerow(COLUMNS)
 
-    def write(self, row: Mapping[str, float]) -> None:
+    def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
-        self._writer.writerow([_cell(row.get(name)) for name in COLUMNS])
+        self._writer.writerow([_cell(row.get(name)) for name in self._columns])
         self._file.flush()
 
     def close(self) -> None:
@@ -77,12 +97,20 @@ class CsvWriter:
         self._file.close()
 
 
+def _header(path: Path) -> Sequence[str]:
+    """The columns of a file; none if it is empty or not there."""
+    if not path.exists():
+        return ()
+    with open(path, newline="", encoding="utf-8") as file:
+        return next(csv.reader(file), ())
+
+
 def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 class TensorBoardWriter:
-    """Scalars against env_steps, in TensorBoard's own files."""
+    """Scalars, distributions and pictures against env_steps, in TensorBoard's own files."""
 
     def __init__(self, directory: Path) -> None:
         # Loaded here: a quarter of a second that no run should wait for before it has begun.
@@ -92,17 +120,55 @@ class TensorBoardWriter:
         # protobuf makes these classes when it is loaded: no type checker finds them
         self._event: Any = vars(event_pb2)["Event"]
         self._summary: Any = vars(summary_pb2)["Summary"]
+        self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
         self._writer = EventFileWriter(str(directory))
 
-    def write(self, row: Mapping[str, float]) -> None:
+    def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
         values: list[Any] = [
             self._summary.Value(tag=name, simple_value=float(value))
             for name, value in row.items()
             if name != "env_steps"
         ]
+        values += [
+            self._summary.Value(tag=tag, histo=self._histogram(*np.histogram(numbers, bins=30), numbers))
+            for tag, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
+            if len(numbers)
+        ]
+        if sum(details.action_counts):
+            chosen = np.array(details.action_counts)
+            edges = np.arange(len(chosen) + 1) - 0.5
+            values.append(self._summary.Value(tag="action", histo=self._histogram(chosen, edges, ())))
+        if details.picture is not None:
+            values.append(self._summary.Value(tag="what_the_network_sees", image=self._image(details.picture)))
         self._writer.add_event(
             self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values))
+        )
+
+    def _histogram(self, counts: np.ndarray, edges: np.ndarray, numbers: Sequence[float]) -> Any:
+        """TensorBoard's histogram of counts between edges; sums are of the numbers themselves where there are any."""
+        middles = (edges[1:] + edges[:-1]) / 2
+        exact = np.array(numbers, np.float64) if len(numbers) else np.repeat(middles, counts)
+        return self._histogram_proto(
+            min=float(exact.min()),
+            max=float(exact.max()),
+            num=float(counts.sum()),
+            sum=float(exact.sum()),
+            sum_squares=float(np.square(exact).sum()),
+            bucket_limit=edges[1:].tolist(),
+            bucket=counts.astype(float).tolist(),
+        )
+
+    def _image(self, picture: np.ndarray) -> Any:
+        from PIL import Image  # a requirement of TensorBoard's
+
+        png = io.BytesIO()
+        Image.fromarray(picture).save(png, "png")
+        return self._summary.Image(
+            height=picture.shape[0],
+            width=picture.shape[1],
+            colorspace=1 if picture.ndim == 2 else 3,
+            encoded_image_string=png.getvalue(),
         )
 
     def close(self) -> None:
@@ -116,10 +182,10 @@ class MetricsWriters:
     def __init__(self, writers: Sequence[MetricsWriter]) -> None:
         self._writers = writers
 
-    def write(self, row: Mapping[str, float]) -> None:
+    def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
         for writer in self._writers:
-            writer.write(row)
+            writer.write(row, details)
 
     def close(self) -> None:
         """See MetricsWriter."""

@@ -49,11 +49,11 @@ class Adam:
 
     _FIRST, _SECOND = 0.9, 0.999
 
-    def __init__(self, size: int, epsilon: float) -> None:
+    def __init__(self, values: Tensor, epsilon: float) -> None:
         self._epsilon = epsilon
         self.statistics = {
-            "mean": torch.zeros(size),
-            "square": torch.zeros(size),
+            "mean": torch.zeros_like(values),
+            "square": torch.zeros_like(values),
             "steps": torch.zeros((), dtype=torch.int64),
         }
 
@@ -77,10 +77,10 @@ class RmsProp:
     one learner.
     """
 
-    def __init__(self, size: int, epsilon: float, decay: float) -> None:
+    def __init__(self, values: Tensor, epsilon: float, decay: float) -> None:
         self._epsilon = epsilon
         self._decay = decay
-        self.statistics = {"square": torch.zeros(size)}
+        self.statistics = {"square": torch.zeros_like(values)}
 
     def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
         """See Optimizer."""

@@ -35,7 +35,8 @@ def add_settings(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--algorithm",
         metavar="NAME",
-        help="a2c (synchronous), a3c (asynchronous), impala (asynchronous, corrected for lag)",
+        help="a2c (synchronous), a3c (asynchronous), impala (asynchronous, corrected for lag), "
+        "appo (as impala, several passes over each batch)",
     )
     options.add_argument(
         "--actors",

@@ -9,6 +9,7 @@ counters, and the version that rollouts are held against.
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -21,12 +22,24 @@ from learner.request_queue import RequestQueue
 from learner.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, Taken
 from policy.runtime import program_hash
 from protocol import keys
-from protocol.codec import encode
-from protocol.messages import Acknowledgement, Farewell, Program, Rollout, Snapshot, StatusReport
+from protocol.codec import Limits, ProtocolError, decode, encode
+from protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Farewell,
+    Program,
+    Refusal,
+    Rollout,
+    Snapshot,
+    StatusReport,
+)
 from protocol.spec import RunSpec, RunStatus, Spaces
 from protocol.transport import Request, Transport
 
 HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+_WAITING_EVALUATIONS = 64  # at once; evaluators beyond that ask again later
+_EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)
 _HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
 
 
@@ -58,6 +71,7 @@ class Reception:
         self._requests = RequestQueue(int(spec.service.queue_megabytes * 2**20))
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
         self._program_hash = ""
+        self._evaluations: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
 
     def open(self) -> None:
         """Lets actors in."""
@@ -70,6 +84,7 @@ class Reception:
             keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key)))
         )
         transport.serve(keys.status(run), self._on_status)
+        transport.serve(keys.evaluations(run, "*"), self._on_evaluation)
         transport.announce(keys.learner(run))
         # Last: who is let in finds all else there.
         transport.serve(keys.join(run), lambda request: request.reply(desk.join(request.payload, time.monotonic())))
@@ -85,6 +100,8 @@ class Reception:
         self._desk.close(farewell)
         self._transport.publish(keys.snapshots(self._run), farewell)
         self._requests.close()
+        for request, _ in self.take_evaluations():
+            request.reply(encode(Refusal(code="finished", reason=reason)))
         if self._judging.is_alive():
             self._judging.join(timeout=5.0)
 
@@ -104,7 +121,7 @@ class Reception:
     def take_batch(self, version: int) -> list[Rollout]:
         """The rollouts of the next update, counted; none if no batch is complete within a heartbeat.
 
-        `version` is the newest; from here on, rollouts of the one that the update makes are the on-policy ones.
+        `version` is the newest; from here on, rollouts of the one that this batch makes are the on-policy ones.
         """
         with self.lock:
             taken = self._take(version)
@@ -115,19 +132,31 @@ class Reception:
                 self._counters.rollouts_rejected["stale"] += 1
                 self.fleet.actors[rollout.identity.actor].rejected["stale"] += 1
             if taken.rollouts:
-                self._counters.trained(taken.rollouts, version)
+                self._counters.trained(taken.rollouts, version, self._spec.training.updates_per_batch)
                 for rollout in taken.rollouts:
                     steps = int(np.count_nonzero(rollout.valid))
                     self.fleet.actors[rollout.identity.actor].env_steps += steps
-                self._version = version + 1
+                self._version = version + self._spec.training.updates_per_batch
             self.lock.notify_all()
         return taken.rollouts
 
     def _take(self, version: int) -> Taken:
         return self._buffer.take(self.fleet.live, version)
 
-    def offer_program(self, model: bytes) -> None:
-        """Has the policy program ready for those who ask."""
+    def take_evaluations(self) -> list[tuple[Request, EvaluationRequest | EvaluationReport]]:
+        """What evaluators asked and told since the last call; each is to be answered."""
+        with self.lock:
+            taken = list(self._evaluations)
+            self._evaluations.clear()
+        return taken
+
+    def newest_snapshot(self) -> bytes:
+        """The snapshot that was published last, encoded."""
+        return self._desk.snapshot()
+
+    def offer_program(self, model: bytes, state_size: int) -> None:
+        """Has the policy program ready for those who ask; rollouts come with `state_size` numbers of memory."""
+        self._intake.state_size = state_size
         self._program_hash = program_hash(model)
         self._desk.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
@@ -157,6 +186,24 @@ class Reception:
             request.reply(encode(Acknowledgement(verdict="finished")))
         elif not self._requests.offer(request):
             request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._version)))
+
+    def _on_evaluation(self, request: Request) -> None:
+        sender = keys.last_chunk(request.key)
+        try:
+            message = decode(request.payload, _EVALUATION_LIMITS)
+        except ProtocolError as error:
+            request.reply(encode(Refusal(code="malformed", reason=str(error))))
+            return
+        if not isinstance(message, EvaluationRequest | EvaluationReport) or message.evaluator != sender:
+            request.reply(encode(Refusal(code="malformed", reason="evaluators ask and report under their own name")))
+            return
+        with self.lock:
+            refused = self._over or not self._program_hash or len(self._evaluations) >= _WAITING_EVALUATIONS
+            if not refused:
+                self._evaluations.append((request, message))
+        if refused:
+            code = "finished" if self._over else "not_ready"
+            request.reply(encode(Refusal(code=code, reason="the learner has nothing to evaluate now")))
 
     def _on_status(self, request: Request) -> None:
         with self.lock:
@@ -195,5 +242,5 @@ def _buffer(spec: RunSpec) -> RolloutBuffer:
     training, actors = spec.training, spec.collection.actors
     if training.algorithm == "a2c":
         return BarrierBuffer(actors)
-    default = {"a3c": 1, "impala": actors}[training.algorithm]
-    return StreamBuffer(training.batch_rollouts or default, training.max_policy_lag)
+    default = 1 if training.algorithm == "a3c" else actors
+    return StreamBuffer(training.batch_rollouts or default, training.policy_lag_bound)

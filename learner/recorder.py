@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from learner.metrics import CsvWriter, MetricsWriter, MetricsWriters, NullWriter, TensorBoardWriter
+from learner.metrics import CsvWriter, Details, MetricsWriter, MetricsWriters, NullWriter, TensorBoardWriter
 from learner.progress import Progress
 from learner.run_directory import METRICS
 
@@ -22,14 +22,14 @@ class Recorder:
     def __init__(self, directory: Path, progress: Progress) -> None:
         self._progress = progress
         self._directory = directory
-        self._rows: queue.Queue[dict[str, float] | None] = queue.Queue(_QUEUED_ROWS)
+        self._rows: queue.Queue[tuple[dict[str, float], Details] | None] = queue.Queue(_QUEUED_ROWS)
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, row: dict[str, float]) -> None:
+    def record(self, row: dict[str, float], details: Details) -> None:
         """Takes a row; never waits."""
         with contextlib.suppress(queue.Full):
-            self._rows.put_nowait(row)
+            self._rows.put_nowait((row, details))
 
     def close(self) -> None:
         """Writes what is left."""
@@ -40,12 +40,12 @@ class Recorder:
     def _work(self) -> None:
         writer: MetricsWriter = NullWriter()
         opened = False
-        while (row := self._rows.get()) is not None:
-            self._progress.show(row)
+        while (taken := self._rows.get()) is not None:
+            self._progress.show(taken[0])
             if not opened:
                 writer = self._attempt(self._open, NullWriter())
                 opened = True
-            writer = self._attempt(lambda writer=writer, row=row: _written(writer, row), NullWriter())
+            writer = self._attempt(lambda writer=writer, taken=taken: _written(writer, *taken), NullWriter())
         self._attempt(writer.close, None)
 
     def _open(self) -> MetricsWriter:
@@ -59,6 +59,6 @@ class Recorder:
             return otherwise
 
 
-def _written(writer: MetricsWriter, row: dict[str, float]) -> MetricsWriter:
-    writer.write(row)
+def _written(writer: MetricsWriter, row: dict[str, float], details: Details) -> MetricsWriter:
+    writer.write(row, details)
     return writer

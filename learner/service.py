@@ -12,12 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from learner.counters import RunCounters
+from learner.evaluations import Evaluations
 from learner.fleet import Fleet
+from learner.metrics import Details
 from learner.progress import Progress
 from learner.reception import Reception
 from learner.recorder import Recorder
 from learner.report import RateMeter, metrics_row, run_status, summary
 from learner.run_directory import SUMMARY, write_json
+from protocol.codec import encode
+from protocol.messages import EvaluationReport, Refusal
 from protocol.spec import RunSpec, RunStatus
 from protocol.transport import Transport
 
@@ -60,6 +64,7 @@ class LearnerService:
         self._counters = RunCounters(spec.training.target_episodes)
         if restored is not None:
             self._counters.restore(restored.counters)
+        self._evaluations = Evaluations(directory, self._epoch)
         self._meter = RateMeter(self._counters, started)
         self._reception = Reception(
             self._run,
@@ -95,7 +100,7 @@ class LearnerService:
     def _learn(self, learner: "Learner") -> Outcome:
         """The main loop, and what surrounds it."""
         program = learner.program()
-        self._reception.offer_program(program)
+        self._reception.offer_program(program, learner.state_size)
         self._reception.publish(learner.policy_version, learner.weights())
         recorder = Recorder(self._directory, self._progress)
         begun, first_env_steps = time.monotonic(), self._counters.env_steps
@@ -105,7 +110,7 @@ class LearnerService:
         finally:
             ended = time.monotonic()
             self._leave()
-            recorder.record(self._row(learner, ended))
+            recorder.record(self._row(learner, ended), self._details(learner))
             recorder.close()
             self._save(learner, program)
         solved = seconds_to_target is not None
@@ -132,8 +137,9 @@ class LearnerService:
                 seconds_to_target = now - self._started
             if seconds_to_target is not None and training.stop_when_solved:
                 break
+            self._attend_evaluators(learner, program)
             if now >= log_at:
-                recorder.record(self._row(learner, now))
+                recorder.record(self._row(learner, now), self._details(learner))
                 log_at = now + service.log_seconds
             if now >= save_at:
                 self._save(learner, program)
@@ -142,13 +148,28 @@ class LearnerService:
 
     def _update(self, learner: "Learner") -> None:
         """One batch, one update, one snapshot; none of them if no batch is complete soon."""
-        from learner.batch import join_rollouts
-
         progress = self._counters.env_steps / self._spec.training.env_steps
         rollouts = self._reception.take_batch(learner.policy_version)
         if rollouts:
-            learner.step(join_rollouts(rollouts), progress)
+            learner.step(rollouts, progress)
             self._reception.publish(learner.policy_version, learner.weights())
+
+    def _attend_evaluators(self, learner: "Learner", program: bytes) -> None:
+        """Gives evaluators the newest policy, a checkpoint of which is kept, and takes in how it played."""
+        for request, message in self._reception.take_evaluations():
+            if isinstance(message, EvaluationReport):
+                answer, news = self._evaluations.report(message)
+                request.reply(encode(answer))
+                if news:
+                    self._progress.say(news)
+                continue
+            directory = self._save(learner, program)
+            if directory is None:
+                request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
+                continue
+            version, env_steps = learner.policy_version, self._counters.env_steps
+            self._evaluations.begin(message.evaluator, directory, version, env_steps)
+            request.reply(self._reception.newest_snapshot())
 
     def _leave(self) -> None:
         stopped = self._stop.is_set()
@@ -165,10 +186,21 @@ class LearnerService:
             rates = self._meter.look(self._counters, now)
             learning = {
                 **learner.take_metrics(),
+                **self._evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
             }
             return metrics_row(self._counters, self._reception.fleet, rates, learning, self._wall_seconds(now))
+
+    def _details(self, learner: "Learner") -> Details:
+        with self._reception.lock:
+            returns, lengths = list(self._counters.returns), list(self._counters.lengths)
+        return Details(
+            returns=returns,
+            lengths=lengths,
+            action_counts=learner.take_action_counts(),
+            picture=learner.take_picture(),
+        )
 
     def _status(self, fleet: Fleet) -> RunStatus:
         return run_status(
@@ -182,8 +214,8 @@ class LearnerService:
             time.monotonic(),
         )
 
-    def _save(self, learner: "Learner", program: bytes) -> None:
-        """Saves a checkpoint; a disk that refuses costs a warning."""
+    def _save(self, learner: "Learner", program: bytes) -> Path | None:
+        """Saves a checkpoint and says where; a disk that refuses costs a warning."""
         from learner.checkpoint import save_checkpoint
 
         spaces = self._reception.fleet.spaces
@@ -191,7 +223,7 @@ class LearnerService:
         with self._reception.lock:
             counters = self._counters.state(self._wall_seconds(time.monotonic()))
         try:
-            save_checkpoint(
+            return save_checkpoint(
                 self._directory,
                 spec=self._spec,
                 spaces=spaces,
@@ -201,9 +233,11 @@ class LearnerService:
                 state=learner.state(),
                 counters=counters,
                 keep=self._spec.service.keep_checkpoints,
+                also_keep=self._evaluations.kept,
             )
         except OSError as error:
             self._progress.say(f"no checkpoint was saved ({error.strerror}); the one before it stays")
+            return None
 
     def _write_summary(self, outcome: Outcome, wall_seconds: float, env_steps_per_second: float) -> None:
         content = summary(

@@ -1,9 +1,14 @@
 """The part of a checkpoint that can play: program, weights, and what environment they are for.
 
 A checkpoint (learner/checkpoint.py) is a sealed directory; this file knows the entries of it that acting
-needs, so that an evaluator reads them without torch and without the learner's code.
+needs, so that an evaluator reads them without torch and without the learner's code. It knows too by what names
+they lie: a run's by policy version, its best by score as well, those that ship with the package by their own.
 """
 
+import difflib
+import math
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,10 +16,17 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from policy.sealed import DamagedError, SealedDirectory
+from policy.sealed import DamagedError, SealedDirectory, write_sealed
 from protocol.spec import RunSpec, Spaces
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
+PRETRAINED = Path(__file__).parent / "pretrained"
+
+_BEST = re.compile(r"best_(-?\d+\.\d)_(\d{10,})", re.ASCII)
+
+
+class NoPolicyError(Exception):
+    """There is no such policy; the message says what there is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,6 +47,80 @@ def checkpoints(run_directory: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted((entry for entry in folder.iterdir() if entry.name.isdigit()), reverse=True)
+
+
+def best_name(score: float, policy_version: int) -> str:
+    """What a checkpoint is called that evaluations found to be the best: best_812.3_0000012345.
+
+    Raises ValueError if the score is not finite.
+    """
+    if not math.isfinite(score):
+        raise ValueError(f"a score must be finite, not {score}")
+    return f"best_{score:.1f}_{policy_version:010d}"
+
+
+def is_best(directory: Path) -> bool:
+    """Whether a checkpoint bears a `best_name`."""
+    return _BEST.fullmatch(directory.name) is not None
+
+
+def best_score(directory: Path) -> float:
+    """The score in a `best_name`, rounded as it stands there. Raises ValueError if the name is another."""
+    return _score_and_version(directory)[0]
+
+
+def best_checkpoint(run_directory: Path) -> Path | None:
+    """The checkpoint of a run with the highest score, of equals the newest; None if none was scored."""
+    folder = run_directory / "checkpoints"
+    scored = [entry for entry in folder.iterdir() if is_best(entry)] if folder.is_dir() else []
+    return max(scored, key=_score_and_version, default=None)
+
+
+def _score_and_version(directory: Path) -> tuple[float, int]:
+    match = _BEST.fullmatch(directory.name)
+    if match is None:
+        raise ValueError(f"{directory} is not named like a best checkpoint")
+    return float(match[1]), int(match[2])
+
+
+def find_policy(directory: Path, warn: Callable[[str], None], newest: bool = False) -> SavedPolicy:
+    """The policy of a checkpoint; of a run directory its best, or its newest if none is or `newest` is asked for.
+
+    Damaged ones are named and passed over. Raises DamagedError if none is left.
+    """
+    if (directory / "manifest.json").exists():
+        return read_policy(directory)
+    best = None if newest else best_checkpoint(directory)
+    candidates = [*([best] if best else []), *checkpoints(directory)]
+    if not candidates:
+        raise DamagedError(f"{directory} has no checkpoints: is it a run directory?")
+    for candidate in candidates:
+        try:
+            return read_policy(candidate)
+        except DamagedError as error:
+            warn(f"passed over: {error}")
+    raise DamagedError(f"{directory} has no checkpoint that can be read")
+
+
+def pretrained(name: str) -> Path:
+    """The checkpoint of a policy that ships with the package. Raises NoPolicyError for an unknown name."""
+    names = sorted(entry.parent.name for entry in PRETRAINED.glob("*/manifest.json"))
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1, 0.5)
+        hint = f"did you mean {near[0]}? " if near else ""
+        there_are = f"there are {', '.join(names)}" if names else "none ships with this release"
+        raise NoPolicyError(f"no pretrained policy {name!r}: {hint}{there_are}")
+    return PRETRAINED / name
+
+
+def export_policy(checkpoint: Path, target: Path) -> None:
+    """Writes the policy of `checkpoint`, without the learner's state, as the sealed directory `target`.
+
+    Raises DamagedError if the checkpoint is not what was written, OSError if the disk refuses.
+    """
+    sealed = SealedDirectory(checkpoint)
+    files = {name: sealed.read(name) for name in (PROGRAM_FILE, PARAMETERS_FILE)}
+    write_sealed(target, files, sealed.content)
 
 
 def read_policy(directory: Path) -> SavedPolicy:

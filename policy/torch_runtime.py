@@ -13,10 +13,18 @@ class TorchRuntime:
     """Runs the network with torch on one thread."""
 
     def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
+        """Raises PolicyError for a network that is the user's own: its name came over the wire, and is not imported."""
+        if ":" in spec.encoder:
+            raise PolicyError(f"the network {spec.encoder} is the user's own: use --runtime onnx")
         torch.set_num_threads(1)
         self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
         self._parameters = dict(self._network.named_parameters())
         self._acting = [name for name in self._parameters if not name.startswith("value_head")]
+
+    @property
+    def state_size(self) -> int:
+        """See PolicyRuntime."""
+        return self._network.state_size
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """See PolicyRuntime. The value head plays no part in acting and may be absent."""
@@ -33,7 +41,11 @@ class TorchRuntime:
                 # Copied: torch wants memory that it may write to, and a snapshot's is read-only.
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
 
-    def act(self, observations: np.ndarray, random: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime."""
-        logits = self._network.act(torch.from_numpy(observations)).numpy()
-        return greedy_categorical(logits) if random is None else sample_categorical(logits, random)
+        logits, next_state = self._network.act(torch.from_numpy(observations), torch.from_numpy(state))
+        chosen = greedy_categorical if random is None else lambda logits: sample_categorical(logits, random)
+        actions, log_probs = chosen(logits.numpy())
+        return actions, log_probs, next_state.numpy()

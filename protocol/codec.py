@@ -5,8 +5,12 @@
          4      2  protocol version, little-endian
          6      2  0: the body is plain, 1: the body is one zstd frame
          8      4  length of the header, little-endian
-        12      -  header: one msgpack map {"kind", "fields", "arrays", "size"}, padded with zeros to 8
-         -      -  body: the raw little-endian buffers of the arrays, each padded with zeros to 8
+        12      -  header: one msgpack map {"kind", "fields", "arrays", "size"}, padded with zeros to 8; each
+                   array is [name, dtype, shape, swapped]
+         -      -  body: the raw little-endian buffers of the arrays, each padded with zeros to 8; of a
+                   swapped one the buffer's second axis comes first
+
+A rollout's frames are swapped: environment by environment, zstd finds each frame's predecessor beside it.
 
 The first six bytes keep their meaning in every version, so that two ends of different versions can
 name both. Nothing that is read executes, and no size that a message declares is believed before it
@@ -18,7 +22,7 @@ import math
 import struct
 import threading
 import typing
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import msgpack
 import numpy as np
@@ -28,7 +32,7 @@ from pydantic import ValidationError
 from protocol import schema
 from protocol.messages import Message, Program, Rollout
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")
@@ -37,7 +41,7 @@ _ALIGNMENT = 8
 _DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
 _COMPRESSED = (Rollout, Program)  # weights are noise to zstd; the rest is small
-_LEVEL = -1
+_LEVEL, _PIXEL_LEVEL = -1, 1  # zstd's: what is cheap for numbers leaves pixels twice as large
 _MAX_DIMENSIONS = 8
 
 
@@ -82,13 +86,14 @@ def encode(message: Message) -> bytes:
     content = {
         "kind": type(message).__name__,
         "fields": fields,
-        "arrays": [(name, _travelling(name, array).str, array.shape) for name, array in arrays],
+        "arrays": [(name, _travelling(name, array).str, array.shape, _is_swapped(array)) for name, array in arrays],
         "size": len(body),
     }
     header = cast(bytes, msgpack.packb(content))
     flags = _PLAIN
     if isinstance(message, _COMPRESSED) and body:
-        smaller = _zstd.compressor.compress(body)
+        pixels = any(array.dtype == np.uint8 and array.ndim > 3 for _, array in arrays)
+        smaller = (_zstd.pixel_compressor if pixels else _zstd.compressor).compress(body)
         if len(smaller) < len(body):
             flags, body = _ZSTD, smaller
     padding = bytes(-(_PREFIX.size + len(header)) % _ALIGNMENT)
@@ -128,7 +133,14 @@ def _travelling(name: str, array: np.ndarray) -> np.dtype:
     return dtype
 
 
+def _is_swapped(array: np.ndarray) -> bool:
+    """Whether the array lies in memory with its second axis first, and is sent so."""
+    return array.ndim >= 2 and not array.flags.c_contiguous and array.swapaxes(0, 1).flags.c_contiguous
+
+
 def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
+    if _is_swapped(array):
+        array = array.swapaxes(0, 1)
     data = np.ascontiguousarray(array, dtype=_travelling(name, array)).tobytes()
     return data, bytes(-len(data) % _ALIGNMENT)
 
@@ -172,15 +184,25 @@ def _read_header(header: bytes) -> tuple[str, dict[str, Any], list[Any], int]:
     return kind, fields, arrays, size
 
 
-def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[tuple[str, np.dtype, tuple[int, ...], int]]:
-    """Name, dtype, shape and offset of each array; together they fill the body exactly."""
+class _Entry(NamedTuple):
+    """One array of the body."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    swapped: bool
+    offset: int
+
+
+def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[_Entry]:
+    """Where each array lies; together they fill the body exactly."""
     if len(arrays) > limits.max_arrays:
         raise ProtocolError(f"{len(arrays)} arrays, the limit is {limits.max_arrays}")
     layout, offset, names = [], 0, set()
     for entry in arrays:
-        if not isinstance(entry, list) or len(entry) != 3:
-            raise ProtocolError("an array must have a name, a dtype and a shape")
-        name, dtype, shape = entry
+        if not isinstance(entry, list) or len(entry) != 4:
+            raise ProtocolError("an array must have a name, a dtype, a shape and whether it is swapped")
+        name, dtype, shape, swapped = entry
         if not isinstance(name, str) or name in names:
             raise ProtocolError("array names must be distinct strings")
         if not isinstance(dtype, str) or dtype not in _DTYPES:
@@ -189,7 +211,9 @@ def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[tuple[str
             raise ProtocolError(f"array {name!r} has no proper shape")
         if not all(type(side) is int and 0 <= side <= limits.max_bytes for side in shape):
             raise ProtocolError(f"array {name!r} has no proper shape")
-        layout.append((name, _DTYPES[dtype], tuple(shape), offset))
+        if type(swapped) is not bool or (swapped and len(shape) < 2):
+            raise ProtocolError(f"array {name!r} cannot be swapped like that")
+        layout.append(_Entry(name, _DTYPES[dtype], tuple(shape), swapped, offset))
         names.add(name)
         length = math.prod(shape) * _DTYPES[dtype].itemsize
         offset += length + -length % _ALIGNMENT
@@ -215,16 +239,17 @@ def _plain_body(flags: int, body: memoryview, size: int) -> bytes | memoryview:
     return plain
 
 
-def _read_arrays(
-    layout: list[tuple[str, np.dtype, tuple[int, ...], int]], body: bytes | memoryview
-) -> dict[str, np.ndarray]:
+def _read_arrays(layout: list[_Entry], body: bytes | memoryview) -> dict[str, np.ndarray]:
     arrays = {}
-    for name, dtype, shape, offset in layout:
+    for name, dtype, shape, swapped, offset in layout:
         flat = np.frombuffer(body, np.uint8, math.prod(shape) * dtype.itemsize, offset)
         if dtype == np.bool_ and flat.size and flat.max() > 1:
             raise ProtocolError(f"array {name!r} has a truth value that is neither 0 nor 1")
         try:
-            array = flat.view(dtype).reshape(shape)
+            if swapped:
+                array = flat.view(dtype).reshape(shape[1], shape[0], *shape[2:]).swapaxes(0, 1)
+            else:
+                array = flat.view(dtype).reshape(shape)
         except ValueError:  # sides whose product is more than numpy counts to, beside one of 0
             raise ProtocolError(f"array {name!r} has no proper shape") from None
         array.flags.writeable = False
@@ -237,6 +262,7 @@ class _Zstd(threading.local):
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)
+        self.pixel_compressor = zstandard.ZstdCompressor(level=_PIXEL_LEVEL, write_content_size=True)
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=64 << 20)
 
 

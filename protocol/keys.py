@@ -31,6 +31,11 @@ def rollouts(run: str, actor: str) -> str:
     return f"daedalus/{run}/rollouts/{actor}"
 
 
+def evaluations(run: str, evaluator: str) -> str:
+    """Where one evaluator asks for policies and reports on them (`*` for all of them)."""
+    return f"daedalus/{run}/evaluations/{evaluator}"
+
+
 def snapshots(run: str) -> str:
     """Where weights are published, and the newest asked for."""
     return f"daedalus/{run}/snapshots"

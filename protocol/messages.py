@@ -69,13 +69,16 @@ class RolloutIdentity:
 class Rollout:
     """T consecutive rows of E environments under one snapshot. Actor -> learner, on `rollouts/{actor}`.
 
+    Each frame travels once: where the policy sees k frames stacked, the observation of row t is made of frames t to
+    t+k-1, the first frame of an episode in place of those before it (protocol/frames.py); k is 1 elsewhere.
     Environments reset by gymnasium's NEXT_STEP rule: the row after an episode's end only resets, its
     action was ignored and it is not `valid`; its observation is the true last one of the episode.
     """
 
     identity: RolloutIdentity
     policy_version: int  # of the behaviour policy
-    observations: np.ndarray  # [T+1, E, *observation_shape]; the last row bootstraps
+    frames: np.ndarray  # [k-1 + T+1, E, *frame_shape]; the last row bootstraps
+    initial_state: np.ndarray  # [E, S] float32, the policy's memory at row 0; S is 0 where it has none
     actions: np.ndarray  # [T, E] integers
     behaviour_log_probs: np.ndarray  # [T, E] float32, log mu(a_t | s_t)
     rewards: np.ndarray  # [T, E] float32, as learning shall see them (scaled)
@@ -91,8 +94,10 @@ class Rollout:
         rows, environments = self.actions.shape
         if rows == 0 or environments == 0:
             raise ValueError("a rollout needs at least one row and one environment")
-        if self.observations.ndim < 3 or self.observations.shape[:2] != (rows + 1, environments):
-            raise ValueError(f"observations must be [{rows + 1}, {environments}, ...], not {self.observations.shape}")
+        if self.frames.ndim < 3 or len(self.frames) <= rows or self.frames.shape[1] != environments:
+            raise ValueError(f"frames must be [{rows + 1} or more, {environments}, ...], not {self.frames.shape}")
+        if self.initial_state.ndim != 2 or len(self.initial_state) != environments:
+            raise ValueError(f"initial_state must be [{environments}, S], not {self.initial_state.shape}")
         for name in ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
             shape = getattr(self, name).shape
             if shape != (rows, environments):
@@ -100,7 +105,7 @@ class Rollout:
         for name in ("terminated", "truncated", "valid"):
             if getattr(self, name).dtype != np.bool_:
                 raise ValueError(f"{name} must be bool, not {getattr(self, name).dtype}")
-        for name in ("behaviour_log_probs", "rewards", "episode_returns"):
+        for name in ("initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
             if getattr(self, name).dtype != np.float32:
                 raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
         if self.actions.dtype.kind not in "iu" or self.episode_lengths.dtype.kind not in "iu":
@@ -123,7 +128,7 @@ class Rollout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """What became of a rollout: learner -> actor.
+    """What became of a rollout or of an evaluation's report: learner -> who sent it.
 
     accepted: it will be trained on, unless the learner ends first or its policy lag outgrows the bound.
     busy: the learner has no room now; send it again. rejected: never; `reason` says why.
@@ -149,6 +154,33 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationRequest:
+    """An evaluator asks for a policy to play: evaluator -> learner, on `evaluations/{evaluator}`.
+
+    The answer is the newest Snapshot, of which the learner keeps a checkpoint until it is reported on, or a Refusal.
+    """
+
+    evaluator: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EvaluationReport:
+    """How the policy of an EvaluationRequest played: evaluator -> learner, on `evaluations/{evaluator}`."""
+
+    evaluator: str
+    learner_epoch: int
+    policy_version: int
+    returns: np.ndarray  # [K] float32, true undiscounted returns
+    lengths: np.ndarray  # [K] int32, in env_steps
+
+    def __post_init__(self) -> None:
+        if self.returns.ndim != 1 or not len(self.returns) or self.returns.shape != self.lengths.shape:
+            raise ValueError("returns and lengths must be [K] alike, with K at least 1")
+        if self.returns.dtype != np.float32 or self.lengths.dtype != np.int32:
+            raise ValueError("returns must be float32 and lengths int32")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Farewell:
     """The run is over: learner -> actors, on `snapshots`. Actors leave."""
 
@@ -163,4 +195,16 @@ class StatusReport:
     status: RunStatus
 
 
-Message = Join | Welcome | Refusal | Program | Rollout | Acknowledgement | Snapshot | Farewell | StatusReport
+Message = (
+    Join
+    | Welcome
+    | Refusal
+    | Program
+    | Rollout
+    | Acknowledgement
+    | Snapshot
+    | EvaluationRequest
+    | EvaluationReport
+    | Farewell
+    | StatusReport
+)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 PositiveInt = Annotated[int, Field(ge=1)]
+NaturalInt = Annotated[int, Field(ge=0)]
 UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -23,14 +24,25 @@ class Specification(BaseModel):
 
 
 class ArraySpace(Specification):
-    """Arrays of one shape and dtype (gymnasium's Box), as they travel: `float32` or `uint8`."""
+    """Arrays of one shape and dtype (gymnasium's Box), as they travel: `float32` or `uint8`.
+
+    An environment shows one frame at a step; the policy sees the newest `frames` of them, stacked on a first axis of
+    their own where there is more than one.
+    """
 
     kind: Literal["array"] = "array"
-    shape: tuple[PositiveInt, ...]
+    shape: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=4)]  # of one frame
     dtype: Literal["float32", "uint8"]
+    frames: Annotated[int, Field(ge=1, le=16)] = 1
+
+    @property
+    def stacked_shape(self) -> tuple[int, ...]:
+        """The shape that the policy sees."""
+        return self.shape if self.frames == 1 else (self.frames, *self.shape)
 
     def __str__(self) -> str:
-        return f"{self.dtype} array of shape {self.shape}"
+        stacked = f", {self.frames} stacked" if self.frames > 1 else ""
+        return f"{self.dtype} array of shape {self.shape}{stacked}"
 
 
 class ChoiceSpace(Specification):
@@ -57,20 +69,44 @@ class Spaces(Specification):
 
 
 class EnvironmentSpec(Specification):
-    """Which environment the actors play, and what is done to its rewards before learning."""
+    """Which environment the actors play, and what they do to its pixels, actions and rewards.
+
+    The transforms apply in the order in which they stand here. A step of the result is one env_step, however many of
+    the environment's own steps (frames) it repeats its action for.
+    """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
+    backend: Literal["gymnasium", "envpool", "ale"] = "gymnasium"  # whose implementation of it
     kwargs: dict[str, JsonValue] = {}
-    max_episode_steps: PositiveInt | None = None
-    reward_scale: Annotated[float, Field(gt=0.0)] = 1.0  # learning sees reward x scale; logs show the true return
+    processes: bool = False  # on gymnasium's backend: each in a process of its own, where the environment is slow
+    max_episode_steps: PositiveInt | None = None  # in the environment's own steps
+
+    action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
+    action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
+    patience: PositiveInt | None = None  # an episode is cut after so many env_steps without a positive reward
+
+    crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None  # pixels off top, bottom, left, right
+    grey: bool = False
+    resize: tuple[PositiveInt, PositiveInt] | None = None  # to height, width: the mean of what each pixel covers
+    frame_stack: Annotated[int, Field(ge=1, le=16)] = 1
+
+    # Learning sees these rewards; logs and evaluations show the true return.
+    reward_clip: Annotated[float, Field(gt=0.0)] | None = None  # to +- this
+    reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
+
+    def as_evaluated(self, backend: Literal["gymnasium", "envpool", "ale"] | None = None) -> "EnvironmentSpec":
+        """The same environment for a score: episodes are played to their true end, on another backend if named."""
+        return self.model_copy(update={"patience": None, "backend": backend or self.backend})
 
 
 class PolicySpec(Specification):
-    """The network: an encoder, then one head for the policy and one for the value."""
+    """The network: an encoder, a memory if it has one, then a head for the policy and one for the value."""
 
-    encoder: Literal["mlp"] = "mlp"
-    hidden: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=8)] = (64, 64)
-    activation: Literal["tanh", "relu"] = "tanh"
+    encoder: Annotated[str, Field(pattern=r"^(mlp|nature|impala|article|[\w.]+:\w+)$", max_length=200)] = "mlp"
+    hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)  # of the mlp
+    activation: Literal["tanh", "relu"] = "tanh"  # of the mlp
+    memory: Literal["none", "gru"] = "none"
+    memory_units: Annotated[int, Field(ge=1, le=4096)] = 256
 
 
 class CollectionSpec(Specification):
@@ -85,20 +121,23 @@ class CollectionSpec(Specification):
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
-    algorithm: Literal["a2c", "a3c", "impala"] = "impala"
+    algorithm: Literal["a2c", "a3c", "impala", "appo"] = "impala"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     env_steps: PositiveInt = 1_000_000  # the budget
     target_return: float | None = None  # solved when the mean of the last `target_episodes` reaches it
     target_episodes: PositiveInt = 100
     stop_when_solved: bool = True
 
-    batch_rollouts: PositiveInt | None = None  # rollouts in a batch; unset: a3c 1, impala one per actor
-    max_policy_lag: Annotated[int, Field(ge=0)] = 32  # updates; older rollouts are dropped and counted
+    batch_rollouts: PositiveInt | None = None  # rollouts in a batch; unset: a3c 1, impala and appo one per actor
+    max_policy_lag: NaturalInt | None = None  # updates; older rollouts are dropped and counted; unset: 32 batches
 
     discount_factor: UnitInterval = 0.99
     trace_lambda: UnitInterval = 1.0  # 1: n-step returns; below: lambda-returns
-    rho_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace, impala only
-    trace_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace's c, impala only
+    rho_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace: impala and appo
+    trace_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace's c: impala and appo
+    passes: Annotated[int, Field(ge=1, le=64)] = 3  # over each batch, appo only
+    minibatches: Annotated[int, Field(ge=1, le=4096)] = 4  # that a batch is shuffled into, one update each; appo only
+    clip_range: Annotated[float, Field(gt=0.0)] = 0.2  # of the probability ratio, appo only
 
     value_loss: Literal["mse", "huber"] = "mse"
     value_coefficient: Annotated[float, Field(ge=0.0)] = 0.5
@@ -112,7 +151,29 @@ class TrainingSpec(Specification):
     optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
     rmsprop_decay: UnitInterval = 0.99
     max_gradient_norm: Annotated[float, Field(gt=0.0)] = 0.5
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"  # of convolutions; auto: bfloat16 where it is faster
     threads: PositiveInt = 1  # of the learner; two that spin for a core the actors use are far slower than one
+
+    @property
+    def updates_per_batch(self) -> int:
+        """How many policy versions one batch makes."""
+        return self.passes * self.minibatches if self.algorithm == "appo" else 1
+
+    @property
+    def policy_lag_bound(self) -> int:
+        """The largest policy lag that is learned from, in updates."""
+        return 32 * self.updates_per_batch if self.max_policy_lag is None else self.max_policy_lag
+
+
+class EvaluationSpec(Specification):
+    """The evaluator that `daedalus train` keeps beside the actors: greedy episodes, which training never sees."""
+
+    seconds: Annotated[float, Field(gt=0.0)] | None = None  # from one evaluation's start to the next's; unset: none
+    episodes: Annotated[int, Field(ge=1, le=10_000)] = 10
+    final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100  # with the best policy, once training has ended
+    final_backend: Literal["gymnasium", "envpool", "ale"] | None = None  # unset: the one that was trained on
 
 
 class ServiceSpec(Specification):
@@ -131,6 +192,7 @@ class RunSpec(Specification):
     policy: PolicySpec = PolicySpec()
     collection: CollectionSpec = CollectionSpec()
     training: TrainingSpec = TrainingSpec()
+    evaluation: EvaluationSpec = EvaluationSpec()
     service: ServiceSpec = ServiceSpec()
 
     @model_validator(mode="after")
@@ -138,6 +200,16 @@ class RunSpec(Specification):
         if self.training.algorithm == "a2c" and self.training.batch_rollouts is not None:
             raise ValueError(
                 "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _stack_fits_the_rollout(self) -> "RunSpec":
+        stack, rows = self.environment.frame_stack, self.collection.rollout_length
+        if stack > rows:
+            raise ValueError(
+                f"environment.frame_stack is {stack}, longer than a rollout: "
+                f"collection.rollout_length is {rows}, make it at least {stack}"
             )
         return self
 

@@ -2,7 +2,9 @@
 
 import copy
 import itertools
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -11,33 +13,43 @@ from actor.environments import make_environments
 from protocol.messages import Rollout, RolloutIdentity
 from protocol.spec import EnvironmentSpec
 
+COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 
 
 class Scripted:
-    """A policy that plays 0, 1, 2, ... and over again, the same in every environment."""
+    """A policy that plays 0, 1, 2, ... and over again, the same in every environment.
+
+    Its memory is two numbers: how many rows it remembers, and the sum of the steps that it saw in them.
+    """
+
+    state_size = 2
 
     def __init__(self, choices: int = 4) -> None:
         self._choices = choices
+        self.remembered: list[np.ndarray] = []
         self.calls = 0
         self.seen: list[np.ndarray] = []
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         pass
 
-    def act(self, observations: np.ndarray, random: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.seen.append(observations.copy())
+        self.remembered.append(state.copy())
         actions = np.full(len(observations), self.calls % self._choices)
         self.calls += 1
-        return actions, np.full(len(observations), -0.5 * self.calls, np.float32)
+        next_state = state + np.stack([np.ones(len(state)), observations[:, 1]], axis=1).astype(np.float32)
+        return actions, np.full(len(observations), -0.5 * self.calls, np.float32), next_state
 
 
 @pytest.fixture
 def collected() -> tuple[list[Rollout], Scripted]:
     """Three rollouts of four rows, one environment, episodes of 3 (terminated), 2 (truncated), 1 (terminated)."""
-    environments = make_environments(EnvironmentSpec(id="counting_environment:Counting-v0"), 1)
     policy = Scripted()
-    collector = Collector(environments, policy, rollout_length=4, reward_scale=1.0, seed=1)
+    collector = Collector(make_environments(COUNTING, 1), policy, COUNTING, rollout_length=4, seed=1)
     return [copy.deepcopy(collector.collect(IDENTITY, 7)) for _ in range(3)], policy
 
 
@@ -59,7 +71,7 @@ def rows(rollouts: list[Rollout], name: str) -> np.ndarray:
 
 def test_each_row_holds_its_observation_action_and_reward(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, policy = collected
-    observations = np.concatenate([rollout.observations[:-1, 0] for rollout in rollouts])
+    observations = np.concatenate([rollout.frames[:-1, 0] for rollout in rollouts])
     np.testing.assert_array_equal(observations, np.stack([EPISODE, STEP], axis=1))
     np.testing.assert_array_equal(observations, np.concatenate(policy.seen))
     np.testing.assert_array_equal(rows(rollouts, "actions"), ACTION)
@@ -77,14 +89,14 @@ def test_termination_truncation_and_reset_rows_are_told_apart(collected: tuple[l
 def test_the_row_after_an_end_shows_the_true_last_observation(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     # Row 2 ends episode 0; row 3 still shows its observation 3, which the value of row 2's successor needs.
-    np.testing.assert_array_equal(rollouts[0].observations[3, 0], [0, 3])
-    np.testing.assert_array_equal(rollouts[1].observations[2, 0], [1, 2])
+    np.testing.assert_array_equal(rollouts[0].frames[3, 0], [0, 3])
+    np.testing.assert_array_equal(rollouts[1].frames[2, 0], [1, 2])
 
 
 def test_the_last_observation_of_a_rollout_is_the_first_of_the_next(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     for before, after in itertools.pairwise(rollouts):
-        np.testing.assert_array_equal(before.observations[-1], after.observations[0])
+        np.testing.assert_array_equal(before.frames[-1], after.frames[0])
 
 
 def test_episodes_are_reported_where_they_end_with_their_true_returns(
@@ -99,8 +111,8 @@ def test_episodes_are_reported_where_they_end_with_their_true_returns(
 
 
 def test_rewards_are_scaled_for_learning_and_not_in_returns() -> None:
-    environments = make_environments(EnvironmentSpec(id="counting_environment:Counting-v0"), 2)
-    collector = Collector(environments, Scripted(), rollout_length=3, reward_scale=0.5, seed=1)
+    spec = COUNTING.model_copy(update={"reward_scale": 0.5})
+    collector = Collector(make_environments(spec, 2), Scripted(), spec, rollout_length=3, seed=1)
     rollout = collector.collect(IDENTITY, 0)
     np.testing.assert_allclose(rollout.rewards[:, 0], 0.5 * REWARD[:3], rtol=1e-6)
     np.testing.assert_allclose(rollout.episode_returns, [REWARD[:3].sum()] * 2, rtol=1e-6)
@@ -108,15 +120,111 @@ def test_rewards_are_scaled_for_learning_and_not_in_returns() -> None:
     np.testing.assert_allclose(second.rewards[:, 1], 0.5 * REWARD[3:6], rtol=1e-6)
 
 
+def test_rewards_are_clipped_then_scaled_for_learning_and_not_in_returns() -> None:
+    spec = COUNTING.model_copy(update={"reward_clip": 10.5, "reward_scale": 0.5})
+    collector = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=4, seed=1)
+    rollouts = [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+    assert (REWARD > 10.5).any()
+    assert ((REWARD > 5.25) & (REWARD < 10.5)).any()  # scaled first, these would be among the clipped
+    np.testing.assert_allclose(rows(rollouts, "rewards"), 0.5 * np.minimum(REWARD, 10.5), rtol=1e-6)
+    returns = np.concatenate([rollout.episode_returns for rollout in rollouts])
+    np.testing.assert_allclose(returns, [(REWARD * (EPISODE == episode)).sum() for episode in range(4)], rtol=1e-6)
+
+
+class _Losing(gymnasium.Env[np.ndarray, np.int64]):
+    """Every step costs 3."""
+
+    observation_space = gymnasium.spaces.Box(0, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(4)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.zeros(2, np.float32), -3.0, False, False, {}
+
+
+def test_losses_are_clipped_as_gains_are() -> None:
+    gymnasium.register("Losing-v0", lambda **_kwargs: _Losing())
+    spec = EnvironmentSpec(id="Losing-v0", max_episode_steps=2, reward_clip=1.0, reward_scale=2.0)
+    rollout = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=2, seed=1).collect(IDENTITY, 0)
+    assert rollout.rewards[:, 0].tolist() == [-2.0, -2.0]
+    assert rollout.episode_returns.tolist() == [-6.0]
+
+
+# Before each of the twelve rows: how many rows of its episode were acted upon, and the sum of their steps. The reset
+# row of an episode is its last; what is made of it is forgotten.
+REMEMBERED = np.array([[0, 0], [1, 0], [2, 1], [3, 3], [0, 0], [1, 0], [2, 1], [0, 0], [1, 0], [0, 0], [1, 0], [2, 1]])
+
+
+def test_memory_is_of_the_running_episode_alone(collected: tuple[list[Rollout], Scripted]) -> None:
+    _, policy = collected
+    np.testing.assert_array_equal(np.concatenate(policy.remembered), REMEMBERED)
+
+
+def test_a_rollout_ships_the_memory_as_it_was_before_its_first_row(collected: tuple[list[Rollout], Scripted]) -> None:
+    rollouts, _ = collected
+    np.testing.assert_array_equal(
+        np.concatenate([rollout.initial_state for rollout in rollouts]), REMEMBERED[[0, 4, 8]]
+    )
+    assert rollouts[2].initial_state.any()  # begun in the middle of an episode
+
+
+def test_environments_remember_apart() -> None:
+    """Two that end at other steps: each forgets at its own starts."""
+    spec = EnvironmentSpec(id="CartPole-v1")
+    environments, policy = make_environments(spec, 3), Scripted(choices=1)
+    collector = Collector(environments, policy, spec, rollout_length=40, seed=3)
+    rollout = collector.collect(IDENTITY, 0)
+    starts = np.concatenate([np.zeros((1, 3), bool), ~rollout.valid[:-1]])
+    assert (starts.any(axis=1) != starts.all(axis=1)).any()
+    expected = np.zeros(3)
+    for row in range(40):
+        expected = np.where(starts[row], 0, expected)
+        np.testing.assert_array_equal(policy.remembered[row][:, 0], expected)
+        expected += 1
+
+
+def test_a_policy_without_memory_ships_none() -> None:
+    policy = Forgetful()
+    rollout = Collector(make_environments(COUNTING, 3), policy, COUNTING, rollout_length=4, seed=1).collect(IDENTITY, 0)
+    assert rollout.initial_state.shape == (3, 0)
+
+
+class Forgetful(Scripted):
+    state_size = 0
+
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        assert state.shape == (len(observations), 0)
+        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+
+
+STACKED = COUNTING.model_copy(update={"frame_stack": 3})
+
+
+def test_each_frame_is_shipped_once_after_the_stack_of_the_first_row() -> None:
+    policy = Forgetful()
+    collector = Collector(make_environments(STACKED, 1), policy, STACKED, rollout_length=4, seed=1)
+    rollouts = [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+    shown = [frame.tolist() for frame in np.stack([EPISODE, STEP], axis=1)]
+    assert rollouts[0].frames[:, 0].tolist() == [shown[0]] * 2 + shown[:5]
+    # Row 4 is the first of episode 1: the stack that it begins with shows nothing of episode 0.
+    assert rollouts[1].frames[:, 0].tolist() == [shown[4]] * 2 + shown[4:9]
+    # Row 8 is the reset row of episode 2, which was two frames long.
+    assert rollouts[2].frames[:, 0].tolist() == [shown[7], shown[7], *shown[8:], [3, 3]]
+
+
 def test_cartpoles_own_vector_entry_point_resets_on_truncation_too() -> None:
     """The notes' notebook resets on termination only; an episode cut by its limit then never ends."""
-    environments = make_environments(EnvironmentSpec(id="CartPole-v1", max_episode_steps=5), 3)
-    collector = Collector(environments, Scripted(choices=2), rollout_length=12, reward_scale=1.0, seed=3)
+    spec = EnvironmentSpec(id="CartPole-v1", max_episode_steps=5)
+    collector = Collector(make_environments(spec, 3), Scripted(choices=2), spec, rollout_length=12, seed=3)
     rollout = collector.collect(IDENTITY, 0)
     assert rollout.truncated[[4, 10]].all()
     assert not rollout.terminated.any()
     assert not rollout.valid[[5, 11]].any()
     assert rollout.valid.sum() == 3 * 10
-    assert (np.abs(rollout.observations[6]) <= 0.05).all()  # a fresh start
-    assert (np.abs(rollout.observations[5]) > 0.05).any()  # the true last one
+    assert (np.abs(rollout.frames[6]) <= 0.05).all()  # a fresh start
+    assert (np.abs(rollout.frames[5]) > 0.05).any()  # the true last one
     np.testing.assert_array_equal(rollout.episode_lengths, [5] * 6)

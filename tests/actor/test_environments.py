@@ -1,5 +1,8 @@
 """What can be played, and what is said about what cannot."""
 
+import warnings
+from typing import Literal
+
 import gymnasium
 import numpy as np
 import pytest
@@ -8,18 +11,52 @@ from actor.environments import UnplayableError, make_environments
 from protocol.spec import EnvironmentSpec
 
 
-@pytest.mark.parametrize("name", ["CartPole-v1", "Acrobot-v1", "LunarLander-v3"])
-def test_environments_follow_the_next_step_rule(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "backend"),
+    [
+        ("CartPole-v1", "gymnasium"),
+        ("Acrobot-v1", "gymnasium"),
+        ("LunarLander-v3", "gymnasium"),
+        ("CartPole-v1", "envpool"),
+        ("Acrobot-v1", "envpool"),
+        ("Pong-v5", "envpool"),
+        ("Pong-v5", "ale"),
+    ],
+)
+def test_environments_follow_the_next_step_rule(name: str, backend: Literal["gymnasium", "envpool", "ale"]) -> None:
     """After an end: a row with reward 0 that shows the first observation next; the same for every way of stepping."""
-    environments = make_environments(EnvironmentSpec(id=name, max_episode_steps=4), 2)
+    _needs(backend)
+    environments = make_environments(EnvironmentSpec(id=name, backend=backend, max_episode_steps=4), 2)
     observations = environments.reset(5)
     assert observations.shape == (2, *environments.spaces.observation.shape)
     for step in range(1, 11):
-        _, rewards, terminated, truncated = environments.step(np.zeros(2, np.int64))
+        _, rewards, terminated, truncated = environments.step(np.full(2, step % 2))
         if step in (5, 10):
             np.testing.assert_array_equal(rewards, 0.0)
         assert (terminated | truncated).all() == (step in (4, 9))
     environments.close()
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_a_reset_row_ignores_its_action(backend: Literal["gymnasium", "envpool"]) -> None:
+    _needs(backend)
+    starts = []
+    for action in (0, 1):
+        environments = make_environments(EnvironmentSpec(id="CartPole-v1", backend=backend, max_episode_steps=3), 2)
+        environments.reset(5)
+        for _ in range(3):
+            environments.step(np.zeros(2, np.int64))
+        starts.append(environments.step(np.full(2, action))[0])
+        environments.close()
+    np.testing.assert_array_equal(*starts)
+    assert (np.abs(starts[0]) <= 0.05).all(), "CartPole starts within 0.05 of the middle"
+
+
+def _needs(backend: str) -> None:
+    if backend != "gymnasium":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # envpool's, of its own spaces
+            pytest.importorskip({"envpool": "envpool", "ale": "ale_py.vector_env"}[backend])
 
 
 def test_an_unknown_environment_is_named_with_near_matches() -> None:
@@ -32,9 +69,52 @@ def test_a_module_that_is_not_there_is_named() -> None:
         make_environments(EnvironmentSpec(id="no_such_module:Mine-v0"), 1)
 
 
-def test_spaces_that_do_not_travel_are_named() -> None:
-    with pytest.raises(UnplayableError, match=r"action space Box.*must be Discrete"):
+def test_continuous_actions_want_a_table() -> None:
+    with pytest.raises(
+        UnplayableError, match=r"action space Box.*must be Discrete.*environment.action_table, 1 number"
+    ):
         make_environments(EnvironmentSpec(id="Pendulum-v1"), 1)
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        (((1.0,), (0.5, 0.5)), r"row 1 has 2 numbers, but an action of space Box\(-2.0, 2.0, \(1,\), float32\) has 1"),
+        (((0.0,), (-2.0,), (2.5,)), r"row 2 is \(2.5,\), outside action space Box"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_told_beside_the_space(table: tuple, reason: str) -> None:
+    with pytest.raises(UnplayableError, match=f"environment.action_table {reason}"):
+        make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
+
+
+def test_a_table_over_choices_is_refused() -> None:
+    with pytest.raises(UnplayableError, match=r"action_table has 2 rows, but action space Discrete\(2\).*leave"):
+        make_environments(EnvironmentSpec(id="CartPole-v1", action_table=((0.0,), (1.0,))), 1)
+
+
+def test_a_table_names_the_actions() -> None:
+    """Pendulum pays for its torque: 0.001 of its square."""
+    rewards = []
+    for table in (((0.0,), (0.0,)), ((0.0,), (2.0,))):
+        environments = make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
+        environments.reset(1)
+        assert environments.spaces.action.count == 2
+        rewards.append(float(environments.step(np.array([1]))[1][0]))
+    assert rewards[0] - rewards[1] == pytest.approx(0.004)
+
+
+def test_observations_that_do_not_travel_are_named() -> None:
+    with pytest.raises(UnplayableError, match=r"observation space Discrete.*must be a Box"):
+        make_environments(EnvironmentSpec(id="Taxi-v4"), 1)
+
+
+@pytest.mark.parametrize("backend", ["envpool", "ale"])
+def test_what_only_gymnasium_does_is_refused(backend: Literal["envpool", "ale"]) -> None:
+    with pytest.raises(UnplayableError, match=f"backend={backend} does not do wrap and environment.processes"):
+        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend, processes=True), 1, wrap="module:function")
+    with pytest.raises(UnplayableError, match="does not do render_mode"):
+        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, render_mode="human")
 
 
 def test_a_keyword_that_the_environment_does_not_take_is_told() -> None:

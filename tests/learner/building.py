@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
-from learner.batch import Batch, join_rollouts
+from learner.batch import Batch, BatchAssembler
 from learner.fleet import Fleet
 from protocol.messages import Join, Rollout, RolloutIdentity
 from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces, TrainingSpec
@@ -14,6 +15,7 @@ EPOCH = 77
 ROWS, ENVIRONMENTS = 6, 3
 SPACES = Spaces(observation=ArraySpace(shape=(3,), dtype="float32"), action=ChoiceSpace(count=4))
 POLICY = PolicySpec(hidden=(8,))
+RECURRENT = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
 
 
 def run_spec(rows: int = ROWS, actors: int = 2, **training: Any) -> RunSpec:
@@ -38,6 +40,8 @@ def make_rollout(
     rows: int = ROWS,
     environments: int = ENVIRONMENTS,
     shape: Sequence[int] = (3,),
+    stack: int = 1,
+    state_size: int = 0,
     seed: int = 0,
     **replaced: np.ndarray,
 ) -> Rollout:
@@ -53,7 +57,8 @@ def make_rollout(
         truncated[row] = valid[row] & (random.random(environments) < 0.15)
     cells = (rows, environments)
     content: dict[str, Any] = {
-        "observations": random.standard_normal((rows + 1, environments, *shape), np.float32),
+        "frames": random.standard_normal((stack + rows, environments, *shape), np.float32),
+        "initial_state": random.standard_normal((environments, state_size), np.float32),
         "actions": random.integers(0, SPACES.action.count, cells, np.uint8),
         "behaviour_log_probs": -random.uniform(0.5, 2.5, cells).astype(np.float32),
         "rewards": random.standard_normal(cells, np.float32),
@@ -66,8 +71,14 @@ def make_rollout(
     return Rollout(identity=who or identity(), policy_version=version, **{**content, **replaced})
 
 
-def make_batch(seed: int, rollouts: int = 2) -> Batch:
-    return join_rollouts([make_rollout(seed=seed * 100 + number) for number in range(rollouts)])
+def make_rollouts(seed: int, count: int = 2, state_size: int = 0) -> list[Rollout]:
+    """Those of one batch."""
+    return [make_rollout(seed=seed * 100 + number, state_size=state_size) for number in range(count)]
+
+
+def join(rollouts: Sequence[Rollout], observation: ArraySpace = SPACES.observation) -> Batch:
+    """One batch of them, in memory of its own."""
+    return BatchAssembler(observation, torch.device("cpu")).join(rollouts)
 
 
 def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:

@@ -24,17 +24,17 @@ def test_only_valid_rows_are_env_steps() -> None:
     for each in (first, second):
         counters.accepted(each, 500)
     assert (counters.env_steps, counters.accepted_env_steps) == (0, steps)
-    counters.trained([first, second], 0)
+    counters.trained([first, second], 0, 12)
     assert counters.env_steps == steps
-    assert (counters.rollouts_accepted, counters.rollouts_trained, counters.updates) == (2, 2, 1)
+    assert (counters.rollouts_accepted, counters.rollouts_trained, counters.updates) == (2, 2, 12)
     assert counters.rollout_bytes == 1000
 
 
 def test_policy_lag_is_the_learners_version_minus_the_rollouts() -> None:
     counters = RunCounters(10)
     assert counters.policy_lag_mean == 0.0
-    counters.trained([rollout(7), rollout(4)], 8)
-    counters.trained([rollout(9)], 9)
+    counters.trained([rollout(7), rollout(4)], 8, 1)
+    counters.trained([rollout(9)], 9, 1)
     assert counters.policy_lag_mean == pytest.approx((1 + 4 + 0) / 3)
     assert counters.policy_lag_max == 4
 
@@ -42,7 +42,7 @@ def test_policy_lag_is_the_learners_version_minus_the_rollouts() -> None:
 def test_the_mean_return_is_over_the_newest_episodes() -> None:
     counters = RunCounters(3)
     assert counters.episode_return_mean is None
-    counters.trained([rollout(returns=(1.0, 2.0)), rollout(returns=(3.0, 7.0))], 0)
+    counters.trained([rollout(returns=(1.0, 2.0)), rollout(returns=(3.0, 7.0))], 0, 1)
     assert counters.episode_return_mean == pytest.approx(4.0)
     assert counters.episodes == 4
     assert list(counters.lengths) == [3, 4, 8]
@@ -51,9 +51,9 @@ def test_the_mean_return_is_over_the_newest_episodes() -> None:
 def test_a_target_is_reached_by_enough_episodes_only() -> None:
     counters = RunCounters(2)
     assert not counters.reached(0.0)
-    counters.trained([rollout(returns=(9.0,))], 0)
+    counters.trained([rollout(returns=(9.0,))], 0, 1)
     assert not counters.reached(5.0)
-    counters.trained([rollout(returns=(1.0,))], 0)
+    counters.trained([rollout(returns=(1.0,))], 0, 1)
     assert counters.reached(5.0)
     assert not counters.reached(5.1)
     assert not counters.reached(None)
@@ -62,7 +62,7 @@ def test_a_target_is_reached_by_enough_episodes_only() -> None:
 def test_counters_come_back_from_json_and_go_on_alike() -> None:
     through, first = RunCounters(3), RunCounters(3)
     for number in range(3):
-        through.trained([rollout(0, (0.1 * number, -2.5), number)], number)
+        through.trained([rollout(0, (0.1 * number, -2.5), number)], number, 2)
         through.accepted(rollout(seed=number), 100)
         through.rollouts_rejected["stale"] += 1
         through.snapshots_published += 1
@@ -71,7 +71,7 @@ def test_counters_come_back_from_json_and_go_on_alike() -> None:
     through.wall_seconds = 12.5
     assert first == through
     for counters in (through, first):
-        counters.trained([rollout(3, (5.0,))], 4)
+        counters.trained([rollout(3, (5.0,))], 4, 3)
         counters.rollouts_rejected["duplicate"] += 1
     assert first == through
 

@@ -76,10 +76,18 @@ def test_a_huge_jump_gives_up_all_that_was_passed() -> None:
 OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=ChoiceSpace(count=2))
 
 
-def test_the_first_actor_with_spaces_decides_them() -> None:
+def test_who_comes_without_spaces_only_asks_what_is_played() -> None:
     fleet = Fleet(1, None)
     assert fleet.join(Join(actor="a", incarnation=1), 0.0) is None
-    assert fleet.spaces is None
+    assert (fleet.spaces, fleet.actors) == (None, {})
+    fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 3.0)
+    assert fleet.join(Join(actor="a", incarnation=2), 9.0) is None
+    actor = fleet.actors["a"]
+    assert (actor.incarnation, actor.lives, actor.last_seen, actor.environments) == (1, 1, 3.0, 2)
+
+
+def test_the_first_actor_with_spaces_decides_them() -> None:
+    fleet = Fleet(1, None)
     assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 0.0) is None
     assert fleet.spaces == SPACES
 
@@ -116,8 +124,8 @@ def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected()
     assert fleet.expected(identity("a")) is actor
     actor.sequences.add(0)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
-    assert fleet.expected(identity("a")) is None
-    assert fleet.expected(identity("a", incarnation=2)) is None  # not before it has told its spaces
+    assert fleet.expected(identity("a")) is actor  # who only asks what is played replaces nobody
+    assert fleet.expected(identity("a", incarnation=2)) is None
     assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=3), 0.0) is None
     assert fleet.expected(identity("a")) is None
     assert fleet.expected(identity("a", incarnation=2)) is actor
@@ -163,7 +171,7 @@ def test_seeds_differ_by_actor_life_start_and_run_and_are_otherwise_the_same() -
         found = {}
         for life in (1, 2):
             for name in ("a", "b"):
-                fleet.join(Join(actor=name, incarnation=life), 0.0)
+                fleet.join(Join(actor=name, incarnation=life, spaces=SPACES, environments=1), 0.0)
                 for start in (0, 500):
                     found[name, life, start] = fleet.seed_for(name, start)
         return found

@@ -73,7 +73,7 @@ def test_a_good_rollout_is_accepted_as_it_was_sent(desk: Desk) -> None:
     verdict = desk.receive(encode(rollout), now=5.0)
     assert isinstance(verdict, Rollout)
     assert verdict.identity == rollout.identity
-    np.testing.assert_array_equal(verdict.observations, rollout.observations)
+    np.testing.assert_array_equal(verdict.frames, rollout.frames)
     actor = desk.fleet.actors["a"]
     assert (actor.accepted, actor.policy_lag, actor.last_seen) == (1, 2, 5.0)
     assert not actor.rejected
@@ -119,18 +119,34 @@ def test_another_message_is_no_rollout(desk: Desk) -> None:
         good(rows=ROWS + 1),
         good(environments=ENVIRONMENTS - 1),
         good(environments=ENVIRONMENTS + 1),
-        good(shape=(4,)),
-        good(shape=(3, 1)),
-        good(observations=np.zeros((ROWS + 1, ENVIRONMENTS, 3), np.uint8)),
+        good(rows=ROWS - 1, stack=2),  # as many frames as there should be
     ],
-    ids=["T too small", "T too large", "E too small", "E too large", "shape", "more dimensions", "dtype"],
+    ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
-def test_other_sizes_and_dtypes_are_malformed(desk: Desk, rollout: Rollout) -> None:
-    assert_rejected(desk, encode(rollout), "malformed", "observations are")
+def test_other_numbers_of_rows_and_environments_are_malformed(desk: Desk, rollout: Rollout) -> None:
+    reason = f"it has {rollout.rows} rows of {rollout.environments} environments, this run has {ROWS} of"
+    assert_rejected(desk, encode(rollout), "malformed", reason)
+
+
+@pytest.mark.parametrize(
+    "rollout",
+    [
+        good(shape=(4,)),
+        good(shape=(2,)),
+        good(shape=(3, 1)),
+        good(stack=2),
+        good(frames=np.zeros((ROWS + 1, ENVIRONMENTS, 3), np.uint8)),
+    ],
+    ids=["larger", "smaller", "more dimensions", "a stack", "dtype"],
+)
+def test_other_frames_are_malformed_and_both_are_named(desk: Desk, rollout: Rollout) -> None:
+    theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
+    verdict = assert_rejected(desk, encode(rollout), "malformed", theirs)
+    assert f"this run has float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
 
 def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(desk: Desk) -> None:
-    bomb = good(rows=4000, environments=500, observations=np.zeros((4001, 500, 3), np.float32))
+    bomb = good(rows=4000, environments=500, frames=np.zeros((4001, 500, 3), np.float32))
     assert_rejected(desk, encode(bomb), "malformed", "the limit is")
 
 
@@ -142,7 +158,7 @@ def test_an_action_out_of_range_is_malformed(desk: Desk, action: int) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["observations", "behaviour_log_probs", "rewards", "episode_returns"])
+@pytest.mark.parametrize("name", ["frames", "behaviour_log_probs", "rewards", "episode_returns"])
 def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(desk: Desk, name: str, value: float) -> None:
     assert_rejected(desk, encode(with_value(name, value)), "malformed", name)
 
@@ -157,6 +173,98 @@ def test_a_log_probability_that_rounding_put_above_0_is_accepted(desk: Desk) -> 
 
 def test_a_policy_version_yet_to_come_is_malformed(desk: Desk) -> None:
     assert_rejected(desk, encode(good(version=VERSION + 1)), "malformed", "yet to come")
+
+
+@pytest.mark.parametrize("size", [1, 7])
+def test_a_memory_where_the_policy_has_none_is_malformed(desk: Desk, size: int) -> None:
+    reason = f"its policy remembers {size} numbers, this run's 0"
+    assert_rejected(desk, encode(good(state_size=size)), "malformed", reason)
+
+
+@pytest.mark.parametrize("size", [0, 4, 6])
+def test_a_memory_of_another_size_is_malformed(desk: Desk, size: int) -> None:
+    desk.intake.state_size = 5
+    verdict = desk.receive(encode(good(state_size=size)))
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == f"its policy remembers {size} numbers, this run's 5"
+    assert isinstance(desk.receive(encode(good(state_size=5))), Rollout)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_memory_that_is_not_finite_is_malformed(desk: Desk, value: float) -> None:
+    desk.intake.state_size = 5
+    state = np.zeros((ENVIRONMENTS, 5), np.float32)
+    state[-1, -1] = value
+    verdict = desk.receive(encode(good(initial_state=state)))
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == "initial_state has a value that is not finite"
+
+
+# ----------------------------------------------------------------------------------------------- stacks
+
+STACKED = ArraySpace(shape=(60, 80, 3), dtype="uint8", frames=4)
+
+
+def stacked_desk(state_size: int = 0) -> Desk:
+    desk = Desk()
+    desk.fleet = joined_fleet("a", spaces=SPACES.model_copy(update={"observation": STACKED}))
+    desk.intake = Intake(run_spec(max_policy_lag=MAX_LAG), EPOCH, desk.fleet)
+    desk.intake.state_size = state_size
+    return desk
+
+
+def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np.ndarray:
+    """Noise, which no compression makes smaller."""
+    return np.random.default_rng(0).integers(0, 256, (length, ENVIRONMENTS, *shape), np.uint8)
+
+
+def test_of_a_stack_each_frame_comes_once() -> None:
+    rollout = good(frames=pixels())
+    verdict = stacked_desk().receive(encode(rollout))
+    assert isinstance(verdict, Rollout)
+    np.testing.assert_array_equal(verdict.frames, rollout.frames)
+
+
+def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
+    swapped = np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)
+    verdict = stacked_desk().receive(encode(good(frames=swapped)))
+    assert isinstance(verdict, Rollout)
+    np.testing.assert_array_equal(verdict.frames, pixels())
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        pixels(ROWS + 1),
+        pixels(ROWS + 3),
+        pixels(ROWS + 5),
+        pixels(shape=(80, 60, 3)),
+        pixels(shape=(60, 80)),
+        pixels(shape=(4, 60, 80, 3))[: ROWS + 1],
+        pixels(shape=(59, 80, 3)),
+    ],
+    ids=["no stack", "a smaller stack", "a larger stack", "turned", "grey", "stacked already", "a line less"],
+)
+def test_frames_of_another_stack_or_size_are_malformed(frames: np.ndarray) -> None:
+    verdict = stacked_desk().receive(encode(good(frames=frames)))
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == "malformed"
+    assert "frames are uint8" in verdict.reason or "the limit is" in verdict.reason
+
+
+def test_the_limit_lets_the_largest_rollout_of_the_run_through_and_not_much_more() -> None:
+    largest = good(frames=pixels(), initial_state=np.zeros((ENVIRONMENTS, 40_000), np.float32))
+    largest = dataclasses.replace(
+        largest,
+        actions=largest.actions.astype(np.int64),
+        episode_returns=np.zeros(ROWS * ENVIRONMENTS, np.float32),
+        episode_lengths=np.ones(ROWS * ENVIRONMENTS, np.int64),
+    )
+    assert isinstance(stacked_desk(40_000).receive(encode(largest)), Rollout)
+    too_many = good(frames=pixels(2 * (ROWS + 4)))
+    verdict = stacked_desk().receive(encode(too_many))
+    assert isinstance(verdict, Rejected)
+    assert "the limit is" in verdict.reason
 
 
 @given(st.data())

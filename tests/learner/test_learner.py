@@ -7,22 +7,27 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from building import POLICY, SPACES, make_batch, make_rollout, run_spec
+from building import POLICY, RECURRENT, SPACES, join, make_rollout, make_rollouts, run_spec
 from oracles import Stream, lambda_return, vtrace, vtrace_advantage
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from learner.batch import Batch, join_rollouts
+from learner.batch import Batch
 from learner.checkpoint import load_checkpoint, save_checkpoint
 from learner.learner import METRICS, Learner
 from policy.network import ActorCritic
+from protocol.messages import Rollout
 from protocol.spec import PolicySpec, TrainingSpec
 
 STEPS = 5
 
 
+def learner_spec(**training: Any) -> TrainingSpec:
+    return TrainingSpec.model_validate(training)
+
+
 def make_learner(policy: PolicySpec = POLICY, **training: Any) -> Learner:
-    return Learner(TrainingSpec.model_validate(training), policy, SPACES)
+    return Learner(learner_spec(**training), policy, SPACES)
 
 
 def weights(learner: Learner) -> dict[str, np.ndarray]:
@@ -39,29 +44,65 @@ def assert_same(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> N
 # --------------------------------------------------------------------------- the update, written plainly
 
 
+Cell = tuple[int, int]  # row and environment
+Played = dict[Cell, Tensor]
+
+
 class PlainLearner:
     """One row at a time where the learner has vectors, torch's modules where it has its own."""
 
-    def __init__(self, spec: TrainingSpec, start: dict[str, np.ndarray]) -> None:
+    def __init__(self, spec: TrainingSpec, policy: PolicySpec, start: dict[str, np.ndarray]) -> None:
         self.spec = spec
-        self.network = ActorCritic(POLICY, SPACES)
+        self.network = ActorCritic(policy, SPACES)
         self.network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
         self.parameters = list(self.network.parameters())
         self.adam = torch.optim.Adam(self.parameters, eps=spec.optimizer_epsilon)
         self.squares = [torch.zeros_like(parameter) for parameter in self.parameters]
 
     def step(self, batch: Batch, rate: float, bonus: float) -> dict[str, float]:
-        spec, cells = self.spec, batch.valid.nonzero().tolist()
-        columns, log_probs, entropies, values = self._play_back(batch)
-        targets = {(t, b): self._targets(columns[b], t) for t, b in cells}
-        advantages = torch.tensor([targets[t, b][1] for t, b in cells])
+        """All updates from a batch; the mean of what they measured."""
+        with torch.no_grad():
+            before, _, values = self._play_back(batch)
+        streams = [self._stream(batch, b, before, values) for b in range(batch.actions.shape[1])]
+        targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
+        measured = [self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
+        return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
+
+    def _parts(self, batch: Batch) -> list[list[Cell]]:
+        """The rows of each update, where nothing is shuffled."""
+        cells = [(t, b) for t, b in batch.valid.nonzero().tolist()]
+        if self.spec.algorithm != "appo":
+            return [cells]
+        if self.network.state_size:
+            columns = evenly(list(range(batch.actions.shape[1])), self.spec.minibatches)
+            parts = [[cell for cell in cells if cell[1] in part] for part in columns]
+        else:
+            parts = evenly(cells, self.spec.minibatches)
+        return parts * self.spec.passes
+
+    def _update(
+        self,
+        batch: Batch,
+        cells: list[Cell],
+        targets: dict[Cell, tuple[float, float]],
+        before: Played,
+        rate: float,
+        bonus: float,
+    ) -> dict[str, float]:
+        spec = self.spec
+        log_probs, entropies, values = self._play_back(batch)
+        advantages = torch.tensor([targets[cell][1] for cell in cells])
         if spec.normalize_advantages:
             advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
-        chosen = torch.stack([log_probs[b][t] for t, b in cells])
-        predicted = torch.stack([values[b][t] for t, b in cells])
-        goals = torch.tensor([targets[t, b][0] for t, b in cells])
-        entropy = torch.stack([entropies[b][t] for t, b in cells]).mean()
-        policy_loss = -(chosen * advantages).mean()
+        predicted = torch.stack([values[cell] for cell in cells])
+        goals = torch.tensor([targets[cell][0] for cell in cells])
+        entropy = torch.stack([entropies[cell] for cell in cells]).mean()
+        ratios = torch.stack([(log_probs[cell] - before[cell]).exp() for cell in cells])
+        if spec.algorithm == "appo":
+            clipped = ratios.clip(1.0 - spec.clip_range, 1.0 + spec.clip_range)
+            policy_loss = -torch.minimum(ratios * advantages, clipped * advantages).mean()
+        else:
+            policy_loss = -(torch.stack([log_probs[cell] for cell in cells]) * advantages).mean()
         criterion = nn.MSELoss() if spec.value_loss == "mse" else nn.HuberLoss()
         value_loss = criterion(predicted, goals)
         self.network.zero_grad()
@@ -77,33 +118,45 @@ class PlainLearner:
             "explained_variance": explained.item(),
             "gradient_norm": norm.item(),
             "value_mean": predicted.mean().item(),
+            "clipped_fraction": ((ratios - 1.0).abs() > spec.clip_range).float().mean().item(),
         }
 
-    def _play_back(self, batch: Batch) -> tuple[list[Stream], list[Tensor], list[Tensor], list[Tensor]]:
-        """Each environment on its own: its rows in the papers' terms, log-probabilities, entropies, values."""
-        streams, log_probs, entropies, values = [], [], [], []
-        for b in range(batch.actions.shape[1]):
-            logits, value = self.network(batch.observations[:, b])
-            policy = torch.distributions.Categorical(logits=logits[:-1])
-            log_probs.append(policy.log_prob(batch.actions[:, b]))
-            entropies.append(policy.entropy())
-            values.append(value)
-            streams.append(
-                Stream(
-                    r=batch.rewards[:, b].tolist(),
-                    V=value.tolist(),
-                    log_ratios=(log_probs[-1].detach() - batch.behaviour_log_probs[:, b]).tolist(),
-                    terminated=batch.terminated[:, b].tolist(),
-                    truncated=batch.truncated[:, b].tolist(),
-                    valid=batch.valid[:, b].tolist(),
-                )
-            )
-        return streams, log_probs, entropies, values
+    def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
+        """Each environment on its own, as an actor steps it: log-probabilities, entropies, values [T+1] of its rows."""
+        log_probs, entropies, values = {}, {}, {}
+        rows, environments = batch.actions.shape
+        for b in range(environments):
+            state = batch.initial_state[b : b + 1]
+            for t in range(rows + 1):
+                if batch.starts[t, b]:
+                    state = torch.zeros_like(state)
+                seen = batch.observations[t, b : b + 1]
+                _, value = self.network(seen.unsqueeze(0), state, torch.zeros(1, 1, dtype=torch.bool))
+                logits, state = self.network.act(seen, state)
+                values[t, b] = value.squeeze()
+                if t < rows:
+                    policy = torch.distributions.Categorical(logits=logits[0])
+                    log_probs[t, b] = policy.log_prob(batch.actions[t, b])
+                    entropies[t, b] = policy.entropy()
+        return log_probs, entropies, values
+
+    @staticmethod
+    def _stream(batch: Batch, b: int, log_probs: Played, values: Played) -> Stream:
+        """The rows of an environment in the papers' terms."""
+        rows = range(len(batch.actions))
+        return Stream(
+            r=batch.rewards[:, b].tolist(),
+            V=[values[t, b].item() for t in range(len(batch.actions) + 1)],
+            log_ratios=[(log_probs[t, b] - batch.behaviour_log_probs[t, b]).item() for t in rows],
+            terminated=batch.terminated[:, b].tolist(),
+            truncated=batch.truncated[:, b].tolist(),
+            valid=batch.valid[:, b].tolist(),
+        )
 
     def _targets(self, x: Stream, t: int) -> tuple[float, float]:
         spec = self.spec
         gamma, lam = spec.discount_factor, spec.trace_lambda
-        if spec.algorithm == "impala":
+        if spec.algorithm in ("impala", "appo"):
             clips = (spec.rho_clip, spec.trace_clip)
             return vtrace(x, gamma, lam, *clips, t), vtrace_advantage(x, gamma, lam, *clips, t)
         goal = lambda_return(x, gamma, lam, t)
@@ -122,6 +175,14 @@ class PlainLearner:
                 parameter -= rate * parameter.grad / (square + epsilon).sqrt()
 
 
+def evenly(items: list[Any], count: int) -> list[list[Any]]:
+    """`count` parts in order, the first ones longer by one where it does not come out even."""
+    size, longer = divmod(len(items), count)
+    lengths = [size + 1] * longer + [size] * (count - longer)
+    ends = np.cumsum(lengths)
+    return [items[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+
+
 KINDS = {
     "a2c": {"algorithm": "a2c", "trace_lambda": 0.9, "max_gradient_norm": 0.1},
     "a3c, rmsprop": {"algorithm": "a3c", "optimizer": "rmsprop", "max_gradient_norm": 100.0},
@@ -134,11 +195,26 @@ KINDS = {
         "value_loss": "huber",
         "normalize_advantages": True,
     },
+    "appo": {"algorithm": "appo", "trace_lambda": 0.95, "rho_clip": 1.5, "clip_range": 0.05},
+    "appo, one update": {"algorithm": "appo", "passes": 1, "minibatches": 1},
+    "appo, all": {
+        "algorithm": "appo",
+        "passes": 2,
+        "minibatches": 5,
+        "clip_range": 0.1,
+        "optimizer": "rmsprop",
+        "value_loss": "huber",
+        "normalize_advantages": True,
+    },
 }
 
 
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_updates_are_those_of_the_plain_implementation(kind: str) -> None:
+def test_updates_are_those_of_the_plain_implementation(
+    kind: str, policy: PolicySpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "randperm", torch.arange)
     spec = TrainingSpec.model_validate(
         {
             **KINDS[kind],
@@ -150,17 +226,97 @@ def test_updates_are_those_of_the_plain_implementation(kind: str) -> None:
             "entropy_bonus_final": 0.0,
         }
     )
-    learner = Learner(spec, POLICY, SPACES)
-    plain = PlainLearner(spec, weights(learner))
+    learner = Learner(spec, policy, SPACES)
+    plain = PlainLearner(spec, policy, weights(learner))
     for step in range(STEPS):
-        batch, progress = make_batch(step), step / STEPS
-        learner.step(batch, progress)
-        metrics = plain.step(batch, rate=0.02 - 0.01 * progress, bonus=0.1 - 0.1 * progress)
+        rollouts, progress = make_rollouts(step, state_size=learner.state_size), step / STEPS
+        learner.step(rollouts, progress)
+        metrics = plain.step(join(rollouts), rate=0.02 - 0.01 * progress, bonus=0.1 - 0.1 * progress)
         taken = learner.take_metrics()
         assert {name: taken[name] for name in metrics} == pytest.approx(metrics, rel=1e-3, abs=1e-4)
         for name, parameter in plain.network.named_parameters():
             assert_close(torch.from_numpy(learner.weights()[name]), parameter.detach(), rtol=1e-4, atol=1e-5)
-    assert learner.policy_version == STEPS
+    assert learner.policy_version == STEPS * spec.updates_per_batch
+
+
+def first_gradient(learner: Learner, rollouts: list[Rollout]) -> Tensor:
+    """That of the first update, as Adam took it in: a tenth of it is the mean that begins at 0."""
+    learner.step(rollouts, 0.0)
+    return learner.state()["adam/mean"] * 10.0
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "impala"])
+def test_what_a_memory_learns_from_all_rows_at_once_is_what_it_would_learn_row_by_row(algorithm: str) -> None:
+    learner = make_learner(RECURRENT, algorithm=algorithm, max_gradient_norm=1e9)
+    plain = PlainLearner(learner_spec(algorithm=algorithm, max_gradient_norm=1e9), RECURRENT, weights(learner))
+    rollouts = make_rollouts(3, state_size=learner.state_size)
+    batch = join(rollouts)
+    assert batch.starts.any()
+    plain.step(batch, 0.0, plain.spec.entropy_bonus)
+    expected = torch.cat([parameter.grad.flatten() for parameter in plain.parameters if parameter.grad is not None])
+    assert expected.abs().max() > 1e-3
+    assert_close(first_gradient(learner, rollouts), expected, rtol=1e-4, atol=1e-6)
+
+
+def on_policy(policy: PolicySpec, start: dict[str, np.ndarray], rollouts: list[Rollout]) -> list[Rollout]:
+    """The same, as if chosen by the policy with these weights."""
+    network = ActorCritic(policy, SPACES)
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
+    chosen = []
+    for rollout in rollouts:
+        batch = join([rollout])
+        with torch.no_grad():
+            logits, _ = network(batch.observations, batch.initial_state, batch.starts)
+        log_probs = torch.distributions.Categorical(logits=logits[:-1]).log_prob(batch.actions)
+        chosen.append(replace(rollout, behaviour_log_probs=log_probs.numpy()))
+    return chosen
+
+
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
+def test_on_policy_the_first_gradient_is_the_same_for_all_algorithms(policy: PolicySpec) -> None:
+    common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1, "trace_lambda": 0.9}
+    learners = {name: make_learner(policy, algorithm=name, **common) for name in ("a2c", "impala", "appo")}
+    rollouts = make_rollouts(1, state_size=learners["appo"].state_size)
+    rollouts = on_policy(policy, weights(learners["appo"]), rollouts)
+    gradients = {name: first_gradient(learner, rollouts) for name, learner in learners.items()}
+    assert gradients["impala"].abs().max() > 1e-3
+    assert_close(gradients["appo"], gradients["impala"], rtol=1e-4, atol=1e-6)
+    assert_close(gradients["a2c"], gradients["impala"], rtol=1e-4, atol=1e-6)
+    assert learners["appo"].take_metrics()["clipped_fraction"] == 0.0
+
+
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
+def test_off_policy_appos_first_gradient_is_impalas(policy: PolicySpec) -> None:
+    """Its ratios compare with the policy that the batch found; how far that was from the actors' is V-trace's."""
+    common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1}
+    impala, appo = (make_learner(policy, algorithm=name, **common) for name in ("impala", "appo"))
+    rollouts = make_rollouts(1, state_size=appo.state_size)
+    assert_close(first_gradient(appo, rollouts), first_gradient(impala, rollouts), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
+@pytest.mark.parametrize(("passes", "count"), [(1, 1), (3, 4), (2, 50)])
+def test_a_batch_makes_as_many_versions_as_there_are_passes_and_minibatches(
+    policy: PolicySpec, passes: int, count: int
+) -> None:
+    learner = make_learner(policy, algorithm="appo", passes=passes, minibatches=count)
+    for step in range(1, 4):  # of 50 minibatches most are empty: 6 environments, 36 rows
+        learner.step(make_rollouts(step, state_size=learner.state_size), 0.0)
+        assert learner.policy_version == step * passes * count
+    assert all(np.isfinite(array).all() for array in weights(learner).values())
+    assert all(np.isfinite(value) for value in learner.take_metrics().values())
+
+
+def test_the_smallest_batch_makes_as_many_versions_as_any() -> None:
+    learner = make_learner(algorithm="appo", passes=2, minibatches=4)
+    before = weights(learner)
+    learner.step([make_rollout(rows=1, environments=1, valid=np.ones((1, 1), np.bool_))], 0.0)
+    assert learner.policy_version == 8
+    assert learner.take_metrics()
+    assert not np.array_equal(before["policy_head.weight"], weights(learner)["policy_head.weight"])
+    learner.step([make_rollout(rows=1, environments=1, valid=np.zeros((1, 1), np.bool_))], 0.0)
+    assert learner.policy_version == 16
+    assert learner.take_metrics() == {}
 
 
 # --------------------------------------------------------------------------------------------- the rest
@@ -186,33 +342,36 @@ def test_a_final_rate_of_0_is_not_taken_for_none() -> None:
     assert (learner.learning_rate(1.0), learner.entropy_bonus(1.0)) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "impala"])
+@pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 def test_the_same_seed_gives_the_same_weights_to_the_bit(algorithm: str) -> None:
     def trained(seed: int) -> dict[str, np.ndarray]:
         learner = make_learner(algorithm=algorithm, seed=seed)
         for step in range(STEPS):
-            learner.step(make_batch(step), 0.0)
+            learner.step(make_rollouts(step), 0.0)
         return weights(learner)
 
     assert_same(trained(3), trained(3))
     assert not np.array_equal(trained(3)["policy_head.weight"], trained(4)["policy_head.weight"])
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "impala"])
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
+@pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 @pytest.mark.parametrize("normalize", [False, True])
-def test_what_a_reset_row_holds_changes_no_weight(algorithm: str, normalize: bool) -> None:
-    batch = make_batch(1)
-    resets = batch.valid == 0.0
-    assert resets.any()
-    garbage = replace(
-        batch,
-        actions=torch.where(resets, 3 - batch.actions, batch.actions),
-        rewards=torch.where(resets, 1e4, batch.rewards),
-        behaviour_log_probs=torch.where(resets, -20.0, batch.behaviour_log_probs),
-    )
+def test_what_a_reset_row_holds_changes_no_weight(algorithm: str, normalize: bool, policy: PolicySpec) -> None:
+    clean = make_rollouts(1, state_size=make_learner(policy).state_size)
+    assert not all(rollout.valid.all() for rollout in clean)
+    garbage = [
+        replace(
+            rollout,
+            actions=np.where(rollout.valid, rollout.actions, 3 - rollout.actions),
+            rewards=np.where(rollout.valid, rollout.rewards, np.float32(1e4)),
+            behaviour_log_probs=np.where(rollout.valid, rollout.behaviour_log_probs, np.float32(-20.0)),
+        )
+        for rollout in clean
+    ]
     results = []
-    for each in (batch, garbage):
-        learner = make_learner(algorithm=algorithm, normalize_advantages=normalize)
+    for each in (clean, garbage):
+        learner = make_learner(policy, algorithm=algorithm, normalize_advantages=normalize)
         learner.step(each, 0.0)
         results.append((weights(learner), learner.take_metrics()))
     assert_same(results[0][0], results[1][0])
@@ -223,9 +382,9 @@ def test_metrics_are_means_since_they_were_last_taken() -> None:
     apart, together = make_learner(), make_learner()
     taken = []
     for step in range(3):
-        apart.step(make_batch(step), 0.0)
+        apart.step(make_rollouts(step), 0.0)
         taken.append(apart.take_metrics())
-        together.step(make_batch(step), 0.0)
+        together.step(make_rollouts(step), 0.0)
     means = {name: float(np.mean([row[name] for row in taken])) for name in METRICS}
     assert together.take_metrics() == pytest.approx(means, rel=1e-5)
     assert together.take_metrics() == {}
@@ -236,14 +395,14 @@ def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
     rewards = torch.linspace(4.0, 6.0, 18).reshape(6, 3).numpy()
     nothing, everything = np.zeros((6, 3), np.bool_), np.ones((6, 3), np.bool_)
     rollout = make_rollout(
-        observations=np.zeros((7, 3, 3), np.float32),
+        frames=np.zeros((7, 3, 3), np.float32),
         rewards=rewards,
         terminated=nothing,
         truncated=nothing,
         valid=everything,
     )
     learner = make_learner(algorithm="a2c", discount_factor=0.0)
-    learner.step(join_rollouts([rollout]), 0.0)
+    learner.step([rollout], 0.0)
     assert learner.take_metrics()["advantage_std"] == pytest.approx(rewards.std(), rel=1e-4)
 
 
@@ -270,27 +429,36 @@ def restored(learner: Learner, directory: Path) -> Learner:
     return learner
 
 
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
+@pytest.mark.parametrize("algorithm", ["impala", "appo"])
 @pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
-def test_a_restored_learner_goes_on_to_the_bit(optimizer: str, tmp_path: Path) -> None:
-    through = make_learner(optimizer=optimizer)
-    for step in range(10):
-        through.step(make_batch(step), step / 10)
+def test_a_restored_learner_goes_on_to_the_bit(
+    optimizer: str, algorithm: str, policy: PolicySpec, tmp_path: Path
+) -> None:
+    settings = {"optimizer": optimizer, "algorithm": algorithm}
+    updates = learner_spec(**settings).updates_per_batch
 
-    first = make_learner(optimizer=optimizer)
-    for step in range(5):
-        first.step(make_batch(step), step / 10)
+    def learn(learner: Learner, steps: range) -> None:
+        for step in steps:
+            learner.step(make_rollouts(step, state_size=learner.state_size), step / 10)
+
+    through = make_learner(policy, **settings)
+    learn(through, range(10))
+    state = {name: value.clone() for name, value in through.state().items()}
+
+    first = make_learner(policy, **settings)
+    learn(first, range(5))
     checkpoint = saved(first, tmp_path)
-    first.step(make_batch(99), 0.0)  # what was saved is no view of what goes on
-    second = restored(make_learner(optimizer=optimizer, seed=99), checkpoint)
-    assert second.policy_version == 5
-    for step in range(5, 10):
-        second.step(make_batch(step), step / 10)
+    learn(first, range(99, 100))  # what was saved is no view of what goes on
+    second = restored(make_learner(policy, **settings, seed=99), checkpoint)
+    assert second.policy_version == 5 * updates
+    learn(second, range(5, 10))
 
-    assert second.policy_version == 10
+    assert second.policy_version == 10 * updates
     assert_same(weights(through), weights(second))
-    for name, value in through.state().items():
-        if name.startswith("optimizer/"):
-            assert torch.equal(value, second.state()[name])
+    assert second.state().keys() == state.keys()
+    for name, value in second.state().items():  # how the next batch would be shuffled among them
+        assert torch.equal(value, state[name])
 
 
 def test_the_random_state_is_restored(tmp_path: Path) -> None:
@@ -303,7 +471,7 @@ def test_the_random_state_is_restored(tmp_path: Path) -> None:
 
 def test_parameters_of_another_network_are_refused(tmp_path: Path) -> None:
     checkpoint = saved(make_learner(), tmp_path)
-    for other in (PolicySpec(hidden=(9,)), PolicySpec(hidden=(8, 8))):
+    for other in (PolicySpec(hidden=(9,)), PolicySpec(hidden=(8, 8)), RECURRENT):
         with pytest.raises(ValueError, match="another network"):
             restored(make_learner(other), checkpoint)
 

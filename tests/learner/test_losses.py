@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from learner.losses import explained_variance, masked_mean, normalized, policy_gradient_loss, value_loss
+from learner.losses import (
+    clipped_fraction,
+    clipped_policy_loss,
+    explained_variance,
+    masked_mean,
+    normalized,
+    policy_gradient_loss,
+    value_loss,
+)
 from policy.distributions import categorical_log_probs
 
 ROWS, COLUMNS = 5, 3
@@ -66,10 +74,62 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     assert_close(logits.grad, expected)
 
 
+@pytest.mark.parametrize("clip_range", [0.1, 0.5, 2.0])
+def test_clipped_policy_loss_is_the_papers(random: torch.Generator, valid: Tensor, clip_range: float) -> None:
+    log_ratios, advantages = normal(random) / 2.0, normal(random)
+
+    def gain(cell: tuple[int, int]) -> float:
+        ratio, advantage = math.exp(log_ratios[cell].item()), advantages[cell].item()
+        clipped = min(max(ratio, 1.0 - clip_range), 1.0 + clip_range)
+        return min(ratio * advantage, clipped * advantage)
+
+    expected = -mean_of({cell: gain(cell) for cell in CELLS}, valid)
+    loss = clipped_policy_loss(log_ratios, advantages, valid, clip_range)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_clipped_policy_loss_by_hand() -> None:
+    # Ratios 1.5, 1.5, 0.5, 0.5, 1.1, 1 with a range of 0.2; the last row is not valid.
+    log_ratios = torch.tensor([[1.5, 1.5, 0.5, 0.5, 1.1, 1.0]]).log().requires_grad_()
+    advantages = torch.tensor([[2.0, -2.0, 2.0, -2.0, 3.0, 100.0]])
+    valid = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
+    loss = clipped_policy_loss(log_ratios, advantages, valid, 0.2)
+    # min(3, 2.4) + min(-3, -2.4) + min(1, 1.6) + min(-1, -1.6) + min(3.3, 3.3), over five rows
+    assert loss.item() == pytest.approx(-(2.4 - 3.0 + 1.0 - 1.6 + 3.3) / 5.0)
+    loss.backward()
+    # Where the ratio went too far already, nothing pulls it on; where it went the wrong way, it is pulled back.
+    expected = torch.tensor([[0.0, 3.0, -1.0, 0.0, -3.3, 0.0]]) / 5.0
+    assert log_ratios.grad is not None
+    assert_close(log_ratios.grad, expected)
+    assert clipped_fraction(log_ratios.detach(), valid, 0.2).item() == pytest.approx(4 / 5)
+
+
+def test_at_a_ratio_of_1_the_clipped_gradient_is_the_policy_gradient(random: torch.Generator, valid: Tensor) -> None:
+    advantages, before = normal(random), normal(random)
+    gradients = []
+    for clipped in (False, True):
+        log_probs = before.clone().requires_grad_()
+        if clipped:
+            clipped_policy_loss(log_probs - before, advantages, valid, 0.2).backward()
+        else:
+            policy_gradient_loss(log_probs, advantages, valid).backward()
+        gradients.append(log_probs.grad)
+    assert_close(gradients[0], gradients[1])
+
+
+def test_clipped_fraction_is_of_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+    log_ratios = normal(random) / 4.0
+    left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}
+    assert clipped_fraction(log_ratios, valid, 0.3).item() == pytest.approx(mean_of(left, valid))
+    assert clipped_fraction(torch.zeros(ROWS, COLUMNS), valid, 0.3).item() == 0.0
+
+
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random).requires_grad_()
     log_probs = normal(random).requires_grad_()
     policy_gradient_loss(log_probs, normal(random) - values, valid).backward()
+    assert values.grad is None
+    clipped_policy_loss(log_probs, normal(random) - values, valid, 0.2).backward()
     assert values.grad is None
     for kind in ("mse", "huber"):
         targets = normal(random).requires_grad_()
@@ -131,6 +191,7 @@ def test_what_invalid_rows_hold_changes_no_loss_and_no_gradient(random: torch.Ge
         losses = [
             policy_gradient_loss(ours, theirs, valid),
             policy_gradient_loss(ours, normalized(theirs, valid), valid),
+            clipped_policy_loss(ours * valid, theirs, valid, 0.2),
             value_loss(ours, theirs, valid, "mse"),
             value_loss(ours, theirs, valid, "huber"),
             explained_variance(ours, theirs, valid),

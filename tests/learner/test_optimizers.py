@@ -30,7 +30,7 @@ def test_adam_is_torchs_adam(epsilon: float) -> None:
     size = 40
     ours = torch.linspace(-1.0, 1.0, size)
     theirs = nn.Parameter(ours.clone())
-    adam, reference = Adam(size, epsilon), torch.optim.Adam([theirs], eps=epsilon)
+    adam, reference = Adam(torch.zeros(size), epsilon), torch.optim.Adam([theirs], eps=epsilon)
     for step, gradient in enumerate(gradients(200, size)):
         rate = 1e-2 * (1.0 - step / 200)
         adam.step(ours, gradient, rate)
@@ -44,7 +44,7 @@ def test_rmsprop_has_its_epsilon_inside_the_root() -> None:
     size, epsilon, decay, rate = 6, 1e-1, 0.9, 0.01
     ours = torch.linspace(-1.0, 1.0, size)
     theta, g = ours.tolist(), [0.0] * size
-    rmsprop = RmsProp(size, epsilon, decay)
+    rmsprop = RmsProp(torch.zeros(size), epsilon, decay)
     for gradient in gradients(50, size):
         rmsprop.step(ours, gradient, rate)
         for i, d in enumerate(gradient.tolist()):

@@ -23,7 +23,7 @@ def trained_counters(*returns: float) -> RunCounters:
     }
     rollout = make_rollout(version=3, valid=EVERYTHING, **episodes)
     counters.accepted(rollout, 180)
-    counters.trained([rollout], 5)
+    counters.trained([rollout], 5, 1)
     return counters
 
 
@@ -31,7 +31,7 @@ def test_rates_are_since_the_last_look() -> None:
     counters = trained_counters()
     meter = RateMeter(counters, 10.0)
     assert meter.rates == {}
-    counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4)
+    counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4, 1)
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
     assert meter.look(counters, 12.0) == expected
     assert meter.rates == expected
@@ -62,6 +62,7 @@ def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
     fleet.set_present("b", False)
     rates = RateMeter(counters, 0.0).look(counters, 1.0)
     learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
+    learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
     assert set(row) == set(COLUMNS)
     assert (row["wall_seconds"], row["env_steps"], row["updates"]) == (9.5, 18, 1)

@@ -8,6 +8,8 @@ from wire_format import DTYPES, bits
 
 from protocol.messages import (
     Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
     Farewell,
     Join,
     Program,
@@ -24,6 +26,7 @@ from protocol.spec import (
     ChoiceSpace,
     CollectionSpec,
     EnvironmentSpec,
+    EvaluationSpec,
     PolicySpec,
     RunSpec,
     RunStatus,
@@ -40,7 +43,10 @@ generators = st.integers(0, 2**32).map(np.random.default_rng)
 spaces = st.builds(
     Spaces,
     observation=st.builds(
-        ArraySpace, shape=st.lists(positive, max_size=4).map(tuple), dtype=st.sampled_from(["float32", "uint8"])
+        ArraySpace,
+        shape=st.lists(positive, min_size=1, max_size=4).map(tuple),
+        dtype=st.sampled_from(["float32", "uint8"]),
+        frames=st.integers(1, 16),
     ),
     action=st.builds(ChoiceSpace, count=st.integers(1, 65_536)),
 )
@@ -56,22 +62,31 @@ run_specs = st.builds(
         id=st.text(min_size=1, max_size=20),
         kwargs=st.dictionaries(text, json_values, max_size=3),
         max_episode_steps=st.none() | positive,
+        action_table=st.none() | st.lists(st.tuples(floats, floats), min_size=2, max_size=3).map(tuple),
+        crop=st.none() | st.tuples(*[st.integers(0, 99)] * 4),
+        grey=st.booleans(),
+        resize=st.none() | st.tuples(positive, positive),
+        frame_stack=st.integers(1, 16),
+        reward_clip=st.none() | st.floats(0.1, 10),
         reward_scale=st.floats(1e-6, 1e6),
     ),
     policy=st.builds(
         PolicySpec,
-        hidden=st.lists(positive, min_size=1, max_size=8).map(tuple),
+        encoder=st.sampled_from(["mlp", "nature", "impala", "article", "my.module:Encoder"]),
+        hidden=st.lists(positive, max_size=8).map(tuple),
+        memory=st.sampled_from(["none", "gru"]),
         activation=st.sampled_from(["tanh", "relu"]),
     ),
     collection=st.builds(CollectionSpec, actors=positive, window=st.integers(1, 64)),
     training=st.builds(
         TrainingSpec,
-        algorithm=st.sampled_from(["a2c", "a3c", "impala"]),
+        algorithm=st.sampled_from(["a2c", "a3c", "impala", "appo"]),
         seed=st.integers(0, 2**32 - 1),
         target_return=st.none() | floats,
         discount_factor=st.floats(0, 1),
         learning_rate_final=st.none() | st.floats(0, 1),
     ),
+    evaluation=st.builds(EvaluationSpec, seconds=st.none() | st.floats(0.1, 1e4)),
     service=st.builds(ServiceSpec, log_seconds=st.floats(0.01, 100)),
 )
 actor_statuses = st.builds(
@@ -96,14 +111,20 @@ def rollouts(draw: st.DrawFn) -> Rollout:
     random = draw(generators)
     rows, environments = draw(st.integers(1, 5)), draw(st.integers(1, 4))
     episodes = draw(st.integers(0, rows * environments))
-    observation = (rows + 1, environments, *draw(st.lists(st.integers(1, 5), min_size=1, max_size=3)))
+    dtype = draw(st.sampled_from(["<f4", "|u1"]))
+    length, frame = draw(st.integers(rows + 1, rows + 4)), draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
+    if draw(st.booleans()):  # environment by environment in memory, and so on the wire
+        frames = bits(random, dtype, (environments, length, *frame)).swapaxes(0, 1)
+    else:
+        frames = bits(random, dtype, (length, environments, *frame))
     shape = (rows, environments)
     return Rollout(
         identity=draw(
             st.builds(RolloutIdentity, actor=text, incarnation=counters, sequence=counters, learner_epoch=counters)
         ),
         policy_version=draw(counters),
-        observations=bits(random, draw(st.sampled_from(["<f4", "|u1"])), observation),
+        frames=frames,
+        initial_state=bits(random, "<f4", (environments, draw(st.integers(0, 3)))),
         actions=bits(random, draw(st.sampled_from(["|u1", "<u2", "<i4", "<i8"])), shape),
         behaviour_log_probs=bits(random, "<f4", shape),
         rewards=bits(random, "<f4", shape),
@@ -112,6 +133,18 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+    )
+
+
+@st.composite
+def evaluation_reports(draw: st.DrawFn) -> EvaluationReport:
+    random, episodes = draw(generators), (draw(st.integers(1, 5)),)
+    return EvaluationReport(
+        evaluator=draw(text),
+        learner_epoch=draw(counters),
+        policy_version=draw(counters),
+        returns=bits(random, "<f4", episodes),
+        lengths=bits(random, "<i4", episodes),
     )
 
 
@@ -134,6 +167,8 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     Rollout: rollouts(),
     Acknowledgement: st.builds(Acknowledgement, reason=text, policy_version=counters),
     Snapshot: snapshots(),
+    EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
+    EvaluationReport: evaluation_reports(),
     Farewell: st.builds(Farewell, learner_epoch=counters, reason=text),
     StatusReport: st.builds(StatusReport, status=statuses),
 }

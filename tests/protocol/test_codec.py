@@ -11,12 +11,25 @@ import pytest
 import zstandard
 from hypothesis import given
 from message_strategies import KINDS, messages, rollouts, snapshots
-from wire_format import IDENTITY, LIMITS, SAMPLES, SNAPSHOT, arrays_of, repeatable, the_same, unwire
+from wire_format import (
+    IDENTITY,
+    LIMITS,
+    PIXELS,
+    SAMPLES,
+    SNAPSHOT,
+    arrays_of,
+    repeatable,
+    some_rollout,
+    the_same,
+    unwire,
+    wire,
+)
 
 from protocol.codec import decode, encode
 from protocol.messages import (
     Message,
     Program,
+    Rollout,
     Snapshot,
 )
 
@@ -61,6 +74,53 @@ def test_arrays_travel_whatever_their_memory_looks_like() -> None:
         np.testing.assert_array_equal(came.weights[name], array)
 
 
+def test_an_array_whose_second_axis_comes_first_in_memory_is_sent_and_comes_so() -> None:
+    data = encode(some_rollout(PIXELS))
+    flags, content, body = unwire(data)
+    assert content["arrays"][0] == ["frames", "|u1", [9, 4, 2, 3], True]
+    assert [swapped for _, _, _, swapped in content["arrays"][1:]] == [False] * 9
+    plain = zstandard.ZstdDecompressor().decompress(body) if flags else body
+    assert plain.startswith(PIXELS.swapaxes(0, 1).tobytes())
+    came = decode(data, LIMITS)
+    assert isinstance(came, Rollout)
+    np.testing.assert_array_equal(came.frames, PIXELS)
+    assert came.frames.swapaxes(0, 1).flags.c_contiguous  # without a copy that would turn it round
+    assert encode(came) == data
+
+
+def test_the_same_array_comes_back_the_same_in_either_order() -> None:
+    came = [decode(encode(some_rollout(frames)), LIMITS) for frames in (PIXELS, PIXELS.copy(order="C"))]
+    assert the_same(came[0], came[1])
+    assert [unwire(encode(each))[1]["arrays"][0][3] for each in came] == [True, False]
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (1, 3), (3, 1), (2, 0), (0, 2), (2, 3, 4), (2, 3, 4, 5)])
+def test_every_shape_of_two_dimensions_and_more_travels_swapped(shape: tuple[int, ...]) -> None:
+    values = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
+    turned = np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
+    came = decode(encode(dataclasses.replace(SNAPSHOT, weights={"w": turned})), LIMITS)
+    assert isinstance(came, Snapshot)
+    np.testing.assert_array_equal(came.weights["w"], values)
+
+
+def test_who_lies_about_the_order_gets_another_array_of_the_shape_that_was_named() -> None:
+    _, content, body = unwire(encode(SNAPSHOT))
+    assert content["arrays"][0] == ["weights/w", "<f4", [2, 2], False]
+    for shape, values in (([2, 2], [[1.0, 3.0], [2.0, 4.0]]), ([1, 4], [[1.0, 2.0, 3.0, 4.0]])):
+        content["arrays"][0][2:] = [shape, True]
+        came = decode(wire(content, body), LIMITS)
+        assert isinstance(came, Snapshot)
+        np.testing.assert_array_equal(came.weights["w"], values)
+
+
+def test_a_picture_that_stays_travels_once_for_all_its_frames() -> None:
+    """Environment by environment zstd has just seen a frame's predecessor; time by time it has forgotten it."""
+    noise = np.random.default_rng(1).integers(0, 256, (4, 1, 400, 400), np.uint8)
+    frames = np.repeat(noise, 9, axis=1).swapaxes(0, 1)
+    assert len(encode(some_rollout(frames))) < 1.01 * noise.size
+    assert len(encode(some_rollout(frames.copy(order="C")))) > 2 * noise.size
+
+
 @pytest.mark.parametrize("dtype", ["float64", "float16", "int8", "int16", "uint32", "uint64", "complex64", "O", "U3"])
 def test_a_dtype_that_does_not_travel_is_our_own_fault(dtype: str) -> None:
     with pytest.raises(ValueError, match=r"weights/w.*does not travel"):
@@ -93,31 +153,31 @@ def test_threads_may_encode_and_decode_at_once() -> None:
 # --------------------------------------------------------------------------------- the layout, golden
 
 
-def test_the_bytes_of_version_1_are_as_documented() -> None:
+def test_the_bytes_of_version_2_are_as_documented() -> None:
     header = msgpack.packb(
         {
             "kind": "Snapshot",
             "fields": {"learner_epoch": 1, "policy_version": 2, "program": "abc"},
-            "arrays": [["weights/w", "<f4", [2, 2]], ["weights/b", "|u1", [3]]],
+            "arrays": [["weights/w", "<f4", [2, 2], False], ["weights/b", "|u1", [3], False]],
             "size": 24,
         }
     )
     assert header is not None
     padding = bytes(-(12 + len(header)) % 8)
     body = struct.pack("<4f", 1, 2, 3, 4) + bytes([1, 2, 3]) + bytes(5)
-    expected = b"DAED" + struct.pack("<H", 1) + struct.pack("<H", 0) + struct.pack("<I", len(header))
+    expected = b"DAED" + struct.pack("<H", 2) + struct.pack("<H", 0) + struct.pack("<I", len(header))
     assert encode(SNAPSHOT) == expected + header + padding + body
 
 
 def test_the_prefix_can_be_read_with_struct_alone() -> None:
     data = SAMPLES["rollout"]
     magic, version, flags, length = struct.unpack_from("<4sHHI", data)
-    assert (magic, version, flags) == (b"DAED", 1, 1)
+    assert (magic, version, flags) == (b"DAED", 2, 1)
     content = msgpack.unpackb(data[12 : 12 + length])
     assert list(content) == ["kind", "fields", "arrays", "size"]
     assert content["kind"] == "Rollout"
     assert content["fields"] == {"identity": dataclasses.asdict(IDENTITY), "policy_version": 5}
-    assert content["arrays"][0] == ["observations", "<f4", [9, 4, 3]]
+    assert content["arrays"][0] == ["frames", "<f4", [9, 4, 3], False]
     start = (12 + length + 7) // 8 * 8
     assert zstandard.ZstdDecompressor().decompress(data[start:]) == bytes(content["size"])
 

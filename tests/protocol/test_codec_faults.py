@@ -48,8 +48,15 @@ SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
     "array nobody knows": (lambda c: c["arrays"][0].__setitem__(0, "gradients/w"), "has no array 'gradients/w'"),
     "array twice": (lambda c: c["arrays"][1].__setitem__(0, "weights/w"), "distinct"),
     "array name a number": (lambda c: c["arrays"][0].__setitem__(0, 1), "distinct strings"),
-    "array without a shape": (lambda c: c["arrays"][0].pop(), "a name, a dtype and a shape"),
-    "array a map": (lambda c: c["arrays"].__setitem__(0, {}), "a name, a dtype and a shape"),
+    "array without a shape": (lambda c: c["arrays"][0].pop(2), "a name, a dtype, a shape and whether"),
+    "array a map": (lambda c: c["arrays"].__setitem__(0, {}), "a name, a dtype, a shape and whether"),
+    "array of version 1": (lambda c: c["arrays"][0].pop(), "a name, a dtype, a shape and whether it is swapped"),
+    "array with more": (lambda c: c["arrays"][0].append(False), "a name, a dtype, a shape and whether"),
+    "swapped a number": (lambda c: c["arrays"][0].__setitem__(3, 1), "'weights/w' cannot be swapped like that"),
+    "swapped text": (lambda c: c["arrays"][0].__setitem__(3, "true"), "cannot be swapped like that"),
+    "swapped nil": (lambda c: c["arrays"][0].__setitem__(3, None), "cannot be swapped like that"),
+    "swapped without a second axis": (lambda c: c["arrays"][1].__setitem__(3, True), "'weights/b' cannot be swapped"),
+    "swapped scalar": (lambda c: c["arrays"].__setitem__(1, ["b", "<f4", [], True]), "'b' cannot be swapped"),
     "dtype float64": (lambda c: c["arrays"][0].__setitem__(1, "<f8"), "does not travel"),
     "dtype object": (lambda c: c["arrays"][0].__setitem__(1, "|O"), "does not travel"),
     "dtype big-endian": (lambda c: c["arrays"][0].__setitem__(1, ">f4"), "does not travel"),
@@ -82,8 +89,9 @@ def test_a_header_with_one_fault_is_refused_by_that_fault(fault: str) -> None:
 @pytest.mark.parametrize("sides", [[0] + [1 << 26] * 3, [1 << 26] * 3 + [0], [1 << 26] * 7 + [0]])
 def test_an_empty_array_with_huge_sides_is_refused_or_empty(sides: list[int]) -> None:
     _, content, _ = unwire(SAMPLES["snapshot"])
-    content.update(arrays=[["weights/w", "<f4", sides]], size=0)
-    decoded_or_refused(wire(content))
+    for swapped in (False, True):
+        content.update(arrays=[["weights/w", "<f4", sides, swapped]], size=0)
+        decoded_or_refused(wire(content))
 
 
 @pytest.mark.parametrize("message", [Join(actor="a", incarnation=1), WELCOME, SNAPSHOT, some_rollout()])
@@ -114,7 +122,7 @@ def test_faults_within_a_nested_message_are_named_by_their_path() -> None:
 
 def test_every_array_of_a_rollout_is_needed() -> None:
     rollout = some_rollout()
-    for name in ("observations", "actions", "valid", "episode_lengths"):
+    for name in ("frames", "initial_state", "actions", "valid", "episode_lengths"):
         flags, content, body = unwire(encode(rollout))
         for entry in content["arrays"]:
             entry[0] = f"not_{name}" if entry[0] == name else entry[0]
@@ -124,7 +132,7 @@ def test_every_array_of_a_rollout_is_needed() -> None:
 
 def test_an_array_beyond_the_expected_is_refused() -> None:
     _, content, _ = unwire(encode(Farewell(learner_epoch=1, reason="")))
-    content.update(arrays=[["extra", "|u1", [8]]], size=8)
+    content.update(arrays=[["extra", "|u1", [8], False]], size=8)
     with pytest.raises(ProtocolError, match="Farewell has no array 'extra'"):
         decode(wire(content, bytes(8)), LIMITS)
 
@@ -138,8 +146,9 @@ def test_a_body_with_room_that_no_array_takes_is_refused() -> None:
 
 def test_shapes_that_do_not_fit_together_are_refused_by_the_messages_own_check() -> None:
     flags, content, body = unwire(SAMPLES["rollout"])
-    content["arrays"][1][2] = [4, 8]
-    with pytest.raises(ProtocolError, match="Rollout: observations must be"):
+    assert content["arrays"][2][0] == "actions"
+    content["arrays"][2][2] = [4, 8]
+    with pytest.raises(ProtocolError, match="Rollout: frames must be"):
         decode(wire(content, body, flags=flags), LIMITS)
 
 
@@ -162,7 +171,7 @@ def test_a_specification_that_does_not_hold_is_refused(spec: Any) -> None:
 @pytest.mark.parametrize("value", [2, 255])
 def test_a_truth_value_is_0_or_1(value: int) -> None:
     _, content, _ = unwire(SAMPLES["snapshot"])
-    content.update(arrays=[["weights/w", "|b1", [8]]], size=8)
+    content.update(arrays=[["weights/w", "|b1", [8], False]], size=8)
     decode(wire(content, bytes([0, 1] * 4)), LIMITS)
     with pytest.raises(ProtocolError, match="'weights/w' has a truth value that is neither 0 nor 1"):
         decode(wire(content, bytes([0, 1, 0, 1, 0, 1, 0, value])), LIMITS)
@@ -182,7 +191,7 @@ def test_unknown_flags_and_magic_are_refused() -> None:
         decode(b"HTTP" + SAMPLES["snapshot"][4:], LIMITS)
 
 
-@pytest.mark.parametrize("version", [0, 2, 65_535])
+@pytest.mark.parametrize("version", [0, 1, 3, 65_535])
 def test_another_version_is_named_beside_our_own(version: int) -> None:
     for data in (wire({}, version=version), wire_header(b"\xc1 of the future", version=version)):
         with pytest.raises(VersionMismatchError, match=rf"version {version}, this one {PROTOCOL_VERSION}:") as refused:

@@ -51,7 +51,7 @@ SMALL = Limits(max_bytes=1 << 20, max_header_bytes=4096, max_arrays=4)
 
 def bomb(frame: bytes, size: int) -> bytes:
     _, content, _ = unwire(SAMPLES["snapshot"])
-    content.update(arrays=[["weights/w", "|u1", [size]]], size=size)
+    content.update(arrays=[["weights/w", "|u1", [size], False]], size=size)
     return wire(content, frame, flags=1)
 
 

@@ -29,6 +29,7 @@ def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) 
         keys.join(run),
         keys.program(run, actor),
         keys.rollouts(run, actor),
+        keys.evaluations(run, actor),
         keys.snapshots(run),
         keys.presence(run, actor),
         keys.learner(run),
@@ -43,3 +44,4 @@ def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) 
 def test_the_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
     assert keys.last_chunk(keys.presence(run, actor)) == actor
     assert keys.last_chunk(keys.rollouts(run, actor)) == actor
+    assert keys.last_chunk(keys.evaluations(run, actor)) == actor

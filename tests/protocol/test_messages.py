@@ -3,14 +3,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.messages import Rollout, RolloutIdentity
+from protocol.messages import EvaluationReport, Rollout, RolloutIdentity
 
 T, E, K = 3, 2, 1
 
 
 def rollout(**changed: np.ndarray) -> Rollout:
     arrays: dict[str, Any] = {
-        "observations": np.zeros((T + 1, E, 4), np.float32),
+        "frames": np.zeros((T + 1, E, 4), np.float32),
+        "initial_state": np.zeros((E, 5), np.float32),
         "actions": np.zeros((T, E), np.int64),
         "behaviour_log_probs": np.zeros((T, E), np.float32),
         "rewards": np.zeros((T, E), np.float32),
@@ -48,7 +49,7 @@ def test_an_array_of_rows_with_another_shape_than_actions_is_named(name: str, sh
         rollout(**{name: np.zeros(shape, dtype)})
 
 
-@pytest.mark.parametrize("name", [*ROW_ARRAYS, "episode_returns"])
+@pytest.mark.parametrize("name", [*ROW_ARRAYS, "initial_state", "episode_returns"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float64])
 def test_an_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
     right = getattr(rollout(), name)
@@ -56,10 +57,25 @@ def test_an_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
         rollout(**{name: right.astype(dtype)})
 
 
-@pytest.mark.parametrize("shape", [(T, E, 4), (T + 2, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), ()])
-def test_observations_need_a_row_more_than_actions(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"^observations must be"):
-        rollout(observations=np.zeros(shape, np.float32))
+@pytest.mark.parametrize("shape", [(T, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), (0, E, 4), ()])
+def test_frames_need_a_row_more_than_actions_at_least(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^frames must be \[4 or more, 2, ...\]"):
+        rollout(frames=np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("shape", [(T + 1, E, 4), (T + 4, E, 4), (T + 4, E, 8, 8, 3)])
+def test_a_stack_brings_frames_of_before_the_first_row(shape: tuple[int, ...]) -> None:
+    assert rollout(frames=np.zeros(shape, np.uint8)).rows == T
+
+
+@pytest.mark.parametrize("shape", [(E + 1, 5), (E,), (T, E, 5), ()])
+def test_a_memory_of_other_environments_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^initial_state must be \[2, S\]"):
+        rollout(initial_state=np.zeros(shape, np.float32))
+
+
+def test_a_policy_may_remember_nothing() -> None:
+    rollout(initial_state=np.zeros((E, 0), np.float32))
 
 
 @pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
@@ -92,3 +108,20 @@ def test_more_episodes_than_rows_are_refused() -> None:
     many = T * E + 1
     with pytest.raises(ValueError, match="more episodes ended"):
         rollout(episode_returns=np.zeros(many, np.float32), episode_lengths=np.ones(many, np.int32))
+
+
+def report(returns: np.ndarray, lengths: np.ndarray) -> EvaluationReport:
+    return EvaluationReport(evaluator="e", learner_epoch=1, policy_version=2, returns=returns, lengths=lengths)
+
+
+def test_a_report_has_a_length_for_each_return() -> None:
+    report(np.zeros(3, np.float32), np.ones(3, np.int32))
+    for returns, lengths in ((3, 2), (0, 0), ((3, 1), (3, 1)), ((), ())):
+        with pytest.raises(ValueError, match=r"^returns and lengths must be \[K\] alike, with K at least 1"):
+            report(np.zeros(returns, np.float32), np.ones(lengths, np.int32))
+
+
+@pytest.mark.parametrize(("returns", "lengths"), [("f8", "i4"), ("i4", "i4"), ("f4", "f4"), ("f4", "i8")])
+def test_a_report_of_other_dtypes_is_refused(returns: str, lengths: str) -> None:
+    with pytest.raises(ValueError, match=r"^returns must be float32 and lengths int32"):
+        report(np.zeros(3, returns), np.ones(3, lengths))

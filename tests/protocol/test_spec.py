@@ -10,6 +10,7 @@ from protocol.spec import (
     ChoiceSpace,
     CollectionSpec,
     EnvironmentSpec,
+    EvaluationSpec,
     PolicySpec,
     RunSpec,
     RunStatus,
@@ -41,6 +42,7 @@ def test_an_environment_alone_makes_a_run() -> None:
         (PolicySpec, {}),
         (CollectionSpec, {}),
         (TrainingSpec, {}),
+        (EvaluationSpec, {}),
         (ServiceSpec, {}),
         (Spaces, SPACES),
         (ArraySpace, SPACES["observation"]),
@@ -55,7 +57,7 @@ def test_a_field_that_is_not_known_is_refused_by_its_name(
         specification.model_validate({**fields, "entropy_bonsu": 1})
 
 
-@pytest.mark.parametrize("section", ["environment", "policy", "collection", "training", "service"])
+@pytest.mark.parametrize("section", ["environment", "policy", "collection", "training", "evaluation", "service"])
 def test_unknown_fields_are_refused_within_sections(section: str) -> None:
     content = {"environment": dict(ENVIRONMENT), section: {**(ENVIRONMENT if section == "environment" else {})}}
     content[section]["typo"] = "1"
@@ -73,17 +75,37 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (ArraySpace, "shape", [0]),
     (ArraySpace, "shape", [-1]),
     (ArraySpace, "shape", [1.5]),
+    (ArraySpace, "shape", []),
+    (ArraySpace, "shape", [2] * 5),
     (ArraySpace, "dtype", "float64"),
+    (ArraySpace, "frames", 0),
+    (ArraySpace, "frames", 17),
     (ChoiceSpace, "count", 0),
     (ChoiceSpace, "count", 65_537),
     (EnvironmentSpec, "id", ""),
     (EnvironmentSpec, "id", "x" * 201),
     (EnvironmentSpec, "max_episode_steps", 0),
+    (EnvironmentSpec, "backend", "dm_control"),
+    (EnvironmentSpec, "action_table", [[0.0]]),
+    (EnvironmentSpec, "action_table", [[0.0], [math.inf]]),
+    (EnvironmentSpec, "action_repeat", 0),
+    (EnvironmentSpec, "action_repeat", 65),
+    (EnvironmentSpec, "patience", 0),
+    (EnvironmentSpec, "crop", [0, 0, 0]),
+    (EnvironmentSpec, "crop", [0, 0, 0, -1]),
+    (EnvironmentSpec, "resize", [0, 84]),
+    (EnvironmentSpec, "resize", [84]),
+    (EnvironmentSpec, "frame_stack", 0),
+    (EnvironmentSpec, "frame_stack", 17),
+    (EnvironmentSpec, "reward_clip", 0.0),
     (EnvironmentSpec, "reward_scale", 0.0),
     (EnvironmentSpec, "reward_scale", math.nan),
     (EnvironmentSpec, "kwargs", {"a": b"bytes"}),
     (PolicySpec, "encoder", "cnn"),
-    (PolicySpec, "hidden", []),
+    (PolicySpec, "encoder", "module:"),
+    (PolicySpec, "memory", "lstm"),
+    (PolicySpec, "memory_units", 0),
+    (PolicySpec, "memory_units", 4097),
     (PolicySpec, "hidden", [8] * 9),
     (PolicySpec, "hidden", [0]),
     (PolicySpec, "activation", "gelu"),
@@ -107,6 +129,13 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (TrainingSpec, "trace_lambda", 1.01),
     (TrainingSpec, "rho_clip", 0.0),
     (TrainingSpec, "trace_clip", 0.0),
+    (TrainingSpec, "passes", 0),
+    (TrainingSpec, "passes", 65),
+    (TrainingSpec, "minibatches", 0),
+    (TrainingSpec, "minibatches", 4097),
+    (TrainingSpec, "clip_range", 0.0),
+    (TrainingSpec, "device", "tpu"),
+    (TrainingSpec, "precision", "float16"),
     (TrainingSpec, "value_loss", "mae"),
     (TrainingSpec, "value_coefficient", -0.1),
     (TrainingSpec, "entropy_bonus", -0.1),
@@ -120,6 +149,10 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (TrainingSpec, "rmsprop_decay", 1.1),
     (TrainingSpec, "max_gradient_norm", 0.0),
     (TrainingSpec, "threads", 0),
+    (EvaluationSpec, "seconds", 0.0),
+    (EvaluationSpec, "episodes", 0),
+    (EvaluationSpec, "final_episodes", 0),
+    (EvaluationSpec, "final_backend", "mujoco"),
     (ServiceSpec, "checkpoint_seconds", 0.0),
     (ServiceSpec, "keep_checkpoints", 0),
     (ServiceSpec, "log_seconds", 0.0),
@@ -154,3 +187,33 @@ def test_a_specification_survives_its_own_json() -> None:
 
 def test_spaces_say_what_they_are() -> None:
     assert str(Spaces.model_validate(SPACES)) == "observation: float32 array of shape (4,); action: 2 choices"
+
+
+def test_a_stack_adds_an_axis_of_its_own_and_one_frame_none() -> None:
+    one = ArraySpace(shape=(84, 96, 3), dtype="uint8")
+    four = ArraySpace(shape=(84, 96, 3), dtype="uint8", frames=4)
+    assert one.stacked_shape == (84, 96, 3)
+    assert four.stacked_shape == (4, 84, 96, 3)
+    assert str(one) == "uint8 array of shape (84, 96, 3)"
+    assert str(four) == "uint8 array of shape (84, 96, 3), 4 stacked"
+
+
+def test_a_stack_longer_than_a_rollout_is_refused_and_the_way_out_named() -> None:
+    run(environment={**ENVIRONMENT, "frame_stack": 4}, collection={"rollout_length": 4})
+    with pytest.raises(ValidationError, match=r"frame_stack is 4.*rollout_length is 3, make it at least 4"):
+        run(environment={**ENVIRONMENT, "frame_stack": 4}, collection={"rollout_length": 3})
+
+
+@pytest.mark.parametrize(
+    ("fields", "updates", "bound"),
+    [
+        ({"algorithm": "impala", "passes": 5}, 1, 32),
+        ({"algorithm": "appo", "passes": 3, "minibatches": 4}, 12, 384),
+        ({"algorithm": "appo", "passes": 1, "minibatches": 1}, 1, 32),
+        ({"algorithm": "appo", "passes": 3, "minibatches": 4, "max_policy_lag": 7}, 12, 7),
+        ({"algorithm": "a3c", "max_policy_lag": 0}, 1, 0),
+    ],
+)
+def test_the_lag_bound_counts_batches_unless_it_is_given(fields: dict[str, Any], updates: int, bound: int) -> None:
+    spec = TrainingSpec.model_validate(fields)
+    assert (spec.updates_per_batch, spec.policy_lag_bound) == (updates, bound)

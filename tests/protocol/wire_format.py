@@ -118,12 +118,14 @@ STATUS = wire(  # every field of a status, as another implementation could write
 )
 
 
-def some_rollout() -> Rollout:
+def some_rollout(frames: np.ndarray | None = None) -> Rollout:
+    """Eight rows of four environments, whose policy remembers two numbers."""
     rows = np.zeros((8, 4))
     return Rollout(
         identity=IDENTITY,
         policy_version=5,
-        observations=np.zeros((9, 4, 3), np.float32),
+        frames=np.zeros((9, 4, 3), np.float32) if frames is None else frames,
+        initial_state=np.zeros((4, 2), np.float32),
         actions=rows.astype(np.int64),
         behaviour_log_probs=rows.astype(np.float32),
         rewards=rows.astype(np.float32),
@@ -135,4 +137,6 @@ def some_rollout() -> Rollout:
     )
 
 
+PIXELS = np.arange(4 * 9 * 6, dtype=np.uint8).reshape(4, 9, 2, 3).swapaxes(0, 1)  # environment by environment
 SAMPLES = {"join": encode(JOIN), "snapshot": encode(SNAPSHOT), "rollout": encode(some_rollout()), "status": STATUS}
+SAMPLES["pixels"] = encode(some_rollout(PIXELS))

@@ -1,0 +1,81 @@
+"""`python -m benchmarks.ship_pretrained RUN_DIR NAME`: makes a run's best policy one that ships with the package.
+
+Writes policy/pretrained/NAME: the policy without the learner's state, and how it came about (config.toml, the
+learning curve, a README with the command). Commit it, and `daedalus evaluate --pretrained NAME` plays it.
+"""
+
+import argparse
+import math
+import shutil
+import sys
+from pathlib import Path
+
+from learner.run_directory import CONFIG, METRICS, SUMMARY, read_json
+from learner.settings import SettingsError
+from policy.saved_policy import PRETRAINED, export_policy, find_policy
+from policy.sealed import DamagedError
+
+_MOST_ROWS = 1000  # of the learning curve
+
+_README = """\
+# {name}
+
+{environment}, {algorithm}, policy version {version} of a run of {env_steps:,} env_steps.
+{score}
+
+    daedalus evaluate --pretrained {name}
+    daedalus evaluate --pretrained {name} --video {name}.gif
+    daedalus train config.toml              # trains another
+"""
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(prog="python -m benchmarks.ship_pretrained", description=__doc__)
+    options.add_argument("run", type=Path, metavar="RUN_DIR")
+    options.add_argument("name", metavar="NAME")
+    arguments = options.parse_args()
+    try:
+        target = ship(arguments.run, PRETRAINED / arguments.name)
+    except (DamagedError, SettingsError, OSError) as error:
+        print(f"ship_pretrained: {error}", file=sys.stderr)
+        return 1
+    size = sum(entry.stat().st_size for entry in target.iterdir())
+    print(f"{target}: {size / 1e6:.1f} MB")
+    return 0
+
+
+def ship(run: Path, target: Path) -> Path:
+    """Writes the best policy of `run`, or its newest, as `target`, with how it came about; returns `target`."""
+    policy = find_policy(run, lambda text: print(text, file=sys.stderr))
+    summary = read_json(run / SUMMARY)
+    export_policy(policy.directory, target)
+    shutil.copyfile(run / CONFIG, target / CONFIG)
+    header, *rows = (run / METRICS).read_text("utf-8").splitlines()
+    every = max(math.ceil(len(rows) / _MOST_ROWS), 1)
+    # Counted from the end: the last row is how it ended.
+    (target / METRICS).write_text("\n".join([header, *rows[::-1][::every][::-1], ""]), "utf-8")
+    (target / "README.md").write_text(
+        _README.format(
+            name=target.name,
+            environment=policy.spec.environment.id,
+            algorithm=policy.spec.training.algorithm,
+            version=policy.policy_version,
+            env_steps=summary["env_steps"],
+            score=_score(summary.get("evaluation"), policy.policy_version),
+        ),
+        "utf-8",
+    )
+    return target
+
+
+def _score(evaluation: dict | None, policy_version: int) -> str:
+    if not evaluation or evaluation["policy_version"] != policy_version:
+        return "Not evaluated since."
+    return (
+        f"Return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} over {evaluation['episodes']} "
+        f"{evaluation['actions']} episodes on {evaluation['backend']}'s {evaluation['environment']}."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""What a policy remembers between rows: nothing, or the state of a gated recurrent unit."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+
+class Memory(Protocol):
+    """Turns the features of a row and the state before it into what the heads see, and the state after it."""
+
+    state_size: int  # S
+    features: int  # F', what the heads see
+
+    def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """One row: features [N, F], state [N, S] -> [N, F'], next state [N, S]."""
+        ...
+
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+        """R rows in their order, each remembering those before it.
+
+        Args:
+          features: [R, B, F].
+          state: [B, S] float32, before row 0.
+          starts: [R, B] bool, whether an episode starts with the row: it remembers nothing.
+
+        Returns: [R, B, F'].
+        """
+        ...
+
+
+class NoMemory(nn.Module):
+    """Remembers nothing: S is 0, and the heads see the features themselves."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.state_size = 0
+        self.features = features
+
+    def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """See Memory."""
+        return features, state
+
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+        """See Memory."""
+        return features
+
+
+class Gru(nn.Module):
+    """A gated recurrent unit (Cho et al. 2014), the equations and the order of weights as in torch.nn.GRUCell.
+
+        r = sigmoid(W_ir x + b_ir + W_hr h + b_hr)
+        z = sigmoid(W_iz x + b_iz + W_hz h + b_hz)
+        n = tanh(W_in x + b_in + r (W_hn h + b_hn))
+        h' = (1 - z) n + z h
+
+    Two linear layers, for x and for h, so that the inputs of all rows are projected at once. The state is float32
+    also under autocast: rounding must not add up over the rows.
+    """
+
+    def __init__(self, features: int, units: int) -> None:
+        super().__init__()
+        self.state_size = units
+        self.features = units
+        self.input = nn.Linear(features, 3 * units)
+        self.hidden = nn.Linear(units, 3 * units)
+        for layer in (self.input, self.hidden):
+            for gate in layer.weight.chunk(3):
+                nn.init.orthogonal_(gate)
+            nn.init.zeros_(layer.bias)
+
+    def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """See Memory."""
+        state = self._next(self.input(features), state)
+        return state, state
+
+    def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+        """See Memory."""
+        states = []
+        for inputs, start in zip(self.input(features), starts.unsqueeze(-1), strict=True):
+            state = self._next(inputs, state.masked_fill(start, 0.0))
+            states.append(state)
+        return torch.stack(states)
+
+    def _next(self, inputs: Tensor, state: Tensor) -> Tensor:
+        """Projected inputs [N, 3S], state [N, S] -> next state [N, S]."""
+        input_r, input_z, input_n = inputs.chunk(3, -1)
+        hidden_r, hidden_z, hidden_n = self.hidden(state).chunk(3, -1)
+        reset = (input_r + hidden_r).sigmoid()
+        update = (input_z + hidden_z).sigmoid()
+        candidate = (input_n + reset * hidden_n).tanh()
+        return candidate + update * (state - candidate)

@@ -1,0 +1,185 @@
+"""envpool's environments, held against a pool stepped one by one."""
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from actor.environments import UnplayableError, make_environments
+from protocol.spec import EnvironmentSpec
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", UserWarning)
+    envpool = pytest.importorskip("envpool")
+
+GAS = ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (-1.0, 0.5, 0.0), (1.0, 0.0, 0.5))
+
+
+def _spec(name: str, **fields) -> EnvironmentSpec:
+    return EnvironmentSpec(id=name, backend="envpool", **fields)
+
+
+class _OneByOne:
+    """The slow oracle: each environment of an identical pool stepped by itself, once at a time, resetting by itself."""
+
+    def __init__(self, name: str, count: int, seed: int, repeat: int, limit: int) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            self._pool = envpool.make_gymnasium(name, num_envs=count, num_threads=1, seed=seed, max_episode_steps=limit)
+            self.first = self._pool.reset()[0]
+        self._repeat = repeat
+        self._ended = [False] * count
+
+    def step(self, environment: int, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        total, frame, terminated, truncated = 0.0, None, False, False
+        for _ in range(1 if self._ended[environment] else self._repeat):
+            frames, rewards, over, cut, info = self._pool.step(action[None], np.array([environment], np.int32))
+            assert (info["elapsed_step"][0] == 0) == self._ended[environment]
+            frame, terminated, truncated = frames[0], bool(over[0]), bool(cut[0])
+            total += float(rewards[0])
+            if terminated or truncated:
+                break
+        self._ended[environment] = terminated or truncated
+        assert frame is not None
+        return frame, total, terminated, truncated
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "limit", "rows"), [("CartPole-v1", None, 18, 100), ("CarRacing-v3", GAS, 11, 12)]
+)
+@pytest.mark.parametrize("repeat", [1, 4])
+def test_repeats_are_what_single_steps_are(name: str, table: tuple | None, limit: int, rows: int, repeat: int) -> None:
+    """Frames, rewards and ends of every row, the reset rows and the ends amid a repeat among them."""
+    count = 3
+    environments = make_environments(_spec(name, action_repeat=repeat, max_episode_steps=limit, action_table=table), 3)
+    oracle = _OneByOne(name, count, seed=5, repeat=repeat, limit=limit)
+    np.testing.assert_array_equal(environments.reset(5), oracle.first)
+    actions = np.random.default_rng(1).integers(0, environments.spaces.action.count, (rows, count))
+    ends = np.zeros(2, np.int64)
+    for row in actions:
+        chosen = np.asarray(table, np.float32)[row] if table else row
+        expected = zip(*(oracle.step(e, chosen[e]) for e in range(count)), strict=True)
+        step = environments.step(row)
+        for ours, theirs in zip(step, expected, strict=True):
+            np.testing.assert_array_equal(ours, np.stack(theirs))
+        ends += step[2].sum(), step[3].sum()
+    assert ends[1] > 0
+    assert ends[0] > 0 or name == "CarRacing-v3"
+    environments.close()
+
+
+def test_an_episode_cut_by_patience_starts_anew_at_the_next_step() -> None:
+    """MountainCar rewards every step with -1 and starts at rest, between -0.6 and -0.4."""
+    environments = make_environments(_spec("MountainCar-v0", patience=3, action_repeat=2), 2)
+    environments.reset(1)
+    for row in range(1, 13):
+        frames, rewards, terminated, truncated = environments.step(np.array([2, 0]))
+        starts = row % 4 == 0
+        assert (frames[:, 1] == 0.0).all() == starts
+        assert rewards.tolist() == ([0.0, 0.0] if starts else [-2.0, -2.0])
+        assert truncated.tolist() == [row % 4 == 3] * 2
+        assert not terminated.any()
+    environments.close()
+
+
+def test_patience_is_counted_for_each_environment() -> None:
+    """The first drives over tiles, the second stands."""
+    environments = make_environments(_spec("CarRacing-v3", patience=4, action_repeat=4, action_table=GAS), 2)
+    environments.reset(1)
+    cuts = np.stack([environments.step(np.array([0, 1]))[3] for _ in range(6)])
+    environments.close()
+    assert np.flatnonzero(cuts[:, 1]).tolist() == [4], "the first step earns the tile that it stands on"
+    assert not cuts[:4, 0].any()
+
+
+def test_car_racing_has_a_thousand_frames() -> None:
+    environments = make_environments(_spec("CarRacing-v3", action_repeat=64, action_table=GAS), 1)
+    environments.reset(1)
+    cuts = [bool(environments.step(np.array([1]))[3][0]) for _ in range(17)]
+    environments.close()
+    assert cuts == [False] * 15 + [True, False]  # 15 x 64 + 40
+
+
+def test_car_racing_looks_the_same_as_gymnasiums() -> None:
+    table = (
+        *((steer, gas, 0.0) for steer in (-1.0, -0.5, 0.0, 0.5, 1.0) for gas in (0.0, 0.5)),
+        (0, 0, 0.2),
+        (0, 0, 0.8),
+    )
+    fields = {"action_table": table, "action_repeat": 2, "crop": (0, 12, 6, 6), "grey": True, "frame_stack": 4}
+    shown = {}
+    for backend in ("gymnasium", "envpool"):
+        environments = make_environments(EnvironmentSpec(id="CarRacing-v3", backend=backend, **fields), 2)
+        first = environments.reset(1)
+        frames = environments.step(np.array([0, 11]))[0]
+        shown[backend] = environments.spaces, first.shape, first.dtype, frames.shape, frames.dtype
+        environments.close()
+    assert shown["gymnasium"] == shown["envpool"]
+    spaces, shape, dtype, _, _ = shown["envpool"]
+    assert (spaces.observation.shape, spaces.observation.frames, spaces.action.count) == ((84, 84), 4, 12)
+    assert (shape, dtype) == ((2, 84, 84), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("fields", "shape"),
+    [
+        ({"grey": True, "resize": (84, 84)}, (84, 84)),
+        ({"grey": True}, (210, 160)),
+        ({}, (210, 160, 3)),
+        ({"resize": (50, 40)}, (50, 40, 3)),
+        ({"grey": True, "crop": (34, 16, 0, 0), "resize": (80, 80)}, (80, 80)),
+    ],
+)
+def test_atari_frames_are_single_and_shaped_as_asked(fields: dict, shape: tuple[int, ...]) -> None:
+    environments = make_environments(_spec("Pong-v5", frame_stack=4, action_repeat=4, **fields), 2)
+    assert environments.spaces.observation.shape == shape
+    assert environments.reset(1).shape == (2, *shape)
+    frames, rewards, _, _ = environments.step(np.zeros(2, np.int64))
+    assert (frames.shape, frames.dtype, rewards.shape) == ((2, *shape), np.uint8, (2,))
+    environments.close()
+
+
+def test_ataris_limit_is_in_frames_as_everywhere() -> None:
+    environments = make_environments(_spec("Pong-v5", action_repeat=4, max_episode_steps=10), 1)
+    environments.reset(1)
+    assert [bool(environments.step(np.zeros(1, np.int64))[3][0]) for _ in range(5)] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+    environments.close()
+
+
+def test_every_seed_is_taken_and_tells_episodes_apart() -> None:
+    environments = make_environments(_spec("CartPole-v1"), 2)
+    first = environments.reset(2**32 - 1)
+    np.testing.assert_array_equal(environments.reset(2**32 - 1), first)
+    assert (environments.reset(1) != first).any()
+    assert (first[0] != first[1]).any()
+    environments.close()
+
+
+@pytest.mark.parametrize(
+    ("spec", "reason"),
+    [
+        (_spec("CarRacer-v3"), "unknown environment 'CarRacer-v3': did you mean CarRacing-v"),
+        (_spec("zzz"), "envpool has none like it"),
+        (_spec("CartPole-v1", kwargs={"no_such_option": 1}), "CartPole-v1 of envpool cannot be made.*no_such_option"),
+        (_spec("CartPole-v1", kwargs={"num_threads": 4}), "names num_threads, which the rest"),
+        (_spec("Pong-v5", kwargs={"stack_num": 4, "frame_skip": 2}), "names frame_skip and stack_num"),
+        (_spec("Pendulum-v1"), "environment.action_table"),
+    ],
+)
+def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:
+    with pytest.raises(UnplayableError, match=reason) as caught:
+        make_environments(spec, 2)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_envpool_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    with pytest.raises(UnplayableError, match=r'"daedalus-rl\[envpool\]".*--set environment.backend=gymnasium'):
+        make_environments(_spec("CartPole-v1"), 1)

@@ -1,0 +1,186 @@
+"""actor/video.py: what was shown is in the file, or there is no file."""
+
+import sys
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from actor.video import Video, VideoError
+
+FILES = ["film.mp4", "film.gif"]
+
+
+def frame(number: int, height: int = 40, width: int = 60) -> np.ndarray:
+    """A red square that moves to the right by four pixels a frame, on blue."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[..., 2] = 200
+    picture[16:24, 4 * number % (width - 8) : 4 * number % (width - 8) + 8] = 250, 0, 0
+    return picture
+
+
+def record(path: Path, frames: int, frames_per_second: float, **options: float) -> Video:
+    with Video(path, **options) as video:  # type: ignore[arg-type]
+        video.frames_per_second = frames_per_second
+        for number in range(frames):
+            video.add(frame(number))
+    return video
+
+
+def read_mp4(path: Path) -> tuple[list[np.ndarray], float]:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        pictures = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+        assert stream.average_rate is not None
+        return pictures, float(stream.average_rate)
+
+
+def read_gif(path: Path) -> tuple[list[np.ndarray], list[int]]:
+    """The pictures as shown, and for how many milliseconds each."""
+    pictures, shown = [], []
+    with Image.open(path) as image:
+        assert image.info["loop"] == 0
+        for number in range(getattr(image, "n_frames", 1)):
+            image.seek(number)
+            pictures.append(np.asarray(image.convert("RGB")))
+            shown.append(image.info["duration"])
+    return pictures, shown
+
+
+def test_every_frame_is_in_an_mp4_at_its_own_rate(tmp_path: Path) -> None:
+    assert record(tmp_path / "film.mp4", 75, 50).frames == 75
+    pictures, rate = read_mp4(tmp_path / "film.mp4")
+    assert rate == 50
+    assert len(pictures) == 75
+    for number, picture in enumerate(pictures):
+        assert np.abs(picture.astype(int) - frame(number)).mean() < 12  # colours are kept at half the size
+
+
+def test_an_mp4_has_even_sizes(tmp_path: Path) -> None:
+    with Video(tmp_path / "film.mp4") as video:
+        video.add(frame(0, 41, 61))
+    assert read_mp4(tmp_path / "film.mp4")[0][0].shape == (40, 60, 3)
+    record(tmp_path / "small.mp4", 2, 30, width=30)
+    assert read_mp4(tmp_path / "small.mp4")[0][0].shape == (20, 30, 3)
+
+
+@pytest.mark.parametrize(
+    ("rate", "frames", "kept", "milliseconds"),
+    [(50, 100, range(0, 100, 4), 2000), (30, 60, range(0, 60, 2), 2000), (12, 24, range(24), 2000)],
+)
+def test_a_gif_keeps_every_nth_frame_and_the_pace(
+    tmp_path: Path, rate: int, frames: int, kept: range, milliseconds: int
+) -> None:
+    record(tmp_path / "film.gif", frames, rate)
+    pictures, shown = read_gif(tmp_path / "film.gif")
+    assert sum(shown) == milliseconds
+    assert len(pictures) == len(kept)
+    for picture, number in zip(pictures, kept, strict=True):
+        np.testing.assert_array_equal(picture, frame(number))
+
+
+def test_a_gif_is_small_and_its_width_can_be_chosen(tmp_path: Path) -> None:
+    with Video(tmp_path / "film.gif") as video:
+        video.add(np.zeros((400, 640, 3), np.uint8))
+    assert read_gif(tmp_path / "film.gif")[0][0].shape == (200, 320, 3)
+    record(tmp_path / "small.gif", 1, 30, width=30)
+    assert read_gif(tmp_path / "small.gif")[0][0].shape == (20, 30, 3)
+
+
+def test_what_does_not_move_costs_a_gif_nothing(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
+    with Video(tmp_path / "film.gif") as video:
+        video.frames_per_second = 15
+        for number in range(10):
+            noise[:8, :8] = 25 * number
+            video.add(noise)
+        for _ in range(10):
+            video.add(noise)
+    pictures, _ = read_gif(tmp_path / "film.gif")
+    assert len(pictures) == 20
+    assert (pictures[15][:8, :8] == 225).all()
+    with Video(tmp_path / "still.gif") as video:
+        video.add(noise)
+    still = (tmp_path / "still.gif").stat().st_size
+    assert (tmp_path / "film.gif").stat().st_size < still + 19 * 500
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_recording_is_cut_after_so_many_seconds(tmp_path: Path, name: str) -> None:
+    assert record(tmp_path / name, 60, 30, max_seconds=0.5).frames == 15
+    if name.endswith("mp4"):
+        assert len(read_mp4(tmp_path / name)[0]) == 15
+    else:
+        assert sum(read_gif(tmp_path / name)[1]) == pytest.approx(500, abs=40)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_run_that_fails_leaves_nothing_and_keeps_what_was_there(tmp_path: Path, name: str) -> None:
+    def fail() -> None:
+        with Video(tmp_path / name) as video:
+            for number in range(40):
+                video.add(frame(number))
+            raise RuntimeError("the engine stalled")
+
+    with pytest.raises(RuntimeError, match="stalled"):
+        fail()
+    assert not list(tmp_path.iterdir())
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(RuntimeError, match="stalled"):
+        fail()
+    assert [entry.read_text() for entry in tmp_path.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_frames_reach_the_disk_as_they_come(tmp_path: Path, name: str) -> None:
+    random = np.random.default_rng(1)
+    with Video(tmp_path / name) as video:
+        video.frames_per_second = 10
+        for _ in range(150):
+            video.add(random.integers(0, 256, (100, 100, 3), np.uint8))
+        (beside,) = tmp_path.iterdir()
+        written = beside.stat().st_size
+    assert written > (tmp_path / name).stat().st_size / 4
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_cannot_be_a_video_is_told(tmp_path: Path, name: str) -> None:
+    def film(*frames: np.ndarray) -> None:
+        with Video(tmp_path / name) as video:
+            for picture in frames:
+                video.add(picture)
+
+    with pytest.raises(VideoError, match="the environment drew nothing"):
+        film()
+    with pytest.raises(VideoError, match=r"from \(40, 60, 3\) to \(20, 60, 3\)"):
+        film(frame(0), frame(0, 20))
+    with pytest.raises(VideoError, match=r"not float64 of \(4, 4\)"):
+        film(np.zeros((4, 4)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_where_nothing_can_be_written_is_known_before_anything_is_played(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / name).mkdir()
+    for place in (tmp_path / "nowhere" / name, tmp_path / "file" / name, tmp_path / name):
+        with pytest.raises(VideoError, match=f"cannot write {place}: "), Video(place):
+            raise AssertionError("the block was entered")
+
+
+def test_an_unknown_suffix_is_told_with_those_that_are_known(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match=r"written as \.mp4 or \.gif, not as 'film.avi'"):
+        Video(tmp_path / "film.avi")
+
+
+@pytest.mark.parametrize(("name", "package"), [("film.mp4", "av"), ("film.gif", "PIL")])
+def test_a_missing_package_is_told_with_what_brings_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(VideoError, match=rf'need {package}: pip install "daedalus-rl\[video\]"'):
+        Video(tmp_path / name)

@@ -1,0 +1,352 @@
+"""`daedalus evaluate`: which policy it plays, where, what it says of it, and the videos that it makes."""
+
+import importlib
+import itertools
+import json
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import safetensors.numpy
+from counting_environment import Counting
+from PIL import Image
+from processes import Running
+
+import actor.evaluate
+import policy.saved_policy
+from actor.environments import make_environments
+from actor.evaluate import main
+from learner.checkpoint import save_checkpoint
+from learner.learner import Learner
+from learner.run_directory import create, write_json
+from policy.runtime import OnnxRuntime
+from policy.saved_policy import best_checkpoint, best_name, checkpoints, read_policy
+from protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec, Spaces
+
+Start = Callable[..., Running]
+COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=4)
+CARTPOLE = EnvironmentSpec(id="CartPole-v1")
+RACING = EnvironmentSpec(
+    id="CarRacing-v3",
+    max_episode_steps=10,
+    action_table=((0.0, 1.0, 0.0), (1.0, 0.5, 0.0)),
+    action_repeat=4,
+    crop=(0, 12, 6, 6),
+    grey=True,
+    resize=(21, 21),
+    frame_stack=4,
+)
+
+
+def save(run: Path, environment: EnvironmentSpec, *versions: int, spaces: Spaces | None = None, **spec: Any) -> Path:
+    """A run with these checkpoints, all of the same untrained policy but with a taste for all actions."""
+    made = make_environments(environment, 1)
+    made.close()
+    run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
+    learner = Learner(run_spec.training, run_spec.policy, spaces or made.spaces)
+    random = np.random.default_rng(5)
+    weights = {name: random.standard_normal(array.shape, np.float32) for name, array in learner.weights().items()}
+    for version in versions:
+        save_checkpoint(
+            run,
+            spec=run_spec,
+            spaces=spaces or made.spaces,
+            policy_version=version,
+            program=learner.program(),
+            parameters=weights,
+            state=learner.state(),
+            counters={},
+            keep=9,
+        )
+    return run
+
+
+def keep_best(run: Path, score: float, version: int) -> Path:
+    directory = run / "checkpoints" / f"{version:010d}"
+    return directory.rename(directory.with_name(best_name(score, version)))
+
+
+@pytest.fixture
+def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    """Runs the command in this process; its result."""
+
+    def run(*words: object) -> dict[str, Any]:
+        capsys.readouterr()
+        status = main([*map(str, words), "--json"])
+        captured = capsys.readouterr()
+        assert status == 0, captured.err
+        return json.loads(captured.out)
+
+    return run
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs the command in this process; the one line that it fails with."""
+
+    def run(status: int, *words: object) -> str:
+        capsys.readouterr()
+        assert main([*map(str, words)]) == status
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        (line,) = captured.err.splitlines()
+        return line
+
+    return run
+
+
+# ------------------------------------------------------------------------------------------------ what it plays
+
+
+def one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[int]]:
+    """The returns of the first episodes of one environment, and the actions that were taken."""
+    saved = read_policy(checkpoint)
+    runtime = OnnxRuntime(saved.program)
+    runtime.load(saved.weights)
+    environment, returns, taken = Counting(), [], set()
+    for _ in range(episodes):
+        frame, _ = environment.reset()
+        seen, total, over = [frame] * 4, 0.0, False
+        memory = np.zeros((1, runtime.state_size), np.float32)
+        while not over:
+            actions, _, memory = runtime.act(np.stack(seen[-4:])[None], memory, None)
+            frame, reward, terminated, truncated, _ = environment.step(actions[0])
+            taken.add(int(actions[0]))
+            seen.append(frame)
+            total += reward
+            over = terminated or truncated
+        returns.append(total)
+    return returns, taken
+
+
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_returns_are_those_of_episodes_played_one_by_one(
+    tmp_path: Path, evaluate: Callable[..., dict], memory: str
+) -> None:
+    run = save(tmp_path / "run", COUNTING, 3, policy={"hidden": (16,), "memory": memory, "memory_units": 8})
+    result = evaluate(run, "--episodes", 11, "--envs", 3)
+    alone = [one_by_one(checkpoints(run)[0], episodes) for episodes in (4, 4, 3)]
+    assert len(set.union(*(taken for _, taken in alone))) > 1
+    expected = sorted(itertools.chain.from_iterable(returns for returns, _ in alone))
+    np.testing.assert_allclose(sorted(result["returns"]), expected, atol=1e-3)
+    assert result["return_mean"] == pytest.approx(np.mean(result["returns"]), rel=1e-6)
+    assert sorted(result["lengths"]) == [1] * 3 + [2] * 3 + [3] * 5
+    assert (result["environment"], result["backend"]) == (COUNTING.id, "gymnasium")
+    assert (result["episodes"], result["policy_version"], result["actions"]) == (11, 3, "greedy")
+
+
+def test_the_best_checkpoint_is_played_or_the_newest_where_that_is_asked_for(
+    tmp_path: Path, evaluate: Callable[..., dict]
+) -> None:
+    run = save(tmp_path / "run", COUNTING, 5, 6, 7, 8, 9)
+    assert evaluate(run, "--episodes", 1)["policy_version"] == 9
+    for version, score in ((5, 9.5), (6, 12.25), (7, -20.5)):
+        keep_best(run, score, version)
+    best = evaluate(run, "--episodes", 1)
+    assert (best["policy_version"], best["best_checkpoint"]) == (6, True)
+    assert best["checkpoint"].endswith("best_12.2_0000000006")
+    newest = evaluate(run, "--episodes", 1, "--newest")
+    assert (newest["policy_version"], newest["best_checkpoint"]) == (9, False)
+    assert evaluate(run / "checkpoints" / "0000000008", "--episodes", 1)["policy_version"] == 8
+    assert [entry.name for entry in checkpoints(run)] == ["0000000009", "0000000008"]
+
+
+def test_a_damaged_best_is_named_and_the_newest_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = save(tmp_path / "run", COUNTING, 1, 2)
+    (keep_best(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
+    assert main([str(run), "--episodes", "1"]) == 0
+    captured = capsys.readouterr()
+    assert "passed over" in captured.err
+    assert "best_3.0_0000000001" in captured.err
+    assert "gymnasium's counting_environment:Counting-v0, policy version 2: return 3." in captured.out
+
+
+def test_names_of_best_checkpoints_can_be_read_back(tmp_path: Path) -> None:
+    assert best_name(812.34, 12345) == "best_812.3_0000012345"
+    assert best_name(-20.5, 7) == "best_-20.5_0000000007"
+    with pytest.raises(ValueError, match="finite"):
+        best_name(float("nan"), 1)
+    assert best_checkpoint(tmp_path) is None
+    for name in ("best_-20.5_0000000007", "best_9.0_0000000003", "best_9.0_0000000004", "best_99_1", ".best_50.0_1"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    best = best_checkpoint(tmp_path)
+    assert best is not None
+    assert best.name == "best_9.0_0000000004"
+
+
+def test_sampled_actions_and_seeds(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    one, same, other = (evaluate(run, "--episodes", 5, "--seed", seed, "--sampled") for seed in (3, 3, 4))
+    assert one == same
+    assert one["actions"] == "sampled"
+    assert one["returns"] != other["returns"]
+    assert one["returns"] != evaluate(run, "--episodes", 5, "--seed", 3)["returns"]
+
+
+# ------------------------------------------------------------------------------------------------ where it plays
+
+
+def test_another_backend_can_be_played(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_backend": "envpool"})
+    assert evaluate(run, "--episodes", 2)["backend"] == "envpool"
+    assert evaluate(run, "--episodes", 2, "--backend", "gymnasium")["backend"] == "gymnasium"
+
+
+def test_spaces_that_differ_from_the_policys_are_named(tmp_path: Path, refused: Callable[..., str]) -> None:
+    spaces = make_environments(CARTPOLE, 1).spaces.model_copy(update={"action": ChoiceSpace(count=3)})
+    run = save(tmp_path / "run", CARTPOLE, 1, spaces=spaces)
+    line = refused(1, run, "--episodes", 1)
+    assert "gymnasium's CartPole-v1 has observation: float32 array of shape (4,); action: 2 choices" in line
+    assert "trained on observation: float32 array of shape (4,); action: 3 choices" in line
+
+
+def test_a_users_own_transform_is_applied(tmp_path: Path, refused: Callable[..., str]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    assert "no_such_module" in refused(1, run, "--episodes", 1, "--wrap", "no_such_module:function")
+
+
+# ------------------------------------------------------------------------------------------------ watching it
+
+
+def test_a_video_has_every_frame_of_the_environments_own(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", RACING, 1)
+    result = evaluate(run, "--video", tmp_path / "drive.mp4", "--seed", 2)
+    assert result["episodes"] == 1
+    assert result["lengths"] == [3]  # ten frames, four to an env_step
+    assert result["video_seconds"] == 11 / 50
+    with av.open(str(tmp_path / "drive.mp4")) as container:
+        assert container.streams.video[0].average_rate == 50
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(frames) == 11  # the first of them before anything was done
+    assert frames[0].shape == (400, 600, 3)
+    assert any((frames[0] != frame).any() for frame in frames[1:])
+    assert evaluate(run, "--episodes", 1, "--seed", 2)["returns"] == result["returns"]
+
+
+def test_a_gif_can_be_cut_and_the_score_is_not(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)
+    result = evaluate(run, *options, "--max-seconds", 0.2, "--width", 150)
+    assert result["video_seconds"] == 0.2
+    with Image.open(tmp_path / "short.gif") as image:
+        assert image.size == (150, 100)
+        assert getattr(image, "n_frames", 1) == 3  # of ten, every fourth
+    assert len(result["returns"]) == 3
+    assert sum(result["lengths"]) > 10
+
+
+def test_a_window_is_shown_where_there_is_a_screen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], refused: Callable[..., str]
+) -> None:
+    run = save(tmp_path / "run", CARTPOLE.model_copy(update={"max_episode_steps": 5}), 1)
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "needs a screen, and there is none here: record the episodes with --video" in refused(2, run, "--render")
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    assert evaluate(run, "--render", "--seed", 1)["lengths"] == [5]
+
+
+# ------------------------------------------------------------------------------------------------ shipped policies
+
+
+def test_a_shipped_policy_plays_as_it_did_in_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], refused: Callable[..., str]
+) -> None:
+    monkeypatch.setattr(policy.saved_policy, "PRETRAINED", tmp_path / "pretrained")
+    assert "'cartpole': none ships" in refused(1, "--pretrained", "cartpole")
+    create(tmp_path / "run", RunSpec(environment=CARTPOLE))
+    run = save(tmp_path / "run", CARTPOLE, 4, 5)
+    keep_best(run, 77.0, 4)
+    (run / "metrics.csv").write_text("row\n" + "".join(f"{row}\n" for row in range(4000)))
+    write_json(run / "summary.json", {"env_steps": 1234, "evaluation": None})
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent.parent))
+    ship = importlib.import_module("benchmarks.ship_pretrained").ship
+    shipped = ship(run, tmp_path / "pretrained" / "cartpole-1")
+    assert {entry.name for entry in shipped.iterdir()} == {
+        *("manifest.json", "seal", "program.onnx", "parameters.safetensors"),
+        *("config.toml", "metrics.csv", "README.md"),
+    }
+    assert safetensors.numpy.load_file(shipped / "parameters.safetensors")
+    assert (shipped / "metrics.csv").read_text().splitlines()[::999] == ["row", "3995"]
+    assert "daedalus evaluate --pretrained cartpole-1\n" in (shipped / "README.md").read_text()
+    of_the_run, of_the_shipped = evaluate(run, "--episodes", 3), evaluate("--pretrained", "cartpole-1", "--episodes", 3)
+    for name in ("returns", "policy_version", "seed"):
+        assert of_the_run[name] == of_the_shipped[name]
+    line = refused(1, "--pretrained", "cartpole")
+    assert "no pretrained policy 'cartpole': did you mean cartpole-1? there are cartpole-1" in line
+    assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
+
+
+# ------------------------------------------------------------------------------------------------ how it behaves
+
+
+def test_progress_goes_to_standard_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = save(tmp_path / "run", COUNTING, 1)
+    monkeypatch.setattr(actor.evaluate, "_PROGRESS_SECONDS", 0.0)
+    assert main([str(run), "--json", "--episodes", "2", "--envs", "1"]) == 0
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert lines[0] == "evaluation: 0 of 2 episodes"
+    assert lines[2].startswith("evaluation: 1 of 2 episodes, mean return 3.")
+    assert len(json.loads(captured.out)["returns"]) == 2
+
+
+def test_told_to_stop_it_ends_and_leaves_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    stop = threading.Event()
+    stop.set()
+    assert main([str(run), "--video", str(tmp_path / "film.mp4")], stop) == 1
+    assert capsys.readouterr().err == "daedalus evaluate: stopped\n"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_signal_ends_it(start: Start, tmp_path: Path) -> None:
+    save(tmp_path / "run", CARTPOLE, 1)
+    running = start("evaluate", "run", "--episodes", 10**9)
+    running.expect("evaluation: .* of 1000000000 episodes, mean return")
+    running.process.send_signal(signal.SIGTERM)
+    assert running.wait() == 1
+    assert running.lines[-1] == "daedalus evaluate: stopped"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        ([], 2, "name a run directory"),
+        (["RUN", "--pretrained", "x"], 2, "one of them only"),
+        (["RUN", "--episodes", 0], 2, "--episodes must be at least 1, not 0"),
+        (["RUN", "--envs", 0], 2, "--envs must be from 1 to 4096, not 0"),
+        (["RUN", "--seed", -1], 2, "--seed must not be negative"),
+        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, not as 'x.avi'"),
+        (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
+        (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot go together"),
+        (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),
+        (["RUN", "--video", "x.mp4", "--backend", "envpool"], 2, "leave out --backend envpool"),
+        (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width must be from 16 to 4096, not 3"),
+        (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds must be above 0, not 0"),
+        (["RUN", "--max-seconds", 5], 2, "are for --video FILE"),
+        (["RUN", "--backend", "ale"], 1, "unknown environment 'CartPole-v1'"),
+        (["nowhere"], 1, "nowhere has no checkpoints: is it a run directory"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    refused: Callable[..., str],
+    words: list[object],
+    status: int,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    assert message in refused(status, *[run if word == "RUN" else word for word in words])
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]

@@ -1,0 +1,52 @@
+"""An environment of pixels and continuous actions that counts, and functions to wrap environments with."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+
+class Picture(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Observation: noise, but for the first pixel, [episode, step, 0]. Reward: the sum of the action."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's own form
+
+    def __init__(self, end: int = 5, render_mode: str | None = None) -> None:
+        self.observation_space = gymnasium.spaces.Box(0, 255, (6, 8, 3), np.uint8)
+        self.action_space = gymnasium.spaces.Box(
+            np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], np.float32), dtype=np.float32
+        )
+        self.render_mode = render_mode
+        self._end = end
+        self._episode = -1
+        self._step = 0
+
+    def _observe(self) -> np.ndarray:
+        picture = self.np_random.integers(0, 256, (6, 8, 3), np.uint8)
+        picture[0, 0] = self._episode, self._step, 0
+        return picture
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self._episode += 1
+        self._step = 0
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        assert self.action_space.contains(action)
+        self._step += 1
+        return self._observe(), float(action.sum()), self._step == self._end, False, {}
+
+    def render(self) -> np.ndarray:
+        return np.full((2, 2, 3), self._step, np.uint8)
+
+
+gymnasium.register("Picture-v0", lambda **kwargs: Picture(**kwargs))
+
+
+def with_doubled_rewards(environment: gymnasium.Env) -> gymnasium.Env:
+    return gymnasium.wrappers.TransformReward(environment, lambda reward: 2 * float(reward))
+
+
+def with_nothing_to_play(environment: gymnasium.Env) -> str:
+    return str(environment)

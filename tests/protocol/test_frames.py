@@ -1,0 +1,191 @@
+"""protocol/frames.py against gymnasium's frame stack: what the actor sees, what the learner makes of its rollouts."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FrameStackObservation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actor.collector import Collector
+from protocol.codec import Limits, decode, encode
+from protocol.frames import FrameStack, stack_rows
+from protocol.messages import Rollout, RolloutIdentity
+from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
+
+IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
+
+
+class Film(gymnasium.Env[np.ndarray, np.int64]):
+    """Shows a picture that it never showed before at each step; its episodes are as long as they are said to be."""
+
+    def __init__(self, space: ArraySpace, number: int, lengths: list[int]) -> None:
+        self.observation_space = gymnasium.spaces.Box(0, 255, space.shape, np.dtype(space.dtype).type)
+        self.action_space = gymnasium.spaces.Discrete(2)
+        self._random = np.random.default_rng(number)
+        self._lengths, self._episode, self._step = lengths, -1, 0
+
+    def _observe(self) -> np.ndarray:
+        return self._random.integers(0, 256, self.observation_space.shape).astype(self.observation_space.dtype)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self._episode, self._step = self._episode + 1, 0
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self._step += 1
+        over = self._step == self._lengths[self._episode % len(self._lengths)]
+        return self._observe(), 1.0, over and self._episode % 2 == 0, over and self._episode % 2 == 1, {}
+
+
+@dataclass
+class Films:
+    """E of them as the collector wants them."""
+
+    space: ArraySpace
+    lengths: list[list[int]]
+    stacked: bool = False
+    played: SyncVectorEnv = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.played = SyncVectorEnv(
+            [lambda number=number: self._make(number) for number in range(self.count)],
+            autoreset_mode=AutoresetMode.NEXT_STEP,
+        )
+
+    def _make(self, number: int) -> gymnasium.Env:
+        film = Film(self.space, number, self.lengths[number])
+        return FrameStackObservation(film, self.space.frames, padding_type="reset") if self.stacked else film
+
+    @property
+    def count(self) -> int:
+        return len(self.lengths)
+
+    @property
+    def spaces(self) -> Spaces:
+        return Spaces(observation=self.space, action=ChoiceSpace(count=2))
+
+    def reset(self, seed: int) -> np.ndarray:
+        return self.played.reset(seed=seed)[0]
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return self.played.step(actions)[:4]
+
+    def close(self) -> None:
+        self.played.close()
+
+
+class Spectator:
+    """A policy that remembers all it was shown."""
+
+    state_size = 0
+
+    def __init__(self) -> None:
+        self.seen: list[np.ndarray] = []
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        pass
+
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self.seen.append(observations.copy())
+        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+
+
+def collected(films: Films, rows: int, count: int) -> tuple[list[Rollout], np.ndarray]:
+    """Rollouts as they reach the learner, and the observations that their actions were chosen from."""
+    spectator = Spectator()
+    collector = Collector(films, spectator, EnvironmentSpec(id="Film-v0"), rollout_length=rows, seed=1)
+    rollouts = []
+    for _ in range(count):
+        came = decode(encode(collector.collect(IDENTITY, 0)), Limits())
+        assert isinstance(came, Rollout)
+        rollouts.append(came)
+    return rollouts, np.stack(spectator.seen)
+
+
+def rebuilt(rollout: Rollout, space: ArraySpace) -> np.ndarray:
+    """The learner's observations [T+1, E, k, *frame_shape], in memory that held something else before."""
+    shape = (rollout.rows + 1, rollout.environments, space.frames, *space.shape)
+    out = np.full(shape, 77, space.dtype)
+    stack_rows(rollout.frames, rollout.valid, out)
+    return out
+
+
+episodes = st.lists(st.integers(1, 9), min_size=1, max_size=5)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    depth=st.integers(1, 5),
+    more_rows=st.integers(0, 6),
+    lengths=st.lists(episodes, min_size=1, max_size=3),
+    shape=st.sampled_from([(2, 3), (2, 3, 1), (4,)]),
+    dtype=st.sampled_from(["uint8", "float32"]),
+)
+def test_every_row_of_every_rollout_is_what_gymnasiums_frame_stack_shows(
+    depth: int, more_rows: int, lengths: list[list[int]], shape: tuple[int, ...], dtype: Any
+) -> None:
+    space = ArraySpace(shape=shape, dtype=dtype, frames=depth)
+    rows, count = depth + more_rows, 4
+    reference = Films(space, lengths, stacked=True)
+    shown = [reference.reset(1)]
+    for _ in range(rows * count):
+        shown.append(reference.step(np.zeros(reference.count, np.int64))[0])
+    expected = np.stack(shown)  # [count * T + 1, E, k, *frame_shape]
+
+    rollouts, seen = collected(Films(space, lengths), rows, count)
+    np.testing.assert_array_equal(seen, expected[:-1] if depth > 1 else expected[:-1, :, 0])
+    for number, rollout in enumerate(rollouts):
+        assert rollout.frames.shape == (depth + rows, len(lengths), *shape)
+        first = number * rows
+        np.testing.assert_array_equal(rebuilt(rollout, space), expected[first : first + rows + 1])
+
+
+def test_stacks_by_hand() -> None:
+    """Frames 1 to 7 of one environment, a stack of 3, four rows; row 1 only reset, so that an episode starts at row 2.
+
+    Frame 4 is the last of the episode before, frame 5 the first of the new one.
+    """
+    frames = np.arange(1, 8, dtype=np.float32).reshape(7, 1, 1)
+    valid = np.array([[True], [False], [True], [True]])
+    out = np.zeros((5, 1, 3, 1), np.float32)
+    stack_rows(frames, valid, out)
+    assert out[:, 0, :, 0].tolist() == [[1, 2, 3], [2, 3, 4], [5, 5, 5], [5, 5, 6], [5, 6, 7]]
+
+
+def test_running_stacks_by_hand() -> None:
+    stack = FrameStack(ArraySpace(shape=(1,), dtype="uint8", frames=3), 2)
+    seen = []
+    for frame, starts in ((1, (True, True)), (2, (False, False)), (3, (False, True)), (4, (False, False))):
+        stack.push(np.full((2, 1), frame, np.uint8), np.array(starts))
+        seen.append(stack.observations[:, :, 0].tolist())
+    assert seen == [[[1, 1, 1]] * 2, [[1, 1, 2]] * 2, [[1, 2, 3], [3, 3, 3]], [[2, 3, 4], [3, 3, 4]]]
+    assert stack.observations.dtype == np.uint8
+
+
+@pytest.mark.parametrize("depth", [1, 4])
+def test_a_stack_of_one_frame_is_the_frame(depth: int) -> None:
+    space = ArraySpace(shape=(2, 3), dtype="uint8", frames=depth)
+    stack = FrameStack(space, 5)
+    assert stack.observations.shape == (5, *space.stacked_shape)
+    assert stack.frames.shape == (5, depth, 2, 3)
+
+
+def test_a_float_environments_numbers_travel_as_float32() -> None:
+    stack = FrameStack(ArraySpace(shape=(2,), dtype="float32", frames=2), 1)
+    stack.push(np.array([[0.1, 0.2]]), np.array([True]))
+    assert stack.observations.dtype == np.float32
+    np.testing.assert_array_equal(stack.observations[0], np.array([[0.1, 0.2]] * 2, np.float32))
+
+
+def test_images_are_sent_environment_by_environment_and_vectors_time_by_time() -> None:
+    for shape, swapped in (((2, 3), True), ((4,), False)):
+        rollouts, _ = collected(Films(ArraySpace(shape=shape, dtype="uint8"), [[3], [4]]), rows=5, count=1)
+        assert rollouts[0].frames.swapaxes(0, 1).flags.c_contiguous == swapped
