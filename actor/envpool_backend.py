@@ -15,7 +15,7 @@ from protocol.spec import EnvironmentSpec
 
 _ATARI_OPTIONS = {"stack_num", "frame_skip", "gray_scale", "img_height", "img_width", "reward_clip"}
 _ATARI_SIZE = (210, 160)
-_ATARI_FRAMES = 108_000  # half an hour of play, which is ALE's limit; envpool's is a quarter of it, counted in repeats
+_ATARI_FRAMES = 108_000  # half an hour of play, as in ALE; envpool's own default counts steps, whatever they repeat
 
 Arrange = Callable[[np.ndarray], np.ndarray]
 

@@ -1,11 +1,13 @@
 """`python -m actor.evaluate`: plays a run's best checkpoint, or a given one, and prints how it does."""
 
 import argparse
+import importlib
 import json
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, TextIO
 
 import gymnasium
@@ -24,6 +26,7 @@ from protocol.spec import EnvironmentSpec
 
 _PROGRESS_SECONDS = 5.0
 _FRAMES_PER_SECOND = 30.0  # of environments that do not say
+_ATARI_FRAMES_PER_SECOND = 60.0
 
 
 class _StoppedError(Exception):
@@ -43,11 +46,9 @@ def main(words: Sequence[str] | None = None, stop: threading.Event | None = None
         exit_with_parent(stop)
     try:
         result = _evaluate(arguments, stop)
-    except (DamagedError, NoPolicyError, UnplayableError, PolicyError, VideoError) as error:
-        print(f"daedalus evaluate: {error}", file=sys.stderr)
-        return 1
-    except _StoppedError:
-        print("daedalus evaluate: stopped", file=sys.stderr)
+    except (_StoppedError, DamagedError, NoPolicyError, UnplayableError, PolicyError, VideoError) as error:
+        # The signal may have gone to the environments' processes as well; that they have ended is no news then.
+        print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
     print(json.dumps(result) if arguments.json else _text(result))
     return 0
@@ -80,8 +81,21 @@ def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> Environm
     backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
     if watched:
         backend = "gymnasium"
-    processes = trained.processes and backend == "gymnasium" and not watched
-    return trained.as_evaluated(backend).model_copy(update={"processes": processes})
+    played = trained.as_evaluated(backend)
+    if backend == "gymnasium" and trained.backend != "gymnasium":
+        played = _as_gymnasium_has_it(played)
+    return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
+
+
+def _as_gymnasium_has_it(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Atari games of the other backends have another name there, and repeat actions on their own unless told not to."""
+    atari_id = f"ALE/{spec.id.removeprefix('ALE/').removesuffix('-v5')}-v5"
+    with suppress(ImportError):
+        gymnasium.register_envs(importlib.import_module("ale_py"))
+    if atari_id not in gymnasium.registry:
+        return spec
+    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}  # as the others have it by default
+    return spec.model_copy(update={"id": atari_id, "kwargs": kwargs})
 
 
 def _play(
@@ -103,7 +117,7 @@ def _play(
     )
     try:
         if video is not None:
-            video.frames_per_second = _frames_per_second(spec.id)
+            video.frames_per_second = _frames_per_second(spec)
         if environments.spaces != policy.spaces:
             raise UnplayableError(
                 f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
@@ -116,9 +130,12 @@ def _play(
         environments.close()
 
 
-def _frames_per_second(environment_id: str) -> float:
+def _frames_per_second(spec: EnvironmentSpec) -> float:
     """How fast an environment's own steps are meant to be seen."""
-    maker = gymnasium.spec(environment_id.rpartition(":")[2]).entry_point
+    skipped = spec.kwargs.get("frameskip", 4)
+    if spec.id.startswith("ALE/") and isinstance(skipped, int):
+        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30, whatever it skips
+    maker = gymnasium.spec(spec.id.rpartition(":")[2]).entry_point
     metadata = getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "metadata", {})
     return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
 

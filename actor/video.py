@@ -96,7 +96,7 @@ class Video:
         except OSError as refused:
             raise self._refused(refused) from None
         finally:
-            pass
+            self._beside.unlink(missing_ok=True)
 
     def _close(self) -> bool:
         """Ends the file; False if there was nothing to write."""

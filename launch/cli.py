@@ -19,7 +19,7 @@ by hand, on any machines:
   status     show the fleet as the learner sees it
 
 afterwards:
-  evaluate   play episodes with what a run has learned
+  evaluate   play episodes with what a run has learned, or film them
   plot       draw the curves of one or more runs
 
 `daedalus COMMAND --help` tells more. To begin: daedalus train cartpole"""

@@ -99,7 +99,7 @@ def _add_where(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
-        help="your own transform, for this machine's actors: takes each gymnasium environment and returns the one to play",
+        help="your own transform, for this machine's actors: takes each gymnasium environment, returns the one to play",
     )
 
 

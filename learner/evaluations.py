@@ -61,7 +61,7 @@ class Evaluations:
 
     def _is_best(self, mean: float) -> bool:
         best = best_checkpoint(self.run_directory)
-        return best is None or mean > best_score(best)
+        return best is None or round(mean, 1) > best_score(best)  # which its name holds rounded so
 
     def _keep_best(self, directory: Path, mean: float, version: int) -> str:
         """Gives the checkpoint its score for a name; what was the best before goes once the new one is there."""

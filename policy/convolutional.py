@@ -80,7 +80,7 @@ class ArticleEncoder(ImageEncoder):
         for inputs, kernel in ((layout.shape[0], 4), (32, 3), (32, 3), (32, 3)):
             convolution = nn.Conv2d(inputs, 32, kernel, stride=2, padding=1)
             nn.init.xavier_uniform_(convolution.weight, nn.init.calculate_gain("leaky_relu"))
-            convolution.bias.data.fill_(0.01)
+            nn.init.constant_(convolution.get_parameter("bias"), 0.01)
             layers += [convolution, PReLU()]
         super().__init__(layout, nn.Sequential(*layers), lambda inputs: (nn.LayerNorm(inputs), inputs))
         unit = 255.0 if space.dtype == "uint8" else 1.0

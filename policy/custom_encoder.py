@@ -27,7 +27,8 @@ class CustomEncoder(nn.Module):
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
-            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {error}") from error
+            first_line = next(iter(str(error).strip().splitlines()), "")
+            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}") from error
 
     def forward(self, observations: Tensor) -> Tensor:
         """[N, *stacked_shape] -> [N, features]."""

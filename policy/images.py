@@ -33,7 +33,7 @@ class ImageLayout:
         """[N, *stacked_shape] -> [N, channels, height, width], lying in memory pixel by pixel (channels_last)."""
         frames = observations.reshape(-1, *self._split)  # [N, k, C, H, W] or [N, k, H, W, C]
         if self._colours_last:
-            frames = frames.movedim(-1, 2)
+            frames = frames.permute(0, 1, 4, 2, 3)
         return frames.flatten(1, 2).contiguous(memory_format=torch.channels_last)
 
 

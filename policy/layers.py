@@ -34,6 +34,8 @@ class PReLU(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """[N, C, H, W] -> the same."""
+        if inputs.is_cuda:
+            return functional.prelu(inputs, self.slope.to(inputs.dtype))
         return _Rectify.apply(inputs, self.slope)  # pyright: ignore[reportReturnType]
 
 
@@ -55,8 +57,10 @@ class _Rectify(torch.autograd.Function):
 
     @staticmethod
     def symbolic(graph: Any, inputs: Any, slope: Any) -> Any:
-        """The same for the ONNX exporter."""
-        return graph.op("PRelu", inputs, slope).setType(inputs.type())
+        """The same for the ONNX exporter: onnxruntime takes twice as long for an article network with its PRelu."""
+        positive = graph.op("Relu", inputs)
+        negative = graph.op("Sub", inputs, positive)
+        return graph.op("Add", positive, graph.op("Mul", negative, slope)).setType(inputs.type())
 
 
 def _pixels(images: Tensor) -> Tensor:

@@ -84,8 +84,8 @@ class Gru(nn.Module):
 
     def _next(self, inputs: Tensor, state: Tensor) -> Tensor:
         """Projected inputs [N, 3S], state [N, S] -> next state [N, S]."""
-        input_r, input_z, input_n = inputs.chunk(3, -1)
-        hidden_r, hidden_z, hidden_n = self.hidden(state).chunk(3, -1)
+        input_r, input_z, input_n = inputs.split(self.state_size, -1)
+        hidden_r, hidden_z, hidden_n = self.hidden(state).split(self.state_size, -1)
         reset = (input_r + hidden_r).sigmoid()
         update = (input_z + hidden_z).sigmoid()
         candidate = (input_n + reset * hidden_n).tanh()

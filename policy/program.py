@@ -1,23 +1,21 @@
 """Torch network -> ONNX program: the acting half of the forward pass, its weights left open.
 
-A program travels once, and any torch module whose acting half can be exported runs where torch is not installed.
-How its weights are bound depends on what is faster (policy/runtime.py): those of a small network are inputs of the
-program, named like the parameters; those of a convolutional one are constants, all zero, in whose place a runtime
-writes a snapshot's. The program's metadata says where in its bytes each begins, and its shape.
+Weights become inputs of the program, named like the parameters; a runtime binds those of a snapshot. So the
+program travels once, and any torch module whose acting half can be exported runs where torch is not
+installed.
 """
 
 import io
-import json
-import math
 import warnings
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
+from policy.custom_encoder import CustomEncoder
+from policy.errors import NetworkError
 from policy.network import ActorCritic
-from policy.runtime import LOGITS, NEXT_STATE, OBSERVATIONS, STATE, WEIGHTS
+from policy.runtime import LOGITS, NEXT_STATE, OBSERVATIONS, STATE, OnnxRuntime, PolicyError
 from protocol.spec import ArraySpace
 
 _OPSET = 17
@@ -32,68 +30,55 @@ class _Acting(nn.Module):
         for name, child in network.named_children():
             self.add_module(name, child)
 
-    def forward(self, observations: Tensor, state: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
-        network = self._network[0]
-        if state is None:
-            return network.act(observations, torch.zeros(0))[0]
-        return network.act(observations, state)
+    def forward(self, observations: Tensor, state: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        logits, next_state = self._network[0].act(observations, state)
+        return (logits, next_state) if self._network[0].state_size else logits
 
 
-def export_program(network: ActorCritic, space: ArraySpace) -> bytes:
+def export_program(network: ActorCritic, observation: ArraySpace) -> bytes:
     """The program of a network.
 
-    In: `observations` [N, *stacked_shape], where it has a memory also `state` [N, S], and the weights where they are
-    inputs. Out: `logits` [N, actions], where it has a memory also `next_state` [N, S].
+    `observations` [N, *stacked_shape] and weights in, `logits` [N, A] out; with a memory also `state` [N, S] in and
+    `next_state` [N, S] out. Raises NetworkError if a user's encoder cannot be exported.
     """
+    if not isinstance(network.encoder, CustomEncoder):
+        return _export(network, observation)
+    try:
+        program = _export(network, observation)
+        weights = {name: parameter.detach().cpu().numpy() for name, parameter in network.named_parameters()}
+        OnnxRuntime(program).load(weights)
+    except PolicyError as error:
+        raise NetworkError(f"the program made of the encoder is of no use to actors: {error}") from None
+    except Exception as error:  # the exporter calls the user's code, and raises whatever that does
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        raise NetworkError(f"the encoder cannot be exported to ONNX: {type(error).__name__}: {first_line}") from error
+    return program
+
+
+def _export(network: ActorCritic, observation: ArraySpace) -> bytes:
     device = next(network.parameters()).device
-    inputs = {OBSERVATIONS: torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype), device=device)}
-    outputs = [LOGITS]
-    if network.state_size:
-        inputs[STATE] = torch.zeros((2, network.state_size), device=device)
-        outputs.append(NEXT_STATE)
+    observations = torch.zeros((2, *observation.stacked_shape), dtype=getattr(torch, observation.dtype), device=device)
+    state = torch.zeros((2, network.state_size), device=device)
+    inputs, outputs = (
+        ([OBSERVATIONS, STATE], [LOGITS, NEXT_STATE]) if network.state_size else ([OBSERVATIONS], [LOGITS])
+    )
     program: Any = io.BytesIO()  # torch takes a file, whatever its annotation says
     with warnings.catch_warnings(), torch.no_grad():
         # The TorchScript exporter is deprecated, and a fifth of a second; its successor takes several times that.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             _Acting(network),
-            tuple(inputs.values()),
+            (observations, state),
             program,
             dynamo=False,
             export_params=False,
             # Without this the exporter makes one input of parameters that hold the same numbers, as new biases do.
             keep_initializers_as_inputs=True,
-            do_constant_folding=False,  # what is made of a weight would be folded, and the weight lost
+            # It would make weights of its own of what is computed from weights alone.
+            do_constant_folding=False,
             opset_version=_OPSET,
-            input_names=list(inputs),
+            input_names=inputs,
             output_names=outputs,
-            dynamic_axes={name: {0: "rows"} for name in (*inputs, *outputs)},
+            dynamic_axes={name: {0: "rows"} for name in inputs + outputs},
         )
-    return _with_constant_weights(program.getvalue()) if network.convolutional else program.getvalue()
-
-
-def _with_constant_weights(program: bytes) -> bytes:
-    """The same program, its weights constants; zeros stand for them, which take no room on the wire."""
-    import onnx  # at the learner only, and only for images
-
-    model = onnx.load_from_string(program)
-    entries = [entry for entry in model.graph.input if entry.name not in (OBSERVATIONS, STATE)]
-    random = np.random.default_rng(0)
-    marks: list[bytes] = []
-    for entry in entries:
-        shape = [side.dim_value for side in entry.type.tensor_type.shape.dim]
-        marks.append(random.bytes(4 * math.prod(shape)))
-        constant = onnx.TensorProto(name=entry.name, data_type=onnx.TensorProto.FLOAT, dims=shape, raw_data=marks[-1])
-        model.graph.initializer.append(constant)
-        model.graph.input.remove(entry)
-    data = bytearray(model.SerializeToString(deterministic=True))
-    places: dict[str, tuple[int, list[int]]] = {}
-    start = 0
-    for constant, mark in zip(model.graph.initializer, marks, strict=True):
-        start = data.index(mark, start)  # they were written in this order
-        places[constant.name] = start, list(constant.dims)
-        data[start : start + len(mark)] = bytes(len(mark))
-        start += len(mark)
-    # Messages of this format are joined by writing one behind the other.
-    listed = onnx.StringStringEntryProto(key=WEIGHTS, value=json.dumps(places))
-    return bytes(data) + onnx.ModelProto(metadata_props=[listed]).SerializeToString()
+    return program.getvalue()

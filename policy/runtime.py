@@ -5,20 +5,18 @@ at the actor anyway.
 """
 
 import hashlib
-import json
-import math
-from typing import Any, Protocol, cast
+import os
+from typing import Any, Protocol
 
 import numpy as np
 import onnxruntime
 
+from policy.constants import with_constants
 from policy.sampling import greedy_categorical, sample_categorical
 
 OBSERVATIONS, STATE = "observations", "state"
 LOGITS, NEXT_STATE = "logits", "next_state"
-WEIGHTS = "weights"  # in a program's metadata: {name: [offset, shape]} of the weights that are constants of it
-
-_MAX_STATE = 65_536
+_MAX_STATE_SIZE = 1 << 16
 
 
 class PolicyError(Exception):
@@ -30,11 +28,14 @@ class PolicyRuntime(Protocol):
 
     @property
     def state_size(self) -> int:
-        """S, how many numbers the policy remembers from row to row; 0 without a memory."""
+        """S, how many numbers the policy remembers from row to row; 0 for most."""
         ...
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
-        """Binds weights for all later calls; raises PolicyError if they do not fit."""
+        """Binds weights for all later calls; raises PolicyError if they do not fit.
+
+        They are not copied: whoever gives them away does not change them any more.
+        """
         ...
 
     def act(
@@ -44,10 +45,11 @@ class PolicyRuntime(Protocol):
 
         Args:
           observations: [E, *stacked_shape].
-          state: [E, S] float32, what is remembered; zeros where an episode starts.
+          state: [E, S] float32, the policy's memory before this row, zeros where an episode starts.
           random: source of the samples, or None for greedy actions.
 
-        Returns: actions [E] int64, their log-probabilities [E] float32, and the next state [E, S] float32.
+        Returns: actions [E] int64, their log-probabilities [E] float32, and the state [E, S] float32 for the
+        next row.
         """
         ...
 
@@ -60,23 +62,26 @@ def program_hash(model: bytes) -> str:
 class OnnxRuntime:
     """Runs a program with onnxruntime on one thread.
 
-    Weights are fed as inputs with every call, or, where the program has them as constants, make a new session with
-    every `load`: that takes 10 ms, and convolutions of constants half the time.
+    Weights are fed as inputs with every call, which costs less than anything that could be done beforehand; except
+    where there are convolutions: their program is made anew with the weights of each snapshot as constants.
     """
 
     def __init__(self, model: bytes) -> None:
-        """Raises PolicyError if the program cannot be run or is not one of ours."""
+        """Raises PolicyError if it is no program."""
+        self._model = model
         self._session = _session(model)
         inputs = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
-        outputs = [entry.name for entry in self._session.get_outputs()]
-        recurrent = STATE in inputs
-        if OBSERVATIONS not in inputs or outputs != ([LOGITS, NEXT_STATE] if recurrent else [LOGITS]):
-            raise PolicyError(f"the program must turn {OBSERVATIONS!r} into {LOGITS!r}")
-        self._state_size = _state_size(inputs.pop(STATE)) if recurrent else 0
+        outputs = {entry.name: entry.type for entry in self._session.get_outputs()}
+        ends = [LOGITS, NEXT_STATE] if STATE in inputs else [LOGITS]
+        if OBSERVATIONS not in inputs or list(outputs) != ends or set(outputs.values()) != {"tensor(float)"}:
+            raise PolicyError(
+                f"the program must turn {OBSERVATIONS!r} into {LOGITS!r}, and {STATE!r} into {NEXT_STATE!r} "
+                "if it has a memory"
+            )
         del inputs[OBSERVATIONS]
-        self._places = _places(self._session, len(model))
-        self._model = bytearray(model) if self._places else bytearray()
-        self._shapes = {**inputs, **{name: shape for name, (_, shape) in self._places.items()}}
+        self._state_size = _state_size(inputs.pop(STATE)) if STATE in inputs else 0
+        self._shapes = inputs
+        self._convolutional = any(len(shape) > 2 for shape in inputs.values())
         self._feed: dict[str, np.ndarray] = {}
 
     @property
@@ -94,25 +99,37 @@ class OnnxRuntime:
         for name, shape in self._shapes.items():
             if name not in weights:
                 raise PolicyError(f"the snapshot lacks the weights {name!r} of its program")
-            if weights[name].shape != shape or weights[name].dtype != np.float32:
-                raise PolicyError(f"weights {name!r} are {weights[name].shape}, the program wants {shape}")
-        for name, (start, _) in self._places.items():
-            self._model[start : start + weights[name].nbytes] = weights[name].astype("<f4", copy=False).tobytes()
-        if self._places:
-            self._session = _session(bytes(self._model))
-        self._feed = {name: weights[name] for name in self._shapes if name not in self._places}
+            given = weights[name]
+            if given.shape != shape or given.dtype != np.float32:
+                raise PolicyError(
+                    f"weights {name!r} are {given.dtype} {given.shape}, the program wants float32 {shape}"
+                )
+        bound = {name: weights[name] for name in self._shapes}
+        if self._convolutional:
+            self._session = _session(with_constants(self._model, bound))
+        else:
+            self._feed = bound
 
     def act(
         self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PolicyRuntime."""
+        """See PolicyRuntime. Raises PolicyError if the program fails, or does not make what it should."""
         self._feed[OBSERVATIONS] = observations
         if self._state_size:
             self._feed[STATE] = state
-        results = cast(list[np.ndarray], self._session.run(None, self._feed))
-        logits = results[0]  # [E, A]
+        try:
+            outputs: Any = self._session.run(None, self._feed)
+        except Exception as error:  # onnxruntime's exceptions share no base of their own
+            raise PolicyError(f"the program failed: {_first_line(error)}") from None
+        logits = outputs[0]  # [E, A]
+        if logits.ndim != 2 or logits.shape[0] != len(observations) or not logits.shape[1]:
+            raise PolicyError(f"the program makes {LOGITS!r} {logits.shape} of {len(observations)} observations")
+        if self._state_size:
+            if outputs[1].shape != state.shape:
+                raise PolicyError(f"the program makes {NEXT_STATE!r} {outputs[1].shape} of {STATE!r} {state.shape}")
+            state = outputs[1]
         actions, log_probs = greedy_categorical(logits) if random is None else sample_categorical(logits, random)
-        return actions, log_probs, results[1] if self._state_size else state
+        return actions, log_probs, state
 
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:
@@ -120,32 +137,21 @@ def _session(model: bytes) -> onnxruntime.InferenceSession:
     # An actor has a core at most; threads that spin would cost the learner its own.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3
+    options.log_severity_level = 4
+    # A model may name files to take weights from. None lie here: whoever sends a program shall not read with it.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     try:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise PolicyError(f"the program cannot be run: {str(error).splitlines()[0][:200]}") from None
+        raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
 
 
 def _state_size(shape: tuple[Any, ...]) -> int:
-    if len(shape) != 2 or not isinstance(shape[1], int) or not 1 <= shape[1] <= _MAX_STATE:
-        raise PolicyError(f"the program's {STATE!r} must be [rows, 1 to {_MAX_STATE}], not {list(shape)}")
-    return shape[1]
+    match shape:
+        case (_, int(size)) if 0 < size <= _MAX_STATE_SIZE:
+            return size
+    raise PolicyError(f"the program's {STATE!r} is {shape}, it must be [rows, S] with S from 1 to {_MAX_STATE_SIZE}")
 
 
-def _places(session: onnxruntime.InferenceSession, size: int) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Offset and shape of the weights that are constants of a program of `size` bytes; none where they are inputs."""
-    listed = session.get_modelmeta().custom_metadata_map.get(WEIGHTS)
-    if listed is None:
-        return {}
-    try:
-        places = {
-            str(name): (int(start), tuple(int(side) for side in shape))
-            for name, (start, shape) in json.loads(listed).items()
-        }
-    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
-        raise PolicyError("the program's list of weights cannot be read") from None
-    for name, (start, shape) in places.items():
-        if start < 0 or min(shape, default=1) < 0 or start + 4 * math.prod(shape) > size:
-            raise PolicyError(f"the program's weights {name!r} do not lie within it")
-    return places
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from policy.errors import NetworkError
 from policy.network import ActorCritic
 from policy.runtime import PolicyError
 from policy.sampling import greedy_categorical, sample_categorical
@@ -13,11 +14,15 @@ class TorchRuntime:
     """Runs the network with torch on one thread."""
 
     def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raises PolicyError for a network that is the user's own: its name came over the wire, and is not imported."""
+        """Raises PolicyError if this network cannot be built, or may not be built here."""
         if ":" in spec.encoder:
-            raise PolicyError(f"the network {spec.encoder} is the user's own: use --runtime onnx")
+            # The name came over the wire; importing it would execute what somebody else chose.
+            raise PolicyError(f"the encoder {spec.encoder!r} is the user's own: use --runtime onnx")
         torch.set_num_threads(1)
-        self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
+        try:
+            self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
+        except NetworkError as error:
+            raise PolicyError(str(error)) from None
         self._parameters = dict(self._network.named_parameters())
         self._acting = [name for name in self._parameters if not name.startswith("value_head")]
 
@@ -46,6 +51,6 @@ class TorchRuntime:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime."""
         logits, next_state = self._network.act(torch.from_numpy(observations), torch.from_numpy(state))
-        chosen = greedy_categorical if random is None else lambda logits: sample_categorical(logits, random)
-        actions, log_probs = chosen(logits.numpy())
-        return actions, log_probs, next_state.numpy()
+        choose = logits.numpy()
+        actions, log_probs = greedy_categorical(choose) if random is None else sample_categorical(choose, random)
+        return actions, log_probs, next_state.numpy() if self.state_size else state

@@ -60,7 +60,7 @@ def test_nothing_that_executes_what_it_reads_is_used(package: str) -> None:
     ("module", "absent"),
     [
         ("actor.__main__", {"torch", "learner", "launch"}),
-        ("actor.evaluator", {"torch", "learner", "launch", "zenoh"}),
+        ("actor.evaluate", {"torch", "learner", "launch", "zenoh"}),
         ("learner.__main__", {"torch", "actor", "launch", "gymnasium"}),
         ("launch.train", {"torch", "actor", "gymnasium", "zenoh", "onnxruntime"}),
         ("protocol.codec", {"torch", "zenoh", "policy"}),

@@ -71,7 +71,6 @@ def test_rewards_are_true() -> None:
         (_spec("Pong", patience=3), "does not do environment.patience: .*--set environment.backend=gymnasium"),
         (_spec("Pong", crop=(1, 1, 1, 1)), "does not do environment.crop"),
         (_spec("Pong", action_table=((1.0,), (2.0,))), "does not do environment.action_table"),
-        (_spec("Pong", processes=True), "does not do environment.processes"),
     ],
 )
 def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:

@@ -111,8 +111,8 @@ def test_observations_that_do_not_travel_are_named() -> None:
 
 @pytest.mark.parametrize("backend", ["envpool", "ale"])
 def test_what_only_gymnasium_does_is_refused(backend: Literal["envpool", "ale"]) -> None:
-    with pytest.raises(UnplayableError, match=f"backend={backend} does not do wrap and environment.processes"):
-        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend, processes=True), 1, wrap="module:function")
+    with pytest.raises(UnplayableError, match=f"backend={backend} does not do wrap"):
+        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, wrap="module:function")
     with pytest.raises(UnplayableError, match="does not do render_mode"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, render_mode="human")
 

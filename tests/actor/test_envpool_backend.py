@@ -2,11 +2,14 @@
 
 import sys
 import warnings
+from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 
 from actor.environments import UnplayableError, make_environments
+from actor.envpool_backend import EnvpoolEnvironments
 from protocol.spec import EnvironmentSpec
 
 with warnings.catch_warnings():
@@ -91,6 +94,34 @@ def test_patience_is_counted_for_each_environment() -> None:
     environments.close()
     assert np.flatnonzero(cuts[:, 1]).tolist() == [4], "the first step earns the tile that it stands on"
     assert not cuts[:4, 0].any()
+
+
+class _ThreeSteps:
+    """A pool of one environment that gives nothing and terminates at its third step: the little of envpool needed."""
+
+    def make_spec(self, _name: str, **_options) -> SimpleNamespace:
+        space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
+        return SimpleNamespace(gymnasium_observation_space=space, gymnasium_action_space=gymnasium.spaces.Discrete(2))
+
+    def make_gymnasium(self, _name: str, **_options) -> "_ThreeSteps":
+        return self
+
+    def reset(self, _ids: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
+        self._steps = 0
+        return np.zeros((1, 1), np.float32), {}
+
+    def step(self, _actions: np.ndarray, _ids: np.ndarray) -> tuple:
+        self._steps += 1
+        return np.full((1, 1), self._steps), np.zeros(1), np.array([self._steps == 3]), np.array([False]), {}
+
+
+@pytest.mark.parametrize(("patience", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [], [1])])
+def test_an_end_of_the_environments_own_stays_one(patience: int, terminates: list, truncates: list) -> None:
+    environments = EnvpoolEnvironments(_ThreeSteps(), "x", {"num_envs": 1}, patience=patience)
+    environments.reset(1)
+    rows = [environments.step(np.zeros(1, np.int64)) for _ in range(3)]
+    assert [row for row, (_, _, terminated, _) in enumerate(rows) if terminated[0]] == terminates
+    assert [row for row, (_, _, _, truncated) in enumerate(rows) if truncated[0]] == truncates
 
 
 def test_car_racing_has_a_thousand_frames() -> None:

@@ -9,11 +9,11 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from picture_environment import Picture
 
 from actor.environment_processes import EnvironmentProcesses
 from actor.environments import UnplayableError, VectorEnvironment, make_environments
 from actor.gymnasium_backend import MakeOne, RepeatedSteps
-from picture_environment import Picture
 from protocol.spec import EnvironmentSpec
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5

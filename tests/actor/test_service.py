@@ -3,6 +3,7 @@
 import queue
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -23,16 +24,30 @@ SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
 )
 SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
-NETWORK = ActorCritic(PolicySpec(), SPACES)
-MODEL = export_program(NETWORK, SPACES.observation)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a learner of it would send."""
+
+    network: ActorCritic
+    model: bytes
+
+    @classmethod
+    def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
+        network = ActorCritic(spec, spaces)
+        return cls(network, export_program(network, spaces.observation))
+
+
+POLICY = Policy.of(PolicySpec(), SPACES)
 
 
 class ScriptedLearner:
     """Answers joins and programs; hands every rollout to the test, which answers it."""
 
-    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1) -> None:
+    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY) -> None:
         self.transport = MemoryTransport(network)
-        self.epoch, self.spec = epoch, spec
+        self.epoch, self.spec, self.policy = epoch, spec, policy
         self.joins: queue.Queue[Join] = queue.Queue()
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
@@ -51,12 +66,14 @@ class ScriptedLearner:
         request.reply(encode(self.refusal or answer))
 
     def _program(self, request: Request) -> None:
-        request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
+        model = self.policy.model
+        request.reply(encode(Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))))
 
     def publish(self, version: int, *, push: bool = True) -> None:
-        weights = {name: parameter.detach().numpy() for name, parameter in NETWORK.named_parameters()}
+        weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}
+        name = program_hash(self.policy.model)
         self.snapshot = encode(
-            Snapshot(learner_epoch=self.epoch, policy_version=version, program=program_hash(MODEL), weights=weights)
+            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights)
         )
         if push:
             self.transport.publish(keys.snapshots("r"), self.snapshot)
@@ -129,6 +146,31 @@ def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNe
     assert learner.receive()[0].identity.sequence == 2
 
 
+def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
+    policy = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
+    environment = SPEC.environment.model_copy(update={"frame_stack": 3})
+    spec = SPEC.model_copy(update={"environment": environment, "policy": policy})
+    spaces = SPACES.model_copy(update={"observation": SPACES.observation.model_copy(update={"frames": 3})})
+    learner = ScriptedLearner(network, spec, policy=Policy.of(policy, spaces))
+    actor = RunningActor(network)
+    learner.publish(0)
+    received = []
+    for _ in range(2):
+        rollout, request = learner.receive()
+        acknowledge(request, "accepted")
+        received.append(rollout)
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+    assert [learner.joins.get(timeout=LIMIT).spaces for _ in range(2)] == [None, spaces]
+    first, second = received
+    assert first.frames.shape == second.frames.shape == (3 + 4, 2, 4)
+    np.testing.assert_array_equal(first.frames[4:], second.frames[:3])
+    assert first.initial_state.shape == (2, 5)
+    assert not first.initial_state.any()
+    assert second.initial_state.any()
+
+
 def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
@@ -137,7 +179,7 @@ def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, act
     acknowledge(request, "busy")
     again, _ = learner.receive()
     assert again.identity == rollout.identity
-    np.testing.assert_array_equal(again.observations, rollout.observations)
+    np.testing.assert_array_equal(again.frames, rollout.frames)
 
 
 def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:

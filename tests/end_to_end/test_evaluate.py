@@ -15,15 +15,16 @@ import pytest
 import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
-from processes import Running
+from processes import Running, processes_mentioning
 
 import actor.evaluate
+import launch.train
 import policy.saved_policy
 from actor.environments import make_environments
 from actor.evaluate import main
 from learner.checkpoint import save_checkpoint
 from learner.learner import Learner
-from learner.run_directory import create, write_json
+from learner.run_directory import create, read_json, write_json
 from policy.runtime import OnnxRuntime
 from policy.saved_policy import best_checkpoint, best_name, checkpoints, read_policy
 from protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec, Spaces
@@ -228,6 +229,18 @@ def test_a_video_has_every_frame_of_the_environments_own(tmp_path: Path, evaluat
     assert evaluate(run, "--episodes", 1, "--seed", 2)["returns"] == result["returns"]
 
 
+def test_an_atari_game_of_another_backend_is_filmed_as_gymnasium_has_it(
+    tmp_path: Path, evaluate: Callable[..., dict]
+) -> None:
+    pong = EnvironmentSpec(id="Pong-v5", backend="envpool", action_repeat=4, grey=True, resize=(21, 21))
+    run = save(tmp_path / "run", pong.model_copy(update={"frame_stack": 4, "max_episode_steps": 40}), 1)
+    options = ("--episodes", 2, "--seed", 1)
+    there, here = evaluate(run, *options), evaluate(run, *options, "--video", tmp_path / "pong.mp4")
+    assert (there["environment"], here["environment"]) == ("Pong-v5", "ALE/Pong-v5")
+    assert here["lengths"] == there["lengths"] == [10, 10]
+    assert here["video_seconds"] == 2 * 41 / 60
+
+
 def test_a_gif_can_be_cut_and_the_score_is_not(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)
@@ -282,6 +295,36 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
     line = refused(1, "--pretrained", "cartpole")
     assert "no pretrained policy 'cartpole': did you mean cartpole-1? there are cartpole-1" in line
     assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
+
+
+# ------------------------------------------------------------------------------------------------ after training
+
+
+def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"final_episodes": 3, "final_backend": "envpool"}
+    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation=settings)
+    keep_best(run, 77.0, 4)
+    spec = read_policy(run / "checkpoints" / "0000000005").spec
+    write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
+    assert launch.train._evaluate(run, spec, None, threading.Event())
+    result = read_json(run / "summary.json")
+    evaluation = result["evaluation"]
+    assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
+    assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
+    assert result["evaluation_return_mean"] == evaluation["return_mean"]
+    launch.train._report(run, spec)
+    assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in capsys.readouterr().out
+
+
+def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
+    spec = read_policy(run / "checkpoints" / "0000000001").spec
+    stopping = threading.Event()
+    stopping.set()
+    assert not launch.train._evaluate(run, spec, None, stopping)
+    assert not processes_mentioning(str(run))
 
 
 # ------------------------------------------------------------------------------------------------ how it behaves

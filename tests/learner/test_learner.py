@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 from building import POLICY, RECURRENT, SPACES, join, make_rollout, make_rollouts, run_spec
-from oracles import Stream, lambda_return, vtrace, vtrace_advantage
-from torch import Tensor, nn
+from plain_learner import PlainLearner
+from torch import Tensor
 from torch.testing import assert_close
 
-from learner.batch import Batch
 from learner.checkpoint import load_checkpoint, save_checkpoint
 from learner.learner import METRICS, Learner
 from policy.network import ActorCritic
 from protocol.messages import Rollout
-from protocol.spec import PolicySpec, TrainingSpec
+from protocol.spec import ArraySpace, PolicySpec, TrainingSpec
 
 STEPS = 5
 
@@ -42,146 +41,6 @@ def assert_same(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> N
 
 
 # --------------------------------------------------------------------------- the update, written plainly
-
-
-Cell = tuple[int, int]  # row and environment
-Played = dict[Cell, Tensor]
-
-
-class PlainLearner:
-    """One row at a time where the learner has vectors, torch's modules where it has its own."""
-
-    def __init__(self, spec: TrainingSpec, policy: PolicySpec, start: dict[str, np.ndarray]) -> None:
-        self.spec = spec
-        self.network = ActorCritic(policy, SPACES)
-        self.network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
-        self.parameters = list(self.network.parameters())
-        self.adam = torch.optim.Adam(self.parameters, eps=spec.optimizer_epsilon)
-        self.squares = [torch.zeros_like(parameter) for parameter in self.parameters]
-
-    def step(self, batch: Batch, rate: float, bonus: float) -> dict[str, float]:
-        """All updates from a batch; the mean of what they measured."""
-        with torch.no_grad():
-            before, _, values = self._play_back(batch)
-        streams = [self._stream(batch, b, before, values) for b in range(batch.actions.shape[1])]
-        targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
-        measured = [self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
-        return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
-
-    def _parts(self, batch: Batch) -> list[list[Cell]]:
-        """The rows of each update, where nothing is shuffled."""
-        cells = [(t, b) for t, b in batch.valid.nonzero().tolist()]
-        if self.spec.algorithm != "appo":
-            return [cells]
-        if self.network.state_size:
-            columns = evenly(list(range(batch.actions.shape[1])), self.spec.minibatches)
-            parts = [[cell for cell in cells if cell[1] in part] for part in columns]
-        else:
-            parts = evenly(cells, self.spec.minibatches)
-        return parts * self.spec.passes
-
-    def _update(
-        self,
-        batch: Batch,
-        cells: list[Cell],
-        targets: dict[Cell, tuple[float, float]],
-        before: Played,
-        rate: float,
-        bonus: float,
-    ) -> dict[str, float]:
-        spec = self.spec
-        log_probs, entropies, values = self._play_back(batch)
-        advantages = torch.tensor([targets[cell][1] for cell in cells])
-        if spec.normalize_advantages:
-            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
-        predicted = torch.stack([values[cell] for cell in cells])
-        goals = torch.tensor([targets[cell][0] for cell in cells])
-        entropy = torch.stack([entropies[cell] for cell in cells]).mean()
-        ratios = torch.stack([(log_probs[cell] - before[cell]).exp() for cell in cells])
-        if spec.algorithm == "appo":
-            clipped = ratios.clip(1.0 - spec.clip_range, 1.0 + spec.clip_range)
-            policy_loss = -torch.minimum(ratios * advantages, clipped * advantages).mean()
-        else:
-            policy_loss = -(torch.stack([log_probs[cell] for cell in cells]) * advantages).mean()
-        criterion = nn.MSELoss() if spec.value_loss == "mse" else nn.HuberLoss()
-        value_loss = criterion(predicted, goals)
-        self.network.zero_grad()
-        (policy_loss + spec.value_coefficient * value_loss - bonus * entropy).backward()
-        norm = nn.utils.clip_grad_norm_(self.parameters, spec.max_gradient_norm)
-        self._descend(rate)
-        with torch.no_grad():
-            explained = 1.0 - (goals - predicted).var(correction=0) / goals.var(correction=0)
-        return {
-            "policy_loss": policy_loss.item(),
-            "value_loss": value_loss.item(),
-            "entropy": entropy.item(),
-            "explained_variance": explained.item(),
-            "gradient_norm": norm.item(),
-            "value_mean": predicted.mean().item(),
-            "clipped_fraction": ((ratios - 1.0).abs() > spec.clip_range).float().mean().item(),
-        }
-
-    def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
-        """Each environment on its own, as an actor steps it: log-probabilities, entropies, values [T+1] of its rows."""
-        log_probs, entropies, values = {}, {}, {}
-        rows, environments = batch.actions.shape
-        for b in range(environments):
-            state = batch.initial_state[b : b + 1]
-            for t in range(rows + 1):
-                if batch.starts[t, b]:
-                    state = torch.zeros_like(state)
-                seen = batch.observations[t, b : b + 1]
-                _, value = self.network(seen.unsqueeze(0), state, torch.zeros(1, 1, dtype=torch.bool))
-                logits, state = self.network.act(seen, state)
-                values[t, b] = value.squeeze()
-                if t < rows:
-                    policy = torch.distributions.Categorical(logits=logits[0])
-                    log_probs[t, b] = policy.log_prob(batch.actions[t, b])
-                    entropies[t, b] = policy.entropy()
-        return log_probs, entropies, values
-
-    @staticmethod
-    def _stream(batch: Batch, b: int, log_probs: Played, values: Played) -> Stream:
-        """The rows of an environment in the papers' terms."""
-        rows = range(len(batch.actions))
-        return Stream(
-            r=batch.rewards[:, b].tolist(),
-            V=[values[t, b].item() for t in range(len(batch.actions) + 1)],
-            log_ratios=[(log_probs[t, b] - batch.behaviour_log_probs[t, b]).item() for t in rows],
-            terminated=batch.terminated[:, b].tolist(),
-            truncated=batch.truncated[:, b].tolist(),
-            valid=batch.valid[:, b].tolist(),
-        )
-
-    def _targets(self, x: Stream, t: int) -> tuple[float, float]:
-        spec = self.spec
-        gamma, lam = spec.discount_factor, spec.trace_lambda
-        if spec.algorithm in ("impala", "appo"):
-            clips = (spec.rho_clip, spec.trace_clip)
-            return vtrace(x, gamma, lam, *clips, t), vtrace_advantage(x, gamma, lam, *clips, t)
-        goal = lambda_return(x, gamma, lam, t)
-        return goal, goal - x.V[t]
-
-    def _descend(self, rate: float) -> None:
-        if self.spec.optimizer == "adam":
-            self.adam.param_groups[0]["lr"] = rate
-            self.adam.step()
-            return
-        decay, epsilon = self.spec.rmsprop_decay, self.spec.optimizer_epsilon
-        with torch.no_grad():
-            for parameter, square in zip(self.parameters, self.squares, strict=True):
-                assert parameter.grad is not None
-                square.copy_(decay * square + (1.0 - decay) * parameter.grad**2)
-                parameter -= rate * parameter.grad / (square + epsilon).sqrt()
-
-
-def evenly(items: list[Any], count: int) -> list[list[Any]]:
-    """`count` parts in order, the first ones longer by one where it does not come out even."""
-    size, longer = divmod(len(items), count)
-    lengths = [size + 1] * longer + [size] * (count - longer)
-    ends = np.cumsum(lengths)
-    return [items[end - length : end] for end, length in zip(ends, lengths, strict=True)]
-
 
 KINDS = {
     "a2c": {"algorithm": "a2c", "trace_lambda": 0.9, "max_gradient_norm": 0.1},
@@ -404,6 +263,37 @@ def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
     learner = make_learner(algorithm="a2c", discount_factor=0.0)
     learner.step([rollout], 0.0)
     assert learner.take_metrics()["advantage_std"] == pytest.approx(rewards.std(), rel=1e-4)
+
+
+def test_action_counts_are_of_the_batches_since_they_were_last_taken() -> None:
+    learner = make_learner()
+    assert learner.take_action_counts() == [0] * 4
+    rollouts = make_rollouts(1) + make_rollouts(2)
+    learner.step(rollouts[:2], 0.0)
+    learner.step(rollouts[2:], 0.0)
+    actions = np.concatenate([rollout.actions.flatten() for rollout in rollouts])
+    assert learner.take_action_counts() == np.bincount(actions, minlength=4).tolist()
+    assert learner.take_action_counts() == [0] * 4
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"), [((2, 5), (2, 15)), ((2, 5, 1), (2, 15)), ((2, 5, 3), (2, 15, 3)), ((5,), None)]
+)
+def test_the_picture_is_the_stack_side_by_side_where_there_are_images(
+    shape: tuple[int, ...], size: tuple[int, ...] | None
+) -> None:
+    space = ArraySpace(shape=shape, dtype="uint8", frames=3)
+    learner = Learner(learner_spec(), POLICY, SPACES.model_copy(update={"observation": space}))
+    assert learner.take_picture() is None
+    frames = np.random.default_rng(0).integers(0, 256, (6 + 3, 3, *shape), np.uint8)
+    learner.step([make_rollout(frames=frames)], 0.0)
+    picture = learner.take_picture()
+    if size is None:
+        assert picture is None
+        return
+    assert picture is not None
+    np.testing.assert_array_equal(picture, np.concatenate(list(frames[:3, 0]), axis=1).reshape(size))
+    assert learner.take_picture() is None
 
 
 # --------------------------------------------------------------------------------------------- restarts

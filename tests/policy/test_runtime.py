@@ -1,65 +1,32 @@
 """The two runtimes hold each other to the same actions; faults of programs and weights are PolicyErrors."""
 
+import os
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper
+from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
-from policy.network import ActorCritic
+from policy.constants import with_constants
 from policy.program import export_program
-from policy.runtime import LOGITS, OBSERVATIONS, OnnxRuntime, PolicyError, PolicyRuntime, program_hash
+from policy.runtime import (
+    LOGITS,
+    NEXT_STATE,
+    OBSERVATIONS,
+    STATE,
+    OnnxRuntime,
+    PolicyError,
+    PolicyRuntime,
+    program_hash,
+)
 from policy.torch_runtime import TorchRuntime
-from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
+from protocol.spec import PolicySpec
 
-Weights = dict[str, np.ndarray]
-
-
-class Policy(NamedTuple):
-    """A network in all its forms."""
-
-    network: ActorCritic
-    spec: PolicySpec
-    spaces: Spaces
-    program: bytes
-
-    def weights(self, seed: int = 0) -> Weights:
-        """Weights that make for decided policies, the value head's among them."""
-        random = np.random.default_rng(seed)
-        named = self.network.named_parameters()
-        return {name: random.normal(0, 0.5, tuple(p.shape)).astype(np.float32) for name, p in named}
-
-    def acting_names(self) -> set[str]:
-        return {name for name, _ in self.network.named_parameters() if not name.startswith("value_head")}
-
-    def observations(self, count: int, seed: int = 1) -> np.ndarray:
-        random, space = np.random.default_rng(seed), self.spaces.observation
-        if space.dtype == "uint8":
-            return random.integers(0, 256, (count, *space.shape), np.uint8)
-        return random.normal(size=(count, *space.shape)).astype(np.float32)
-
-    def runtimes(self) -> tuple[PolicyRuntime, PolicyRuntime]:
-        return OnnxRuntime(self.program), TorchRuntime(self.spec, self.spaces)
-
-
-def make_policy(hidden: tuple[int, ...], activation: str, shape: tuple[int, ...], dtype: str, actions: int) -> Policy:
-    spec = PolicySpec.model_validate({"hidden": hidden, "activation": activation})
-    observation = ArraySpace.model_validate({"shape": shape, "dtype": dtype})
-    spaces = Spaces(observation=observation, action=ChoiceSpace(count=actions))
-    network = ActorCritic(spec, spaces)
-    return Policy(network, spec, spaces, export_program(network, observation))
-
-
-POLICIES: dict[str, tuple[tuple[int, ...], str, tuple[int, ...], str, int]] = {
-    "tanh": ((64, 64), "tanh", (4,), "float32", 2),
-    "relu": ((32,), "relu", (8,), "float32", 6),
-    "planes": ((16, 8, 16), "relu", (2, 3, 4), "float32", 3),
-    "bytes": ((24, 24), "tanh", (5, 5), "uint8", 4),
-    "one action": ((3,), "tanh", (1,), "float32", 1),
-}
+NO_STATE = np.zeros((1, 0), np.float32)
 
 
 @pytest.fixture(scope="module", params=POLICIES)
@@ -69,7 +36,7 @@ def policy(request: pytest.FixtureRequest) -> Policy:
 
 @pytest.fixture(scope="module")
 def one_policy() -> Policy:
-    return make_policy(*POLICIES["tanh"])
+    return make_policy(*CARTPOLE)
 
 
 @pytest.fixture(params=[0, 1], ids=["onnx", "torch"])
@@ -85,50 +52,86 @@ def generator() -> np.random.Generator:
 
 
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
-@pytest.mark.parametrize("rows", [1, 256])
+@pytest.mark.parametrize("rows", [1, 17])
 def test_both_runtimes_act_alike(policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]) -> None:
-    results = []
+    both = policy.runtimes()
+    for seed in (0, 1):  # also when weights follow weights
+        results = []
+        for runtime in both:
+            runtime.load(policy.weights(seed))
+            results.append(runtime.act(policy.observations(rows), policy.states(rows), random()))
+        (actions, log_probs, state), (torch_actions, torch_log_probs, torch_state) = results
+        assert (actions.shape, actions.dtype) == ((rows,), np.int64)
+        assert (log_probs.shape, log_probs.dtype) == ((rows,), np.float32)
+        assert (state.shape, state.dtype) == ((rows, policy.network.state_size), np.float32)
+        np.testing.assert_array_equal(actions, torch_actions)
+        np.testing.assert_allclose(log_probs, torch_log_probs, atol=2e-5, rtol=0)
+        np.testing.assert_allclose(state, torch_state, atol=2e-5, rtol=0)
+
+
+def test_the_state_comes_back_to_what_it_was_made_from(policy: Policy) -> None:
+    rows = 5
     for runtime in policy.runtimes():
         runtime.load(policy.weights())
-        results.append(runtime.act(policy.observations(rows), random()))
-    (actions, log_probs), (torch_actions, torch_log_probs) = results
-    assert (actions.shape, actions.dtype) == ((rows,), np.int64)
-    assert (log_probs.shape, log_probs.dtype) == ((rows,), np.float32)
-    np.testing.assert_array_equal(actions, torch_actions)
-    np.testing.assert_allclose(log_probs, torch_log_probs, atol=1e-5, rtol=0)
+        given = policy.states(rows)
+        before = given.copy()
+        _, log_probs, state = runtime.act(policy.observations(rows), given, None)
+        _, again, _ = runtime.act(policy.observations(rows), state, None)
+        np.testing.assert_array_equal(given, before)
+        if policy.network.state_size:
+            assert runtime.state_size == policy.spec.memory_units
+            assert (state != before).any()
+            assert (log_probs != again).any()
+        else:
+            assert runtime.state_size == 0
+            assert state is given
 
 
 def test_acting_is_the_policy_half_of_learning(policy: Policy) -> None:
-    weights = policy.weights()
-    policy.network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
-    observations = policy.observations(64)
+    rows, weights = 16, policy.weights()
+    policy.load(weights)
+    observations, states = policy.observations(rows), policy.states(rows)
     with torch.no_grad():
-        logits, values = policy.network(torch.from_numpy(observations))
-    assert (logits.shape, values.shape) == ((64, policy.spaces.action.count), (64,))
+        logits, values = policy.network(
+            torch.from_numpy(observations)[None], torch.from_numpy(states), torch.zeros(1, rows, dtype=torch.bool)
+        )
+    assert (logits.shape, values.shape) == ((1, rows, policy.spaces.action.count), (1, rows))
+    assert (logits.std() > 0.05) | (policy.spaces.action.count == 1)  # what follows can fail
     for runtime in policy.runtimes():
         runtime.load(weights)
-        actions, log_probs = runtime.act(observations, generator())
-        expected = logits.log_softmax(-1).numpy()[np.arange(64), actions]
-        np.testing.assert_allclose(log_probs, expected, atol=1e-5, rtol=0)
+        actions, log_probs, _ = runtime.act(observations, states, generator())
+        expected = logits[0].log_softmax(-1).numpy()[np.arange(rows), actions]
+        np.testing.assert_allclose(log_probs, expected, atol=2e-5, rtol=0)
 
 
 def test_samples_follow_the_generator_alone(runtime: PolicyRuntime, one_policy: Policy) -> None:
     runtime.load(one_policy.weights())
     observations = one_policy.observations(256)
-    first, again, other = (runtime.act(observations, np.random.default_rng(seed))[0] for seed in (5, 5, 6))
+    first, again, other = (runtime.act(observations, NO_STATE, np.random.default_rng(seed))[0] for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
 
 def test_bytes_are_scaled_to_the_unit_interval() -> None:
-    policy = make_policy((4,), "relu", (1,), "uint8", 2)
+    policy = make_policy({"hidden": (4,), "activation": "relu"}, spaces((1,), actions=2))
     weights = {name: np.zeros_like(array) for name, array in policy.weights().items()}
     weights["encoder.layers.0.weight"][0, 0] = 1.0
     weights["policy_head.weight"][0, 0] = 1.0  # logits are (observation / 255, 0)
     for runtime in policy.runtimes():
         runtime.load(weights)
-        _, log_probs = runtime.act(np.array([[255], [0]], np.uint8), None)
+        _, log_probs, _ = runtime.act(np.array([[255], [0]], np.uint8), NO_STATE, None)
         np.testing.assert_allclose(log_probs, [-np.log1p(np.exp(-1)), -np.log(2)], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["my_module:Net", "os:system"])
+def test_torch_imports_no_module_that_the_wire_names(name: str) -> None:
+    with pytest.raises(PolicyError, match="use --runtime onnx"):
+        TorchRuntime(PolicySpec(encoder=name), spaces((84, 84)))
+
+
+def test_torch_refuses_a_network_that_is_not_for_the_space() -> None:
+    with pytest.raises(PolicyError, match="'nature'"):
+        TorchRuntime(PolicySpec(encoder="nature"), spaces((4,), "float32"))
 
 
 # ------------------------------------------------------------------------------------------ the program
@@ -142,14 +145,16 @@ def test_a_program_wants_the_acting_parameters_by_their_names(policy: Policy) ->
 
 def test_a_program_holds_no_weights(policy: Policy) -> None:
     graph = onnx.load_model_from_string(policy.program).graph
-    assert [entry.name for entry in graph.input if entry.name not in policy.acting_names()] == [OBSERVATIONS]
-    assert [entry.name for entry in graph.output] == [LOGITS]
+    inputs, outputs = ([OBSERVATIONS, STATE], [LOGITS, NEXT_STATE])
+    ends = 2 if policy.network.state_size else 1
+    assert [entry.name for entry in graph.input if entry.name not in policy.acting_names()] == inputs[:ends]
+    assert [entry.name for entry in graph.output] == outputs[:ends]
     assert not graph.initializer
-    assert len(policy.program) < 8192
+    assert len(policy.program) < 32_768
 
 
 def test_a_program_does_not_grow_with_its_network(one_policy: Policy) -> None:
-    wide = make_policy((1024, 1024), "tanh", (4,), "float32", 2)
+    wide = make_policy({"hidden": (1024, 1024)}, spaces((4,), "float32", actions=2))
     assert abs(len(wide.program) - len(one_policy.program)) < 64
 
 
@@ -159,26 +164,37 @@ def test_a_program_depends_on_the_architecture_and_not_on_the_weights(policy: Po
             torch.nn.init.normal_(parameter) if value is None else torch.nn.init.constant_(parameter, value)
         again = export_program(policy.network, policy.spaces.observation)
         assert program_hash(again) == program_hash(policy.program)
-    assert program_hash(make_policy((5,), "tanh", (2,), "float32", 2).program) != program_hash(policy.program)
+    assert program_hash(make_policy({"hidden": (5,)}, spaces((2,), "float32")).program) != program_hash(policy.program)
 
 
 def test_the_hash_of_a_program_is_sha256() -> None:
     assert program_hash(b"abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def other_program(inputs: tuple[str, ...], output: str) -> bytes:
-    """A model that adds its inputs up."""
-    entries = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [None, 2]) for name in inputs]
-    result = helper.make_tensor_value_info(output, TensorProto.FLOAT, [None, 2])
-    graph = helper.make_graph([helper.make_node("Sum", list(inputs), [output])], "other", entries, [result])
+Shapes = dict[str, list[int | None] | None]
+
+
+def model(nodes: list[onnx.NodeProto], inputs: Shapes, outputs: Shapes, *initializers: TensorProto) -> bytes:
+    """A model of float32 arrays."""
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in side.items()]
+        for side in (inputs, outputs)
+    ]
+    graph = helper.make_graph(nodes, "other", ends[0], ends[1], initializers)
     opset = helper.make_opsetid("", 17)
     return helper.make_model(graph, opset_imports=[opset], ir_version=8).SerializeToString()
+
+
+def other_program(inputs: tuple[str, ...], output: str) -> bytes:
+    """A model that adds its inputs up."""
+    node = helper.make_node("Sum", list(inputs), [output])
+    return model([node], {name: [None, 2] for name in inputs}, {output: [None, 2]})
 
 
 def test_a_program_from_elsewhere_runs_if_its_names_are_right() -> None:
     runtime = OnnxRuntime(other_program((OBSERVATIONS,), LOGITS))
     runtime.load({})
-    actions, _ = runtime.act(np.array([[1, 2], [2, 1]], np.float32), None)
+    actions, _, _ = runtime.act(np.array([[1, 2], [2, 1]], np.float32), NO_STATE, None)
     np.testing.assert_array_equal(actions, [1, 0])
 
 
@@ -186,6 +202,70 @@ def test_a_program_from_elsewhere_runs_if_its_names_are_right() -> None:
 def test_a_program_with_other_ends_is_refused(inputs: tuple[str, ...], output: str) -> None:
     with pytest.raises(PolicyError, match="must turn 'observations' into 'logits'"):
         OnnxRuntime(other_program(inputs, output))
+
+
+def remembering(state: list[int | None] | None, made_of_it: str = "Identity") -> bytes:
+    """A model with a memory of that shape."""
+    nodes = [
+        helper.make_node("Identity", [OBSERVATIONS], [LOGITS]),
+        helper.make_node(made_of_it, [STATE], [NEXT_STATE]),
+    ]
+    return model(nodes, {OBSERVATIONS: [None, 2], STATE: state}, {LOGITS: [None, 2], NEXT_STATE: None})
+
+
+def test_a_program_with_a_memory_says_how_much() -> None:
+    runtime = OnnxRuntime(remembering([None, 3]))
+    runtime.load({})
+    state = np.arange(6, dtype=np.float32).reshape(2, 3)
+    assert runtime.state_size == 3
+    np.testing.assert_array_equal(runtime.act(np.ones((2, 2), np.float32), state, None)[2], state)
+
+
+@pytest.mark.parametrize("shape", [[None, None], [None, 0], [None, 1 << 40], [3], [None, 3, 3], []])
+def test_a_memory_without_a_sensible_size_is_refused(shape: list[int | None]) -> None:
+    with pytest.raises(PolicyError, match=r"'state'|cannot be run"):
+        OnnxRuntime(remembering(shape))
+
+
+def test_a_memory_that_comes_out_in_another_shape_is_refused() -> None:
+    runtime = OnnxRuntime(remembering([None, 3], "Transpose"))
+    runtime.load({})
+    with pytest.raises(PolicyError, match=r"'next_state' \(3, 2\)"):
+        runtime.act(np.ones((2, 2), np.float32), np.zeros((2, 3), np.float32), None)
+
+
+@pytest.mark.parametrize("operation", ["Transpose", "Size", "Neg"])
+def test_outputs_that_are_no_logits_are_refused(operation: str) -> None:
+    kind = TensorProto.INT64 if operation == "Size" else TensorProto.FLOAT
+    result = helper.make_tensor_value_info(LOGITS, kind, None)
+    source = helper.make_tensor_value_info(OBSERVATIONS, TensorProto.FLOAT, [None, None])
+    graph = helper.make_graph([helper.make_node(operation, [OBSERVATIONS], [LOGITS])], "other", [source], [result])
+    program = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+    columns = 0 if operation == "Neg" else 3
+    with pytest.raises(PolicyError, match="'logits'"):
+        OnnxRuntime(program).act(np.ones((2, columns), np.float32), NO_STATE, None)
+
+
+def test_a_program_that_fails_while_it_acts_is_at_fault_itself(one_policy: Policy) -> None:
+    runtime = OnnxRuntime(one_policy.program)
+    with pytest.raises(PolicyError, match="the program failed"):  # nothing is loaded yet
+        runtime.act(one_policy.observations(1), NO_STATE, None)
+    runtime.load(one_policy.weights())
+    with pytest.raises(PolicyError, match="the program failed"):
+        runtime.act(np.zeros((1, 9), np.float32), NO_STATE, None)
+
+
+def test_a_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.arange(2, dtype=np.float32).tofile("secret")
+    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[2], data_location=TensorProto.EXTERNAL)
+    for key, value in (("location", "secret"), ("offset", "0"), ("length", "8")):
+        tensor.external_data.add(key=key, value=value)
+    node = helper.make_node("Max", [OBSERVATIONS, "w"], [LOGITS])
+    program = model([node], {OBSERVATIONS: [None, 2]}, {LOGITS: [None, 2]}, tensor)
+    with pytest.raises(PolicyError, match="External data path"):
+        OnnxRuntime(program)
+    assert os.listdir() == ["secret"]
 
 
 def test_a_program_whose_weights_have_no_fixed_shape_takes_none() -> None:
@@ -206,6 +286,32 @@ def test_a_program_cut_short_is_refused(one_policy: Policy) -> None:
             OnnxRuntime(one_policy.program[:length])
 
 
+# ---------------------------------------------------------------------------------------- the constants
+
+
+def test_constants_are_the_inputs_they_replace(policy: Policy) -> None:
+    weights = {name: array for name, array in policy.weights().items() if name in policy.acting_names()}
+    merged = onnx.load_model_from_string(with_constants(policy.program, weights))
+    assert {tensor.name for tensor in merged.graph.initializer} == policy.acting_names()
+    for tensor in merged.graph.initializer:
+        array = onnx.numpy_helper.to_array(tensor)
+        assert array.dtype == np.float32
+        np.testing.assert_array_equal(array, weights[tensor.name])
+    before = onnx.load_model_from_string(policy.program)
+    assert list(merged.graph.node) == list(before.graph.node)
+    assert list(merged.graph.input) == list(before.graph.input)
+
+
+def test_weights_of_convolutions_are_constants_and_others_are_fed(policy: Policy) -> None:
+    runtime = OnnxRuntime(policy.program)
+    runtime.load(policy.weights())
+    weights = policy.acting_names()
+    fed = {entry.name for entry in runtime._session.get_inputs()} & weights
+    assert fed == (set() if policy.network.convolutional else weights)
+    # What could be overridden, onnxruntime would not lay out beforehand.
+    assert not runtime._session.get_overridable_initializers()
+
+
 # ------------------------------------------------------------------------------------------ the weights
 
 
@@ -220,12 +326,12 @@ def test_every_acting_weight_is_needed_and_named(runtime: PolicyRuntime, one_pol
 def test_the_value_head_plays_no_part_in_acting(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations = one_policy.observations(32)
     runtime.load(one_policy.weights())
-    _, with_head = runtime.act(observations, None)
+    _, with_head, _ = runtime.act(observations, NO_STATE, None)
     acting = {name: array for name, array in one_policy.weights().items() if name in one_policy.acting_names()}
     runtime.load(acting)
-    np.testing.assert_array_equal(runtime.act(observations, None)[1], with_head)
+    np.testing.assert_array_equal(runtime.act(observations, NO_STATE, None)[1], with_head)
     runtime.load({**acting, "unheard.of": np.zeros(3, np.float32)})
-    np.testing.assert_array_equal(runtime.act(observations, None)[1], with_head)
+    np.testing.assert_array_equal(runtime.act(observations, NO_STATE, None)[1], with_head)
 
 
 @pytest.mark.parametrize("shape", [(64, 5), (63, 4), (4, 64), (256,), (64, 4, 1), (0, 4), ()])
@@ -244,23 +350,24 @@ def test_onnx_takes_float32_weights_alone(one_policy: Policy) -> None:
         OnnxRuntime(one_policy.program).load(weights)
 
 
-def test_refused_weights_leave_the_loaded_ones_in_force(runtime: PolicyRuntime, one_policy: Policy) -> None:
-    observations = one_policy.observations(64)
-    runtime.load(one_policy.weights())
-    _, before = runtime.act(observations, None)
-    with pytest.raises(PolicyError):
-        runtime.load(one_policy.weights(seed=2) | {"policy_head.bias": np.zeros(9, np.float32)})
-    np.testing.assert_array_equal(runtime.act(observations, None)[1], before)
+def test_refused_weights_leave_the_loaded_ones_in_force(policy: Policy) -> None:
+    observations, states = policy.observations(8), policy.states(8)
+    for runtime in policy.runtimes():
+        runtime.load(policy.weights())
+        _, before, _ = runtime.act(observations, states, None)
+        with pytest.raises(PolicyError):
+            runtime.load(policy.weights(seed=2) | {"policy_head.bias": np.zeros(9, np.float32)})
+        np.testing.assert_array_equal(runtime.act(observations, states, None)[1], before)
 
 
 def test_new_weights_change_what_is_done_and_old_ones_bring_it_back(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations, outputs = one_policy.observations(64), []
     for seed in (0, 1, 0):
         runtime.load(one_policy.weights(seed))
-        outputs.append(runtime.act(observations, generator()))
+        outputs.append(runtime.act(observations, NO_STATE, generator()))
     assert (outputs[0][1] != outputs[1][1]).any()
     assert (outputs[0][0] != outputs[1][0]).any()
-    np.testing.assert_array_equal(outputs[0], outputs[2])
+    np.testing.assert_array_equal(outputs[0][:2], outputs[2][:2])
 
 
 def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) -> None:
@@ -268,4 +375,4 @@ def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) ->
     for array in weights.values():
         array.flags.writeable = False
     runtime.load(weights)
-    runtime.act(one_policy.observations(2), None)
+    runtime.act(one_policy.observations(2), NO_STATE, None)

@@ -1,0 +1,69 @@
+"""A task that only a policy with a memory can solve, and pixels with a memory, by real processes over a real router."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cue_environment
+import pytest
+from processes import Running, until
+
+Start = Callable[..., Running]
+SETTINGS = (
+    "policy.memory_units=32",
+    "policy.hidden=[32]",
+    "training.target_return=0.95",
+    "training.learning_rate=0.003",
+    "training.trace_lambda=0.95",
+    "collection.envs_per_actor=32",
+    "collection.rollout_length=12",  # two episodes and more: the memory starts anew within a rollout
+)
+
+
+@pytest.mark.parametrize(("memory", "status"), [("gru", 0), ("none", 3)])
+def test_a_cue_is_remembered_by_a_policy_with_a_memory_only(
+    start: Start, tmp_path: Path, memory: str, status: int
+) -> None:
+    shutil.copy(cue_environment.__file__, tmp_path)
+    options = [word for setting in (f"policy.memory={memory}", *SETTINGS) for word in ("--set", setting)]
+    running = start("train", "--env", "cue_environment:Cue-v0", "--env-steps", 200_000, "--run-dir", "run", *options)
+    assert running.wait() == status, running.output
+    evaluation = json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"]
+    assert evaluation > 0.9 if memory == "gru" else abs(evaluation) < 0.5
+
+
+def test_pixels_are_learned_from_evaluated_and_the_best_policy_kept(start: Start, tmp_path: Path) -> None:
+    """Stacked frames, convolutions with a memory, appo, and an evaluator beside the actors."""
+    (tmp_path / "pong.toml").write_text(
+        """
+        environment.id = "ALE/Pong-v5"
+        environment.backend = "ale"
+        environment.action_repeat = 4
+        environment.grey = true
+        environment.resize = [84, 84]
+        environment.frame_stack = 4
+        environment.max_episode_steps = 400
+        policy = {encoder = "nature", memory = "gru", memory_units = 32}
+        collection = {actors = 1, envs_per_actor = 4, rollout_length = 16}
+        training = {algorithm = "appo", env_steps = 1000000, passes = 2, minibatches = 2}
+        evaluation = {seconds = 0.2, episodes = 1, final_episodes = 2}
+        service = {log_seconds = 0.2}
+        """
+    )
+    running = start("train", "pong.toml", "--run-dir", "run")
+    running.expect(r"evaluation at [\d,]+ env_steps: -?\d+\.\d \+- 0\.0 over 1 episodes, the best so far")
+    until(lambda: running.output.count("evaluation at") >= 2)
+    running.process.terminate()
+    assert running.wait() == 1
+    with (tmp_path / "run" / "metrics.csv").open(newline="") as file:
+        evaluated = [row for row in csv.DictReader(file) if row["evaluation_return_mean"]]
+    assert evaluated
+    assert all(int(row["evaluation_env_steps"]) <= int(row["env_steps"]) for row in evaluated)
+    (best,) = (tmp_path / "run" / "checkpoints").glob("best_*")
+    score = max(float(row["evaluation_return_mean"]) for row in evaluated)
+    assert float(best.name.split("_")[1]) >= round(score, 1) - 0.05
+    played = start("evaluate", "run", "--episodes", 1, "--json")
+    assert played.wait() == 0, played.output
+    assert json.loads(played.output)["best_checkpoint"]

@@ -1,0 +1,151 @@
+"""learner/learner.py once more, written out plainly: one row of one environment at a time, in the papers' terms."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from building import SPACES
+from oracles import Stream, lambda_return, vtrace, vtrace_advantage
+from torch import Tensor, nn
+
+from learner.batch import Batch
+from policy.network import ActorCritic
+from protocol.spec import PolicySpec, TrainingSpec
+
+Cell = tuple[int, int]  # row and environment
+Played = dict[Cell, Tensor]
+
+
+class PlainLearner:
+    """One row at a time where the learner has vectors, torch's modules where it has its own."""
+
+    def __init__(self, spec: TrainingSpec, policy: PolicySpec, start: dict[str, np.ndarray]) -> None:
+        self.spec = spec
+        self.network = ActorCritic(policy, SPACES)
+        self.network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
+        self.parameters = list(self.network.parameters())
+        self.adam = torch.optim.Adam(self.parameters, eps=spec.optimizer_epsilon)
+        self.squares = [torch.zeros_like(parameter) for parameter in self.parameters]
+
+    def step(self, batch: Batch, rate: float, bonus: float) -> dict[str, float]:
+        """All updates from a batch; the mean of what they measured."""
+        with torch.no_grad():
+            before, _, values = self._play_back(batch)
+        streams = [self._stream(batch, b, before, values) for b in range(batch.actions.shape[1])]
+        targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
+        measured = [self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
+        return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
+
+    def _parts(self, batch: Batch) -> list[list[Cell]]:
+        """The rows of each update, where nothing is shuffled."""
+        cells = [(t, b) for t, b in batch.valid.nonzero().tolist()]
+        if self.spec.algorithm != "appo":
+            return [cells]
+        if self.network.state_size:
+            columns = evenly(list(range(batch.actions.shape[1])), self.spec.minibatches)
+            parts = [[cell for cell in cells if cell[1] in part] for part in columns]
+        else:
+            parts = evenly(cells, self.spec.minibatches)
+        return parts * self.spec.passes
+
+    def _update(
+        self,
+        batch: Batch,
+        cells: list[Cell],
+        targets: dict[Cell, tuple[float, float]],
+        before: Played,
+        rate: float,
+        bonus: float,
+    ) -> dict[str, float]:
+        spec = self.spec
+        log_probs, entropies, values = self._play_back(batch)
+        advantages = torch.tensor([targets[cell][1] for cell in cells])
+        if spec.normalize_advantages:
+            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        predicted = torch.stack([values[cell] for cell in cells])
+        goals = torch.tensor([targets[cell][0] for cell in cells])
+        entropy = torch.stack([entropies[cell] for cell in cells]).mean()
+        ratios = torch.stack([(log_probs[cell] - before[cell]).exp() for cell in cells])
+        if spec.algorithm == "appo":
+            clipped = ratios.clip(1.0 - spec.clip_range, 1.0 + spec.clip_range)
+            policy_loss = -torch.minimum(ratios * advantages, clipped * advantages).mean()
+        else:
+            policy_loss = -(torch.stack([log_probs[cell] for cell in cells]) * advantages).mean()
+        criterion = nn.MSELoss() if spec.value_loss == "mse" else nn.HuberLoss()
+        value_loss = criterion(predicted, goals)
+        self.network.zero_grad()
+        (policy_loss + spec.value_coefficient * value_loss - bonus * entropy).backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters, spec.max_gradient_norm)
+        self._descend(rate)
+        with torch.no_grad():
+            explained = 1.0 - (goals - predicted).var(correction=0) / goals.var(correction=0)
+        return {
+            "policy_loss": policy_loss.item(),
+            "value_loss": value_loss.item(),
+            "entropy": entropy.item(),
+            "explained_variance": explained.item(),
+            "gradient_norm": norm.item(),
+            "value_mean": predicted.mean().item(),
+            "clipped_fraction": ((ratios - 1.0).abs() > spec.clip_range).float().mean().item(),
+        }
+
+    def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
+        """Each environment on its own, as an actor steps it: log-probabilities, entropies, values [T+1] of its rows."""
+        log_probs, entropies, values = {}, {}, {}
+        rows, environments = batch.actions.shape
+        for b in range(environments):
+            state = batch.initial_state[b : b + 1]
+            for t in range(rows + 1):
+                if batch.starts[t, b]:
+                    state = torch.zeros_like(state)
+                seen = batch.observations[t, b : b + 1]
+                _, value = self.network(seen.unsqueeze(0), state, torch.zeros(1, 1, dtype=torch.bool))
+                logits, state = self.network.act(seen, state)
+                values[t, b] = value.squeeze()
+                if t < rows:
+                    policy = torch.distributions.Categorical(logits=logits[0])
+                    log_probs[t, b] = policy.log_prob(batch.actions[t, b])
+                    entropies[t, b] = policy.entropy()
+        return log_probs, entropies, values
+
+    @staticmethod
+    def _stream(batch: Batch, b: int, log_probs: Played, values: Played) -> Stream:
+        """The rows of an environment in the papers' terms."""
+        rows = range(len(batch.actions))
+        return Stream(
+            r=batch.rewards[:, b].tolist(),
+            V=[values[t, b].item() for t in range(len(batch.actions) + 1)],
+            log_ratios=[(log_probs[t, b] - batch.behaviour_log_probs[t, b]).item() for t in rows],
+            terminated=batch.terminated[:, b].tolist(),
+            truncated=batch.truncated[:, b].tolist(),
+            valid=batch.valid[:, b].tolist(),
+        )
+
+    def _targets(self, x: Stream, t: int) -> tuple[float, float]:
+        spec = self.spec
+        gamma, lam = spec.discount_factor, spec.trace_lambda
+        if spec.algorithm in ("impala", "appo"):
+            clips = (spec.rho_clip, spec.trace_clip)
+            return vtrace(x, gamma, lam, *clips, t), vtrace_advantage(x, gamma, lam, *clips, t)
+        goal = lambda_return(x, gamma, lam, t)
+        return goal, goal - x.V[t]
+
+    def _descend(self, rate: float) -> None:
+        if self.spec.optimizer == "adam":
+            self.adam.param_groups[0]["lr"] = rate
+            self.adam.step()
+            return
+        decay, epsilon = self.spec.rmsprop_decay, self.spec.optimizer_epsilon
+        with torch.no_grad():
+            for parameter, square in zip(self.parameters, self.squares, strict=True):
+                assert parameter.grad is not None
+                square.copy_(decay * square + (1.0 - decay) * parameter.grad**2)
+                parameter -= rate * parameter.grad / (square + epsilon).sqrt()
+
+
+def evenly(items: list[Any], count: int) -> list[list[Any]]:
+    """`count` parts in order, the first ones longer by one where it does not come out even."""
+    size, longer = divmod(len(items), count)
+    lengths = [size + 1] * longer + [size] * (count - longer)
+    ends = np.cumsum(lengths)
+    return [items[end - length : end] for end, length in zip(ends, lengths, strict=True)]

@@ -1,0 +1,255 @@
+"""learner/evaluations.py: what was played is kept until it is reported on, the best for good."""
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from building import EPOCH, SPACES, run_spec
+
+from learner.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from learner.evaluations import Evaluations
+from learner.metrics import COLUMNS
+from policy.saved_policy import best_checkpoint, checkpoints, read_policy
+from protocol.messages import Acknowledgement, EvaluationReport
+
+
+class Run:
+    """A run's directory, and the evaluations of one life of its learner."""
+
+    def __init__(self, directory: Path, epoch: int = EPOCH) -> None:
+        self.directory = directory
+        self.evaluations = Evaluations(directory, epoch)
+
+    def save(self, version: int, keep: int = 2) -> Path:
+        return save_checkpoint(
+            self.directory,
+            spec=run_spec(),
+            spaces=SPACES,
+            policy_version=version,
+            program=b"program",
+            parameters={"w": np.full(3, version, np.float32)},
+            state={},
+            counters={},
+            keep=keep,
+            also_keep=self.evaluations.kept,
+        )
+
+    def begin(self, version: int, evaluator: str = "e") -> Path:
+        directory = self.save(version)
+        self.evaluations.begin(evaluator, directory, version, 1000 * version)
+        return directory
+
+    def report(
+        self, version: int, *returns: float, evaluator: str = "e", epoch: int = EPOCH
+    ) -> tuple[Acknowledgement, str]:
+        return self.evaluations.report(
+            EvaluationReport(
+                evaluator=evaluator,
+                learner_epoch=epoch,
+                policy_version=version,
+                returns=np.array(returns, np.float32),
+                lengths=np.arange(1, len(returns) + 1, dtype=np.int32),
+            )
+        )
+
+    def play(self, version: int, *returns: float) -> str:
+        """One evaluation from its beginning to its end; what the user is told."""
+        self.begin(version)
+        answer, text = self.report(version, *returns)
+        assert answer.verdict == "accepted"
+        return text
+
+    @property
+    def names(self) -> list[str]:
+        return sorted(entry.name for entry in (self.directory / "checkpoints").iterdir())
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------------- the best
+
+
+def test_the_first_is_the_best_and_kept_under_its_score(run: Run) -> None:
+    assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.3 +- 1.2 over 3 episodes, the best so far"
+    assert run.names == ["0000000007", "best_2.3_0000000007"]
+    best = best_checkpoint(run.directory)
+    assert best is not None
+    assert read_policy(best).policy_version == 7
+    assert load_checkpoint(best).policy.weights["w"].tolist() == [7.0] * 3
+
+
+def test_a_better_one_takes_its_place_and_a_worse_one_does_not(run: Run) -> None:
+    texts = [run.play(version, score) for version, score in ((1, 5.0), (2, 4.0), (3, 9.0), (4, -1.0))]
+    assert [text.endswith("the best so far") for text in texts] == [True, False, True, False]
+    assert run.names == ["0000000003", "0000000004", "best_9.0_0000000003"]
+
+
+def test_scores_below_0_are_compared_as_numbers(run: Run) -> None:
+    for version, score in ((1, -20.5), (2, -3.0), (3, -10.0)):
+        run.play(version, score)
+    assert run.names[-1] == "best_-3.0_0000000002"
+
+
+def test_the_best_outlives_the_checkpoint_that_it_was(run: Run) -> None:
+    run.play(1, 5.0)
+    for version in (2, 3, 4):
+        run.save(version)
+    assert run.names == ["0000000003", "0000000004", "best_5.0_0000000001"]
+    best = best_checkpoint(run.directory)
+    assert best is not None
+    assert load_checkpoint(best).policy.weights["w"].tolist() == [1.0] * 3
+
+
+def test_the_best_is_no_checkpoint_to_go_on_from(run: Run) -> None:
+    run.play(1, 5.0)
+    run.save(2)
+    assert [path.name for path in checkpoints(run.directory)] == ["0000000002", "0000000001"]
+    assert load_newest(run.directory, lambda _: None).policy.policy_version == 2
+
+
+def test_a_resumed_run_knows_its_best(run: Run) -> None:
+    run.play(1, 5.0)
+    resumed = Run(run.directory, EPOCH + 1)
+    resumed.begin(2)
+    answer, text = resumed.report(2, 4.0, epoch=EPOCH + 1)
+    assert answer.verdict == "accepted"
+    assert "best" not in text
+    assert "best_5.0_0000000001" in run.names
+
+
+@pytest.mark.parametrize(("first", "second"), [(5.01, 5.04), (5.04, 5.01), (5.0, 5.0)])
+def test_a_score_that_rounds_to_the_best_is_no_better(run: Run, first: float, second: float) -> None:
+    """Two evaluators of one version among them: the name is taken, and what is kept is the same."""
+    for evaluator in ("e", "f"):
+        run.begin(1, evaluator)
+    assert "the best so far" in run.report(1, first)[1]
+    answer, text = run.report(1, second, evaluator="f")
+    assert answer.verdict == "accepted"
+    assert "best" not in text
+    assert run.names == ["0000000001", "best_5.0_0000000001"]
+
+
+def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.play(1, 5.0)
+    run.begin(2)
+
+    def refusing(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", refusing)
+    answer, text = run.report(2, 9.0)
+    monkeypatch.undo()
+    assert answer.verdict == "accepted"
+    assert text.endswith("the best so far, but it could not be kept (No space left on device)")
+    best = best_checkpoint(run.directory)
+    assert best is not None
+    assert best.name == "best_5.0_0000000001"
+    run.save(3)
+    assert not [name for name in run.names if name.startswith(".")]  # what was half done is cleared away
+    assert "the best so far" in run.play(4, 9.0)
+    assert run.names[-1] == "best_9.0_0000000004"
+
+
+# ---------------------------------------------------------------------------------------------- what is kept
+
+
+def test_what_is_being_played_is_not_pruned(run: Run) -> None:
+    played = run.begin(1)
+    for version in range(2, 7):
+        run.save(version)
+    assert run.names == ["0000000001", "0000000005", "0000000006"]
+    assert read_policy(played).policy_version == 1
+    run.report(1, 3.0)
+    run.save(7)
+    assert run.names == ["0000000006", "0000000007", "best_3.0_0000000001"]
+
+
+def test_each_evaluator_plays_its_own(run: Run) -> None:
+    run.begin(1, "e")
+    run.begin(2, "f")
+    for version in range(3, 6):
+        run.save(version)
+    assert run.names[:2] == ["0000000001", "0000000002"]
+    assert run.report(2, 1.0, evaluator="e")[0].verdict == "rejected"
+    assert run.report(2, 1.0, evaluator="f")[0].verdict == "accepted"
+    assert run.report(1, 1.0, evaluator="e")[0].verdict == "accepted"
+
+
+def test_an_evaluator_that_asks_again_gives_up_what_it_played(run: Run) -> None:
+    run.begin(1)
+    run.begin(2)
+    run.save(3)
+    assert "0000000001" not in run.names
+    assert run.report(1, 9.0)[0].verdict == "rejected"
+    assert run.report(2, 3.0)[0].verdict == "accepted"
+
+
+# ---------------------------------------------------------------------------------------------- what is refused
+
+
+def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str, reason: str) -> None:
+    assert answer.verdict == verdict
+    assert reason in answer.reason
+    assert text == ""
+    assert best_checkpoint(run.directory) is None
+    assert run.evaluations.take_newest() == {}
+
+
+def test_an_evaluator_that_was_given_nothing_is_rejected(run: Run) -> None:
+    run.save(1)
+    assert_not_taken(run, *run.report(1, 9.0), "rejected", "'e' was not given version 1 to play")
+
+
+def test_another_version_is_rejected_and_the_right_one_still_awaited(run: Run) -> None:
+    run.begin(1)
+    assert_not_taken(run, *run.report(2, 9.0), "rejected", "was not given version 2")
+    assert run.report(1, 9.0)[0].verdict == "accepted"
+
+
+def test_a_report_counts_once(run: Run) -> None:
+    run.begin(1)
+    assert run.report(1, 3.0)[0].verdict == "accepted"
+    assert run.report(1, 9.0)[0].verdict == "rejected"
+    assert run.names[-1] == "best_3.0_0000000001"
+
+
+def test_another_life_of_the_learner_is_fenced(run: Run) -> None:
+    run.begin(1)
+    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another life")
+    assert run.report(1, 9.0)[0].verdict == "accepted"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_returns_that_are_not_finite_are_rejected(run: Run, value: float) -> None:
+    run.begin(1)
+    assert_not_taken(run, *run.report(1, 3.0, value), "rejected", "not finite")
+    assert run.report(1, 3.0)[0].verdict == "accepted"
+
+
+# -------------------------------------------------------------------------------------------------- metrics
+
+
+def test_the_newest_is_told_once_in_columns_of_the_metrics(run: Run) -> None:
+    assert run.evaluations.take_newest() == {}
+    run.play(1, 1.0)
+    run.play(2, 3.0, 5.0)
+    newest = run.evaluations.take_newest()
+    assert newest == {
+        "evaluation_return_mean": 4.0,
+        "evaluation_return_std": 1.0,
+        "evaluation_length_mean": 1.5,
+        "evaluation_env_steps": 2000,
+    }
+    assert set(newest) <= set(COLUMNS)
+    assert run.evaluations.take_newest() == {}
+
+
+def test_returns_too_large_to_add_up_as_float32_are_averaged(run: Run) -> None:
+    run.play(1, 3e38, 3e38)
+    assert run.evaluations.take_newest()["evaluation_return_mean"] == pytest.approx(3e38)

@@ -1,0 +1,149 @@
+"""A learner, an actor and an evaluator in one process, over the memory transport."""
+
+import csv
+import io
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import until
+
+from actor.evaluator import Evaluator
+from actor.service import ActorConfig, ActorService
+from learner.progress import Progress
+from learner.service import LearnerService
+from policy.saved_policy import best_checkpoint, best_score, checkpoints, read_policy
+from protocol.spec import RunSpec
+from protocol.transport import MemoryNetwork, MemoryTransport
+
+FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
+
+
+class House:
+    """What a run is made of, each on a thread of its own."""
+
+    def __init__(self, directory: Path, **sections: Any) -> None:
+        self.directory = directory / "run"
+        self.directory.mkdir()
+        self.spec = RunSpec.model_validate(
+            {
+                "environment": {"id": "CartPole-v1", "frame_stack": 2},
+                "policy": {"hidden": [8], "memory": "gru", "memory_units": 4},
+                "collection": {"actors": 1, "envs_per_actor": 4, "rollout_length": 8},
+                "training": {"env_steps": 10**9, "stop_when_solved": False, "algorithm": "appo", **FEW_UPDATES},
+                "service": FAST,
+                **sections,
+            }
+        )
+        self.output = io.StringIO()
+        self.said: list[str] = []
+        self.stop = threading.Event()
+        self._network = MemoryNetwork()
+        self._errors: list[BaseException] = []
+        self._threads = [
+            self._start(self._learn),
+            self._start(self._play, ActorService, "a"),
+            self._start(self._play, Evaluator, "e"),
+        ]
+
+    def _start(self, work: Any, *arguments: Any) -> threading.Thread:
+        thread = threading.Thread(target=self._watch, args=(work, *arguments), daemon=True)
+        thread.start()
+        return thread
+
+    def _watch(self, work: Any, *arguments: Any) -> None:
+        try:
+            work(*arguments)
+        except BaseException as error:
+            self._errors.append(error)
+
+    def _learn(self) -> None:
+        transport = MemoryTransport(self._network)
+        progress = Progress(self.output, self.spec.training.env_steps)
+        try:
+            LearnerService(self.spec, self.directory, transport, self.stop, progress, started=time.monotonic()).run()
+        finally:
+            transport.close()
+
+    def _play(self, role: Any, name: str) -> None:
+        transport = MemoryTransport(self._network)
+        try:
+            role(ActorConfig(name=name, incarnation=1), transport, self.stop, self.said.append).run()
+        finally:
+            transport.close()
+
+    def end(self) -> None:
+        self.stop.set()
+        for thread in self._threads:
+            thread.join(60.0)
+            assert not thread.is_alive()
+        assert not self._errors
+
+    def rows(self) -> list[dict[str, str]]:
+        with open(self.directory / "metrics.csv", newline="") as file:
+            return list(csv.DictReader(file))
+
+
+FEW_UPDATES = {"passes": 2, "minibatches": 2}
+
+
+def test_evaluations_end_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Path) -> None:
+    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
+    try:
+        until(lambda: sum("evaluation at" in line for line in house.output.getvalue().splitlines()) >= 3)
+    finally:
+        house.end()
+    best = best_checkpoint(house.directory)
+    assert best is not None
+    assert read_policy(best).policy_version % 4 == 0  # passes x minibatches
+    evaluated = [row for row in house.rows() if row["evaluation_return_mean"]]
+    assert evaluated
+    # The newest evaluation of a row is written, so the best may be one that another overtook.
+    assert max(float(row["evaluation_return_mean"]) for row in evaluated) <= best_score(best) + 0.05
+    assert all(int(row["evaluation_env_steps"]) <= int(row["env_steps"]) for row in evaluated)
+    # What evaluators were given was kept while they played it, and is pruned when the run ends.
+    assert len(checkpoints(house.directory)) <= 2
+
+
+def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> None:
+    """A checkpoint after every update, of which one is kept, while the evaluator plays an older one."""
+    often = {**FAST, "checkpoint_seconds": 1e-6}
+    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 40}, service=often)
+    try:
+        until(lambda: house.output.getvalue().count("evaluation at") >= 2)
+    finally:
+        house.end()
+    assert "the best so far" in house.output.getvalue()
+    assert "could not be kept" not in house.output.getvalue()
+
+
+def test_the_evaluator_is_no_part_of_the_training(tmp_path: Path) -> None:
+    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
+    try:
+        until(lambda: "evaluation at" in house.output.getvalue())
+    finally:
+        house.end()
+    assert {row["actors"] for row in house.rows()} <= {"0", "1"}
+    summary = json.loads((house.directory / "summary.json").read_text())
+    assert summary["policy_lag_max"] <= house.spec.training.policy_lag_bound
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala", "appo"])
+def test_every_algorithm_learns_from_stacks_with_a_memory(tmp_path: Path, algorithm: str) -> None:
+    training = {"env_steps": 10**9, "stop_when_solved": False, "algorithm": algorithm, **FEW_UPDATES}
+    house = House(tmp_path, training=training)
+    try:
+        until(
+            lambda: (house.directory / "metrics.csv").exists() and any(row.get("policy_loss") for row in house.rows())
+        )
+    finally:
+        house.end()
+    last = house.rows()[-1]
+    updates, versions = int(last["updates"]), read_policy(checkpoints(house.directory)[0]).policy_version
+    assert updates == versions > 0
+    assert updates % (4 if algorithm == "appo" else 1) == 0
+    summary = json.loads((house.directory / "summary.json").read_text())
+    assert "malformed" not in summary["rollouts_rejected"]

@@ -1,0 +1,63 @@
+"""What the learner computes from a rollout under the weights that made it is what the actor computed: ratios of 1."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from building import join
+
+from actor.collector import Collector
+from actor.environments import make_environments
+from policy.distributions import categorical_log_probs
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import OnnxRuntime, PolicyRuntime
+from policy.torch_runtime import TorchRuntime
+from protocol.codec import Limits, decode, encode
+from protocol.messages import Rollout, RolloutIdentity
+from protocol.spec import EnvironmentSpec, PolicySpec, Spaces
+
+IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
+POLICIES = {
+    "mlp": PolicySpec(hidden=(8,)),
+    "gru": PolicySpec(hidden=(8,), memory="gru", memory_units=6),
+}
+
+
+def make_runtime(kind: str, policy: PolicySpec, spaces: Spaces, network: ActorCritic) -> PolicyRuntime:
+    if kind == "torch":
+        return TorchRuntime(policy, spaces)
+    return OnnxRuntime(export_program(network, spaces.observation))
+
+
+@pytest.mark.parametrize("runtime", ["onnx", "torch"])
+@pytest.mark.parametrize("stack", [1, 3])
+@pytest.mark.parametrize("policy", POLICIES)
+def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had(
+    policy: str, stack: int, runtime: str
+) -> None:
+    # Episodes of 3, 2 and 1 steps: some begin, end and go on in every rollout of 5 rows.
+    spec = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=stack)
+    environments = make_environments(spec, 4)
+    spaces = environments.spaces
+    torch.manual_seed(1)
+    network = ActorCritic(POLICIES[policy], spaces)
+    with torch.no_grad():
+        network.policy_head.weight.mul_(100.0)  # far from uniform, so that what was seen shows
+    weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
+    collector = Collector(
+        environments, make_runtime(runtime, POLICIES[policy], spaces, network), spec, rollout_length=5, seed=2
+    )
+    collector.load(weights)
+    for _ in range(6):
+        rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY, 0)), Limits()))
+        assert isinstance(rollout, Rollout)
+        batch = join([rollout], spaces.observation)
+        with torch.no_grad():
+            logits, _ = network(batch.observations, batch.initial_state, batch.starts)
+            log_probs, _ = categorical_log_probs(logits[:-1], batch.actions)
+        valid = rollout.valid
+        assert np.ptp(log_probs.numpy()[valid]) > 0.1
+        np.testing.assert_allclose(log_probs.numpy()[valid], rollout.behaviour_log_probs[valid], atol=1e-4)

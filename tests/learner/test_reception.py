@@ -1,0 +1,212 @@
+"""learner/reception.py over the memory transport: which versions are welcome, what evaluators ask and tell."""
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_spec
+from processes import LIMIT
+
+from learner.counters import RunCounters
+from learner.fleet import Fleet
+from learner.reception import Reception
+from protocol import keys
+from protocol.codec import Limits, decode, encode
+from protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Farewell,
+    Join,
+    Message,
+    Refusal,
+    Snapshot,
+)
+from protocol.spec import RunSpec, RunStatus
+from protocol.transport import MemoryNetwork, MemoryTransport
+
+REPORT = EvaluationReport(
+    evaluator="e",
+    learner_epoch=EPOCH,
+    policy_version=0,
+    returns=np.ones(3, np.float32),
+    lengths=np.ones(3, np.int32),
+)
+
+
+def no_status(fleet: Fleet) -> RunStatus:
+    raise AssertionError("nobody asked for it")
+
+
+def made(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> Reception:
+    """One that is open."""
+    transport = MemoryTransport(network)
+    reception = Reception(
+        "r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
+    )
+    reception.open()
+    return reception
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def reception(network: MemoryNetwork) -> Iterator[Reception]:
+    opened = made(network, run_spec(), RunCounters(10))
+    yield opened
+    opened.close("the test is over")
+
+
+@pytest.mark.parametrize(("algorithm", "updates"), [("impala", 1), ("appo", 6)])
+def test_rollouts_of_the_version_that_a_batch_makes_are_welcome_as_soon_as_it_is_taken(
+    network: MemoryNetwork, algorithm: str, updates: int
+) -> None:
+    """The snapshot of that version may be played before the next batch is complete."""
+    counters = RunCounters(10)
+    spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
+    reception = made(network, spec, counters)
+    actor = MemoryTransport(network)
+    join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+
+    def verdict(sequence: int, version: int) -> str:
+        rollout = make_rollout(identity("a", sequence), version=version)
+        (answer,) = actor.ask(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        acknowledgement = decode(answer, Limits())
+        assert isinstance(acknowledgement, Acknowledgement)
+        return acknowledgement.verdict
+
+    try:
+        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        assert verdict(0, version=1) == "rejected"
+        assert verdict(1, version=0) == "accepted"
+        assert len(reception.take_batch(0)) == 1
+        assert verdict(2, version=updates + 1) == "rejected"
+        assert verdict(3, version=updates) == "accepted"
+        assert len(reception.take_batch(updates)) == 1
+    finally:
+        reception.close("the test is over")
+    assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
+
+
+class Asker:
+    """Sends without waiting; keeps the answers as they come."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self._transport = MemoryTransport(network)
+        self.answers: list[Message] = []
+
+    def send(self, payload: bytes, evaluator: str = "e") -> None:
+        def on_answer(answer: bytes | None) -> None:
+            if answer is not None:  # None: the test took it and forgot it
+                self.answers.append(decode(answer, Limits()))
+
+        self._transport.send(keys.evaluations("r", evaluator), payload, timeout=1.0, on_answer=on_answer)
+
+
+@pytest.fixture
+def asker(network: MemoryNetwork, reception: Reception) -> Asker:
+    return Asker(network)
+
+
+def offer_policy(reception: Reception) -> None:
+    reception.offer_program(b"program", 0)
+    reception.publish(3, {"w": np.zeros(2, np.float32)})
+
+
+def codes(asker: Asker) -> list[str]:
+    return [answer.code for answer in asker.answers if isinstance(answer, Refusal)]
+
+
+def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    asker.send(encode(REPORT))
+    assert asker.answers == []
+    (first, asked), (_, told) = reception.take_evaluations()
+    assert asked == EvaluationRequest(evaluator="e")
+    assert isinstance(told, EvaluationReport)
+    assert reception.take_evaluations() == []
+    first.reply(reception.newest_snapshot())
+    (answer,) = asker.answers
+    assert isinstance(answer, Snapshot)
+    assert answer.policy_version == 3
+
+
+def test_before_there_is_a_policy_nothing_can_be_evaluated(reception: Reception, asker: Asker) -> None:
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(asker) == ["not_ready"]
+    assert reception.take_evaluations() == []
+
+
+def test_evaluators_beyond_measure_are_told_to_ask_later(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    for _ in range(64):
+        asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert asker.answers == []
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(asker) == ["not_ready"]
+    assert len(reception.take_evaluations()) == 64
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff" * 100,
+        encode(Farewell(learner_epoch=EPOCH, reason="")),
+        encode(EvaluationRequest(evaluator="f")),
+        encode(EvaluationRequest(evaluator="")),
+    ],
+    ids=["empty", "noise", "another message", "another's name", "no name"],
+)
+def test_what_is_no_question_of_an_evaluators_own_is_refused(
+    reception: Reception, asker: Asker, payload: bytes
+) -> None:
+    offer_policy(reception)
+    asker.send(payload)
+    assert codes(asker) == ["malformed"]
+    assert reception.take_evaluations() == []
+
+
+def test_a_report_beyond_measure_is_refused(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    many = 200_000
+    asker.send(
+        encode(
+            EvaluationReport(
+                evaluator="e",
+                learner_epoch=EPOCH,
+                policy_version=0,
+                returns=np.zeros(many, np.float32),
+                lengths=np.zeros(many, np.int32),
+            )
+        )
+    )
+    assert codes(asker) == ["malformed"]
+
+
+def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    reception.close("solved")
+    asker.send(encode(REPORT))
+    assert codes(asker) == ["finished", "finished"]
+
+
+def test_many_at_once_are_all_held(reception: Reception, network: MemoryNetwork) -> None:
+    offer_policy(reception)
+    askers = [Asker(network) for _ in range(16)]
+    threads = [
+        threading.Thread(target=asker.send, args=(encode(EvaluationRequest(evaluator=f"e{number}")), f"e{number}"))
+        for number, asker in enumerate(askers)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    taken = {message.evaluator for _, message in reception.take_evaluations()}
+    assert taken == {f"e{number}" for number in range(16)}

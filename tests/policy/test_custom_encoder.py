@@ -1,0 +1,155 @@
+"""The user's own encoder is found, tried, exported, or refused in a line that says what to do."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from policies import make_policy, observations, spaces
+from torch import nn
+
+from policy.errors import NetworkError
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import OnnxRuntime
+from protocol.spec import PolicySpec
+
+PREAMBLE = """
+import torch
+from torch import nn
+
+class Base(nn.Module):
+    def __init__(self, shape):
+        super().__init__()
+        self.shape = shape
+        self.convolution = nn.Conv2d(shape[0], 6, 3, stride=2)
+
+    def forward(self, observations):
+        return self.convolution(observations.float() / 255).relu().flatten(1)
+"""
+SPACES = spaces((9, 11), frames=3)
+
+Building = Callable[[str], ActorCritic]
+
+
+@pytest.fixture
+def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]:
+    """Builds the network with the class `Net` of this source, whose module lies in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def from_source(source: str) -> ActorCritic:
+        (tmp_path / "users_own.py").write_text(PREAMBLE + source)
+        return ActorCritic(PolicySpec(encoder="users_own:Net"), SPACES)
+
+    yield from_source
+    sys.modules.pop("users_own", None)
+
+
+def test_a_class_in_the_working_directory_is_found_and_exported(build: Building) -> None:
+    network = build("class Net(Base): pass")
+    assert network.encoder.features == 6 * 4 * 5
+    assert network.convolutional
+    policy = make_policy({"encoder": "users_own:Net", "memory": "gru", "memory_units": 8}, SPACES)
+    runtime, weights = OnnxRuntime(policy.program), policy.weights()
+    policy.load(weights)
+    runtime.load(weights)
+    seen, states = policy.observations(5), policy.states(5)
+    with torch.no_grad():
+        logits, expected = policy.network.act(torch.from_numpy(seen), torch.from_numpy(states))
+    actions, log_probs, state = runtime.act(seen, states, np.random.default_rng(0))
+    np.testing.assert_allclose(state, expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(log_probs, logits.log_softmax(-1).numpy()[np.arange(5), actions], atol=1e-5)
+
+
+def test_it_is_given_the_stacked_shape_and_observations_as_they_are(build: Building) -> None:
+    network = build(
+        """
+class Net(Base):
+    features = 120
+    def forward(self, observations):
+        assert type(self.shape) is tuple and self.shape == (3, 9, 11)
+        assert observations.dtype == torch.uint8 and observations.shape[1:] == self.shape
+        return super().forward(observations)
+"""
+    )
+    seen = torch.full((2, 4, 3, 9, 11), 7, dtype=torch.uint8)
+    logits, _ = network(seen, torch.zeros(4, 0), torch.zeros(2, 4, dtype=torch.bool))
+    assert logits.shape == (2, 4, 4)
+
+
+@pytest.mark.parametrize("name", ["not_there_at_all:Net", "not_there.at_all:Net", "..:Net"])
+def test_a_module_that_is_not_there(name: str) -> None:
+    with pytest.raises(NetworkError, match=rf"policy\.encoder={name}: .*"):
+        ActorCritic(PolicySpec(encoder=name), SPACES)
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("import not_installed_at_all", "No module named 'not_installed_at_all'; install it"),
+        ("class net(Base): pass", r"users_own.py has no torch.nn.Module 'Net'; name"),
+        ("def Net(shape): return Base(shape)", "has no torch.nn.Module 'Net'"),
+        ("class Net(Base):\n    def __init__(self): pass", "TypeError: "),
+        ("class Net(Base):\n    def forward(self, x): raise KeyError('mine')", "KeyError: 'mine'"),
+        ("class Net(Base):\n    def forward(self, x): return self.convolution(x.float())", "must return .2, features."),
+        ("class Net(Base):\n    def forward(self, x): return super().forward(x).sum(0)", "must return .2, features."),
+        ("class Net(Base):\n    def forward(self, x): return None", "makes NoneType of 2 observations"),
+        ("class Net(Base):\n    def forward(self, x): return super().forward(x)[:1]", r"makes \(1, 120\)"),
+        ("class Net(Base):\n    def forward(self, x): return super().forward(x).double()", "must return torch.float32"),
+        ("class Net(Base):\n    features = 7", r"features=7 but returns \(2, 120\)"),
+        (
+            "class Net(Base):\n    def __init__(self, s): super().__init__(s); self.norm = nn.BatchNorm2d(3)",
+            "norm.*Layer",
+        ),
+        ("raise RuntimeError('at import')", "RuntimeError: at import"),
+        ("class Net(Base:", "SyntaxError"),
+    ],
+)
+def test_what_is_no_encoder_is_refused_in_one_line(build: Building, source: str, said: str) -> None:
+    with pytest.raises(NetworkError, match=rf"policy\.encoder=users_own:Net: .*{said}") as caught:
+        build(source)
+    assert "\n" not in str(caught.value)
+
+
+FORWARD = """
+class Net(Base):
+    def __init__(self, shape):
+        super().__init__(shape)
+        self.first, self.tied = nn.Linear(120, 120), nn.Linear(120, 120)
+        self.tied.weight = self.first.weight
+        self.constant = torch.linspace(-1, 1, 120)
+
+    def forward(self, observations):
+        x = super().forward(observations)
+        return """
+
+
+def test_shared_weights_and_constants_are_exported(build: Building) -> None:
+    network = build(FORWARD + "self.tied(self.first(x) * self.constant)")
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, 0.0, 0.2)
+    runtime = OnnxRuntime(export_program(network, SPACES.observation))
+    runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
+    seen = observations(SPACES.observation, (3,))
+    _, log_probs, _ = runtime.act(seen, np.zeros((3, 0), np.float32), None)
+    with torch.no_grad():
+        logits, _ = network.act(torch.from_numpy(seen), torch.zeros(3, 0))
+    np.testing.assert_allclose(log_probs, logits.log_softmax(-1).amax(-1).numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("torch.linalg.eigvals(x[:, :4, None] * torch.ones(4)).real", "cannot be exported to ONNX"),
+        ("torch.atan(x.double()).float()", "of no use to actors: the program cannot be run"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(build: Building, returned: str, said: str) -> None:
+    network = build(FORWARD + returned)
+    with pytest.raises(NetworkError, match=said) as caught:
+        export_program(network, SPACES.observation)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,257 @@
+"""The network is the same step by step and unrolled, one row or many, in every layout of an image."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from policies import POLICIES, Policy, make_policy, observations, spaces
+from torch import Tensor, nn
+from torch.nn import functional
+
+from policy.encoders import MultilayerPerceptron, build_encoder
+from policy.errors import NetworkError
+from policy.memory import Gru
+from policy.network import ActorCritic
+from protocol.spec import ArraySpace, PolicySpec
+
+ENCODERS = ("nature", "impala", "article")
+
+
+@pytest.fixture(scope="module", params=POLICIES)
+def policy(request: pytest.FixtureRequest) -> Policy:
+    policy = make_policy(*POLICIES[request.param])
+    policy.load(policy.weights())
+    return policy
+
+
+@pytest.fixture(scope="module")
+def recurrent() -> Policy:
+    policy = make_policy({"hidden": (8,), "memory": "gru", "memory_units": 12}, spaces((3,), "float32"))
+    policy.load(policy.weights())
+    return policy
+
+
+def step_by_step(network: ActorCritic, seen: Tensor, state: Tensor, starts: Tensor) -> Tensor:
+    """As an actor plays: one row after the other, the memory emptied where an episode starts. The oracle."""
+    rows = []
+    for row in range(len(seen)):
+        for environment in range(len(state)):
+            if starts[row, environment]:
+                state[environment] = 0.0
+        logits, state = network.act(seen[row], state)
+        rows.append(logits)
+    return torch.stack(rows)
+
+
+def check_unroll(policy: Policy, starts: np.ndarray, seed: int) -> None:
+    rows, environments = starts.shape
+    seen = torch.from_numpy(observations(policy.spaces.observation, (rows, environments), seed))
+    state = torch.from_numpy(policy.states(environments, seed))
+    begins = torch.from_numpy(starts)
+    with torch.no_grad():
+        logits, values = policy.network(seen, state.clone(), begins)
+        expected = step_by_step(policy.network, seen, state.clone(), begins)
+    assert logits.shape == (rows, environments, policy.spaces.action.count)
+    assert values.shape == (rows, environments)
+    torch.testing.assert_close(logits, expected, atol=2e-5, rtol=1e-4)
+
+
+def test_forward_is_acting_row_by_row(policy: Policy) -> None:
+    starts = np.zeros((5, 3), np.bool_)
+    starts[2, 0] = starts[3, 1] = starts[0, 2] = True
+    check_unroll(policy, starts, 0)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    starts=st.integers(1, 6).flatmap(
+        lambda rows: st.lists(st.lists(st.booleans(), min_size=rows, max_size=rows), min_size=1, max_size=4)
+    ),
+    seed=st.integers(0, 1000),
+)
+def test_episodes_may_start_anywhere(recurrent: Policy, starts: list[list[bool]], seed: int) -> None:
+    check_unroll(recurrent, np.array(starts, np.bool_).T, seed)
+
+
+def test_nothing_is_remembered_across_a_start_and_all_else_is(recurrent: Policy) -> None:
+    seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 1)))
+    starts = torch.tensor([[False], [False], [True], [False]])
+    states = [torch.zeros(1, 12), torch.ones(1, 12)]
+    with torch.no_grad():
+        one, other = (recurrent.network(seen, state, starts)[0] for state in states)
+    torch.testing.assert_close(one[2:], other[2:])
+    assert (one[:2] - other[:2]).abs().amax(-1).min() > 1e-4
+
+
+def test_the_memory_is_learned_through_all_rows(recurrent: Policy) -> None:
+    seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 2))).requires_grad_()
+    logits, _ = recurrent.network(seen, torch.zeros(2, 12), torch.zeros(4, 2, dtype=torch.bool))
+    logits[3, 0].square().sum().backward()
+    assert seen.grad is not None
+    assert (seen.grad[:, 0].abs().sum(-1) > 0).all()
+    assert (seen.grad[:, 1] == 0).all()
+
+
+def test_the_gru_is_that_of_torch() -> None:
+    ours, theirs = Gru(7, 5), nn.GRUCell(7, 5)
+    with torch.no_grad():
+        for parameter in ours.parameters():
+            parameter.normal_()
+        theirs.weight_ih.copy_(ours.input.weight)
+        theirs.bias_ih.copy_(ours.input.bias)
+        theirs.weight_hh.copy_(ours.hidden.weight)
+        theirs.bias_hh.copy_(ours.hidden.bias)
+        features, state = torch.randn(9, 7), torch.randn(9, 5)
+        torch.testing.assert_close(ours.step(features, state)[0], theirs(features, state), atol=1e-6, rtol=1e-5)
+
+
+def test_one_row_and_many_give_the_same(policy: Policy) -> None:
+    seen, states = torch.from_numpy(policy.observations(6)), torch.from_numpy(policy.states(6))
+    with torch.no_grad():
+        together, _ = policy.network.act(seen, states)
+        alone = [policy.network.act(seen[row : row + 1], states[row : row + 1])[0] for row in range(6)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=2e-5, rtol=1e-4)
+
+
+def test_under_autocast_the_heads_are_float32_and_near(policy: Policy) -> None:
+    seen = torch.from_numpy(observations(policy.spaces.observation, (3, 4)))
+    state, starts = torch.from_numpy(policy.states(4)), torch.zeros(3, 4, dtype=torch.bool)
+    logits, values = policy.network(seen, state, starts)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rough_logits, rough_values = policy.network(seen, state, starts)
+        _, next_state = policy.network.act(seen[0], state)
+    assert (rough_logits.dtype, rough_values.dtype, next_state.dtype) == (torch.float32,) * 3
+    assert (logits - rough_logits).abs().max() < 0.05 * max(1.0, float(logits.detach().abs().max()))
+    assert (values - rough_values).abs().max() < 0.05 * max(1.0, float(values.detach().abs().max()))
+    (rough_logits.sum() + rough_values.sum()).backward()
+    assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in policy.network.parameters())
+
+
+def test_new_policies_are_nearly_uniform() -> None:
+    for spec, where in POLICIES.values():
+        network = ActorCritic(PolicySpec.model_validate(spec), where)
+        seen = torch.from_numpy(observations(where.observation, (1, 8)))
+        state, starts = torch.zeros(8, network.state_size), torch.zeros(1, 8, dtype=torch.bool)
+        logits, values = network(seen, state, starts)
+        assert logits.detach().abs().max() < 0.2
+        assert torch.isfinite(values).all()
+
+
+def test_convolutional_is_said_of_images(policy: Policy) -> None:
+    assert policy.network.convolutional == (policy.spec.encoder != "mlp")
+
+
+# ------------------------------------------------------------------------------------------- encoders
+
+
+def encoder_of(name: str, shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1) -> nn.Module:
+    torch.manual_seed(0)  # the same weights wherever the shapes agree
+    space = ArraySpace.model_validate({"shape": shape, "dtype": dtype, "frames": frames})
+    return build_encoder(PolicySpec(encoder=name), space).requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "features"),
+    [("nature", (84, 84), 512), ("impala", (84, 84), 256), ("article", (96, 96), 1152)],
+)
+def test_the_networks_of_the_literature(name: str, shape: tuple[int, ...], features: int) -> None:
+    encoder = encoder_of(name, shape, frames=4)
+    parameters = {name: p.numel() for name, p in encoder.named_parameters()}
+    assert encoder.features == features
+    assert encoder(torch.zeros((2, 4, *shape), dtype=torch.uint8)).shape == (2, features)
+    counts = {
+        # Weights and biases, layer by layer.
+        "nature": (4 * 64 * 32 + 32) + (32 * 16 * 64 + 64) + (64 * 9 * 64 + 64) + (3136 * 512 + 512),
+        "impala": (4 * 9 * 16 + 16) + 4 * (16 * 9 * 16 + 16) + (16 * 9 * 32 + 32) + 4 * (32 * 9 * 32 + 32)
+        + (32 * 9 * 32 + 32) + 4 * (32 * 9 * 32 + 32) + (3872 * 256 + 256),
+        "article": (4 * 16 * 32 + 32 + 1) + 3 * (32 * 9 * 32 + 32 + 1) + 2 * 1152,
+    }  # fmt: skip
+    assert sum(parameters.values()) == counts[name]
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_every_layout_shows_the_same_picture(name: str, dtype: str) -> None:
+    height, width, frames, colours = 40, 44, 2, 3
+    pictures = observations(
+        ArraySpace.model_validate({"shape": (frames * colours, height, width), "dtype": dtype}), (2,)
+    )
+    split = pictures.reshape(2, frames, colours, height, width)
+    layouts = [
+        (encoder_of(name, (frames * colours, height, width), dtype), pictures),
+        (encoder_of(name, (height, width), dtype, frames * colours), pictures),
+        (encoder_of(name, (height, width, colours), dtype, frames), split.transpose(0, 1, 3, 4, 2)),
+    ]
+    first, *others = [encoder(torch.from_numpy(np.ascontiguousarray(seen))) for encoder, seen in layouts]
+    assert first.std() > 1e-3
+    for other in others:
+        torch.testing.assert_close(other, first, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_layouts_of_one_frame(name: str) -> None:
+    grey = observations(ArraySpace(shape=(40, 44), dtype="uint8"), (2,))
+    colours = np.stack([grey, grey // 2, grey // 3], -1)
+    first, deeper = (encoder_of(name, shape) for shape in ((40, 44), (40, 44, 1)))
+    torch.testing.assert_close(first(torch.from_numpy(grey)), deeper(torch.from_numpy(grey[..., None])))
+    first, deeper = (encoder_of(name, shape) for shape in ((3, 40, 44), (40, 44, 3)))
+    channels_first = torch.from_numpy(np.ascontiguousarray(colours.transpose(0, 3, 1, 2)))
+    torch.testing.assert_close(first(channels_first), deeper(torch.from_numpy(colours)), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["nature", "impala"])
+def test_bytes_count_as_numbers_from_0_to_1(name: str) -> None:
+    seen = torch.from_numpy(observations(ArraySpace(shape=(40, 44), dtype="uint8"), (2,)))
+    ours, plain = encoder_of(name, (40, 44), "uint8"), encoder_of(name, (40, 44), "float32")
+    torch.testing.assert_close(ours(seen), plain(seen / 255.0), atol=1e-5, rtol=1e-4)
+
+
+def test_the_article_sees_contrast_and_not_brightness() -> None:
+    seen = torch.from_numpy(observations(ArraySpace(shape=(4, 48, 48), dtype="float32"), (2,)))
+    encoder = encoder_of("article", (4, 48, 48), "float32")
+    torch.testing.assert_close(encoder(seen), encoder(3.0 * seen + 5.0), atol=1e-4, rtol=1e-3)
+    black = encoder_of("article", (48, 48), "uint8")(torch.zeros((1, 48, 48), dtype=torch.uint8))
+    assert torch.isfinite(black).all()
+
+
+def test_the_article_normalises_as_written() -> None:
+    seen = torch.from_numpy(observations(ArraySpace(shape=(4, 32, 32), dtype="float32"), (3,)))
+    encoder = encoder_of("article", (4, 32, 32), "float32")
+    centred = seen - seen.mean((1, 2, 3), keepdim=True)
+    images = centred / centred.square().mean((1, 2, 3), keepdim=True).add(1e-5).sqrt()
+    weights = dict(encoder.named_parameters())
+    for layer in range(4):
+        weight, bias = (weights[f"convolutions.{2 * layer}.{kind}"] for kind in ("weight", "bias"))
+        images = functional.conv2d(images, weight, bias, stride=2, padding=1)
+        images = functional.prelu(images, weights[f"convolutions.{2 * layer + 1}.slope"])
+    expected = functional.layer_norm(
+        images.flatten(1), (images[0].numel(),), weights["head.weight"], weights["head.bias"]
+    )
+    torch.testing.assert_close(encoder(seen), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_an_mlp_may_have_no_layers_and_stacks_are_flattened() -> None:
+    encoder = MultilayerPerceptron(ArraySpace(shape=(3,), dtype="float32", frames=2), (), "tanh")
+    assert encoder.features == 6
+    seen = torch.arange(12.0).reshape(2, 2, 3)
+    torch.testing.assert_close(encoder(seen), seen.reshape(2, 6))
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize(("shape", "frames"), [((4,), 1), ((4,), 4), ((2, 3, 4, 5), 1)])
+def test_what_is_no_image_is_refused(name: str, shape: tuple[int, ...], frames: int) -> None:
+    with pytest.raises(NetworkError, match=rf"'{name}' sees images.*{shape[0]}.*policy\.encoder"):
+        encoder_of(name, shape, frames=frames)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("nature", (20, 20)), ("nature", (84, 35)), ("article", (1, 96))])
+def test_an_image_too_small_is_refused(name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(NetworkError, match=rf"'{name}' leaves nothing of a uint8 array of shape \({shape[0]}, "):
+        encoder_of(name, shape, frames=4)
+
+
+def test_the_smallest_images() -> None:
+    assert encoder_of("nature", (36, 36)).features == 512
+    assert encoder_of("impala", (1, 1)).features == 256
+    assert encoder_of("article", (2, 2)).features == 32
