@@ -111,7 +111,7 @@ def test_evaluations_end_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Pa
 def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> None:
     """A checkpoint after every update, of which one is kept, while the evaluator plays an older one."""
     often = {**FAST, "checkpoint_seconds": 1e-6}
-    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 40}, service=often)
+    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 400}, service=often)
     try:
         until(lambda: house.output.getvalue().count("evaluation at") >= 2)
     finally:
