@@ -12,6 +12,8 @@ import numpy as np
 from policy.saved_policy import best_checkpoint, best_name, best_score
 from protocol.messages import Acknowledgement, EvaluationReport
 
+_MOST_PLAYING = 16
+
 
 @dataclass(slots=True)
 class Evaluations:
@@ -28,7 +30,13 @@ class Evaluations:
         return {directory for directory, _, _ in self.playing.values()}
 
     def begin(self, evaluator: str, directory: Path, policy_version: int, env_steps: int) -> None:
-        """An evaluator plays the policy that was saved in `directory`; what it played before is given up."""
+        """An evaluator plays the policy that was saved in `directory`; what it played before is given up.
+
+        Of more evaluators than a run has use for, those that asked first are given up: each holds a checkpoint.
+        """
+        self.playing.pop(evaluator, None)
+        while len(self.playing) >= _MOST_PLAYING:
+            del self.playing[next(iter(self.playing))]
         self.playing[evaluator] = directory, policy_version, env_steps
 
     def report(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:

@@ -87,7 +87,8 @@ class Learner:
         else:
             self._learn_once(batch, progress)
         self._seen = batch.observations[0, 0]
-        self._action_counts += torch.bincount(batch.actions.flatten(), minlength=len(self._action_counts))
+        chosen = torch.bincount(batch.actions.flatten(), batch.valid.flatten(), len(self._action_counts))
+        self._action_counts += chosen.to(torch.int64)
 
     def _forward(self, observations: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         with autocast(self._spec.precision, self._device, self._network.convolutional):

@@ -253,3 +253,10 @@ def test_the_newest_is_told_once_in_columns_of_the_metrics(run: Run) -> None:
 def test_returns_too_large_to_add_up_as_float32_are_averaged(run: Run) -> None:
     run.play(1, 3e38, 3e38)
     assert run.evaluations.take_newest()["evaluation_return_mean"] == pytest.approx(3e38)
+
+
+def test_evaluators_that_never_report_hold_a_bounded_number_of_checkpoints(tmp_path: Path) -> None:
+    evaluations = Evaluations(tmp_path, learner_epoch=1)
+    for number in range(100):
+        evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
+    assert evaluations.kept == {tmp_path / str(number) for number in range(84, 100)}

@@ -271,7 +271,7 @@ def test_action_counts_are_of_the_batches_since_they_were_last_taken() -> None:
     rollouts = make_rollouts(1) + make_rollouts(2)
     learner.step(rollouts[:2], 0.0)
     learner.step(rollouts[2:], 0.0)
-    actions = np.concatenate([rollout.actions.flatten() for rollout in rollouts])
+    actions = np.concatenate([rollout.actions[rollout.valid] for rollout in rollouts])  # the others were ignored
     assert learner.take_action_counts() == np.bincount(actions, minlength=4).tolist()
     assert learner.take_action_counts() == [0] * 4
 
