@@ -2,6 +2,7 @@
 nothing to the training data. No threads but the transport's.
 """
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +15,6 @@ from actor.learner_link import LearnerLink, OverError
 from actor.service import ActorConfig
 from policy.runtime import OnnxRuntime
 from protocol.messages import EvaluationReport, Join, Snapshot, Welcome
-from protocol.spec import Spaces
 from protocol.transport import Transport
 
 _DEFAULT_SECONDS = 60.0  # between evaluations where the run does not say
@@ -51,11 +51,10 @@ class Evaluator:
         episodes = spec.evaluation.episodes
         self._say(f"run {welcome.run!r}: {episodes} greedy episodes of {spec.environment.id} every {interval:g} s")
         environment = spec.environment.as_evaluated()
-        made = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
+        environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
         try:
-            environments = _Interruptible(made, self._stop)
             due = time.monotonic() + interval
-            for number in range(2**31):
+            for number in itertools.count():
                 if self._stop.wait(max(due - time.monotonic(), 0.0)):
                     raise OverError("stopped")
                 due = time.monotonic() + interval
@@ -64,11 +63,11 @@ class Evaluator:
                 if not self._evaluate(welcome, environments, seed):
                     return
         finally:
-            made.close()
+            environments.close()
 
     def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
         """One evaluation, from the request to the report; False if the learner is not there any more."""
-        snapshot = self._link.policy_to_evaluate(welcome.run, self._config.name)
+        snapshot = self._link.policy_to_evaluate(welcome.run, self._config.name, self._stop)
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
         model = self._link.program(welcome.run, snapshot.program)
@@ -76,7 +75,9 @@ class Evaluator:
             return False
         runtime = OnnxRuntime(model)
         runtime.load(snapshot.weights)
-        evaluation = play_episodes(runtime, environments, welcome.spec.evaluation.episodes, seed, sampled=False)
+        evaluation = play_episodes(
+            runtime, environments, welcome.spec.evaluation.episodes, seed, sampled=False, progress=self._continue
+        )
         self._say(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
         self._link.report(
             welcome.run,
@@ -87,31 +88,11 @@ class Evaluator:
                 returns=evaluation.returns,
                 lengths=evaluation.lengths,
             ),
+            self._stop,
         )
         return True
 
-
-class _Interruptible:
-    """Environments that a request to stop ends in the middle of an episode."""
-
-    def __init__(self, environments: VectorEnvironment, stop: threading.Event) -> None:
-        self._environments, self._stop = environments, stop
-
-    @property
-    def count(self) -> int:
-        return self._environments.count
-
-    @property
-    def spaces(self) -> Spaces:
-        return self._environments.spaces
-
-    def reset(self, seed: int) -> np.ndarray:
-        return self._environments.reset(seed)
-
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _continue(self, _finished: int, _mean: float) -> None:
+        """Called after every step: a request to stop ends it in the middle of an episode."""
         if self._stop.is_set():
             raise OverError("stopped")
-        return self._environments.step(actions)
-
-    def close(self) -> None:
-        self._environments.close()

@@ -1,5 +1,7 @@
 """What an actor asks of learners: to be found, to be let in, for programs and snapshots. No state, no threads."""
 
+import contextlib
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -24,6 +26,7 @@ from protocol.transport import Transport, TransportError
 _LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
 _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
 _UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
+_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 
 
@@ -93,24 +96,22 @@ class LearnerLink:
         """The newest snapshot, or the farewell, of a run."""
         return self._ask(keys.snapshots(run))
 
-    def policy_to_evaluate(self, run: str, evaluator: str) -> Snapshot | None:
+    def policy_to_evaluate(self, run: str, evaluator: str, stop: threading.Event) -> Snapshot | None:
         """The newest snapshot, of which the learner keeps a checkpoint until `report`; None if it has none to give.
 
-        Raises OverError if the run is over.
+        Raises OverError if the run is over, or if told to stop.
         """
         request = encode(EvaluationRequest(evaluator=evaluator))
-        for answer in self._ask(keys.evaluations(run, evaluator), request, _UPDATE_SECONDS):
-            if isinstance(answer, Snapshot):
-                return answer
-            if isinstance(answer, Farewell) or (isinstance(answer, Refusal) and answer.code == "finished"):
-                raise OverError("the run is over")
-        return None
+        answer = self._ask_between_updates(keys.evaluations(run, evaluator), request, stop)
+        if isinstance(answer, Farewell) or (isinstance(answer, Refusal) and answer.code == "finished"):
+            raise OverError("the run is over")
+        return answer if isinstance(answer, Snapshot) else None
 
-    def report(self, run: str, report: EvaluationReport) -> None:
-        """Tells the learner how a policy played; what it does not take is lost."""
-        for answer in self._ask(keys.evaluations(run, report.evaluator), encode(report), _UPDATE_SECONDS):
-            if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
-                self._say(f"the learner did not take the evaluation: {answer.reason}")
+    def report(self, run: str, report: EvaluationReport, stop: threading.Event) -> None:
+        """Tells the learner how a policy played; what it does not take is lost. Raises OverError if told to stop."""
+        answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), stop)
+        if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
+            self._say(f"the learner did not take the evaluation: {answer.reason}")
 
     def decode(self, data: bytes) -> Message | None:
         """The message in `data`; None, and a word about it, if it is damaged.
@@ -125,9 +126,22 @@ class LearnerLink:
             self._say(f"ignored a message: {error}")
             return None
 
-    def _ask(self, key: str, payload: bytes = b"", timeout: float = _ANSWER_SECONDS) -> list[Message]:
+    def _ask_between_updates(self, key: str, payload: bytes, stop: threading.Event) -> Message | None:
+        """One question to the learner's main thread; None without an answer. Raises OverError if told to stop."""
+        answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         try:
-            answers = self._transport.ask(key, payload, timeout=timeout)
+            self._transport.send(key, payload, timeout=_UPDATE_SECONDS, on_answer=answers.put)
+        except TransportError:
+            return None
+        while not stop.is_set():
+            with contextlib.suppress(queue.Empty):
+                answer = answers.get(timeout=_HEARTBEAT_SECONDS)
+                return None if answer is None else self.decode(answer)
+        raise OverError("stopped")
+
+    def _ask(self, key: str, payload: bytes = b"") -> list[Message]:
+        try:
+            answers = self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
         except TransportError:
             return []
         return [message for message in map(self.decode, answers) if message is not None]

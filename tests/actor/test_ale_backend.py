@@ -24,7 +24,9 @@ def test_a_game_goes_by_its_usual_names(name: str) -> None:
 
 
 def test_a_game_of_several_words() -> None:
-    make_environments(_spec("ALE/MsPacman-v5"), 1).close()
+    environments = make_environments(_spec("ALE/MsPacman-v5"), 1)
+    assert environments.spaces.action.count == 9  # eight directions and none; Pong has 6
+    environments.close()
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_a_camera_wants_one_environment() -> None:
 
 def test_what_shows_no_picture_cannot_be_filmed() -> None:
     class Dark(Picture):
-        def render(self) -> None:  # type: ignore[override]
+        def render(self) -> None:  # type: ignore[override] - what is wrong with it
             return None
 
     with pytest.raises(UnplayableError, match="renders no picture, but NoneType"):
@@ -188,7 +188,7 @@ def test_closing_after_an_interrupted_step_ends_the_processes() -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    environments.parent_pipes[1] = SimpleNamespace(send=pipe.send, recv=interrupted)  # type: ignore[assignment]
+    environments.parent_pipes[1] = SimpleNamespace(send=pipe.send, recv=interrupted)  # type: ignore[assignment] - a pipe's two methods
     with pytest.raises(KeyboardInterrupt):
         environments.step(np.zeros(2, np.int64))
     environments.parent_pipes[1] = pipe

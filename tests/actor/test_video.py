@@ -22,7 +22,7 @@ def frame(number: int, height: int = 40, width: int = 60) -> np.ndarray:
 
 
 def record(path: Path, frames: int, frames_per_second: float, **options: float) -> Video:
-    with Video(path, **options) as video:  # type: ignore[arg-type]
+    with Video(path, **options) as video:  # type: ignore[arg-type] - width is an int
         video.frames_per_second = frames_per_second
         for number in range(frames):
             video.add(frame(number))

@@ -375,4 +375,4 @@ def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) ->
     for array in weights.values():
         array.flags.writeable = False
     runtime.load(weights)
-    runtime.act(one_policy.observations(2), NO_STATE, None)
+    assert runtime.act(one_policy.observations(2), NO_STATE, None)[0].shape == (2,)

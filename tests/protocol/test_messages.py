@@ -31,11 +31,13 @@ def test_a_rollout_tells_its_rows_and_environments() -> None:
 
 
 def test_as_many_episodes_may_end_as_there_are_rows() -> None:
-    rollout(episode_returns=np.zeros(T * E, np.float32), episode_lengths=np.ones(T * E, np.int32))
+    made = rollout(episode_returns=np.zeros(T * E, np.float32), episode_lengths=np.ones(T * E, np.int32))
+    assert len(made.episode_returns) == T * E
 
 
 def test_a_rollout_without_ended_episodes_is_a_rollout() -> None:
-    rollout(episode_returns=np.zeros(0, np.float32), episode_lengths=np.zeros(0, np.int32))
+    made = rollout(episode_returns=np.zeros(0, np.float32), episode_lengths=np.zeros(0, np.int32))
+    assert len(made.episode_returns) == 0
 
 
 ROW_ARRAYS = ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid")
@@ -75,7 +77,7 @@ def test_a_memory_of_other_environments_is_refused(shape: tuple[int, ...]) -> No
 
 
 def test_a_policy_may_remember_nothing() -> None:
-    rollout(initial_state=np.zeros((E, 0), np.float32))
+    assert rollout(initial_state=np.zeros((E, 0), np.float32)).initial_state.shape == (E, 0)
 
 
 @pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
