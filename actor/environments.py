@@ -173,7 +173,7 @@ def _make_bare(
             from actor.ale_backend import make_ale
 
             return make_ale(spec, count)
-        case "gymnasium":
+        case "gymnasium" | "sketch":
             from actor.gymnasium_backend import make_gymnasium
 
             return make_gymnasium(spec, count, wrap=wrap, render_mode=render_mode, camera=camera), spec

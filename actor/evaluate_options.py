@@ -4,6 +4,9 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import get_args
+
+from protocol.spec import Backend
 
 DESCRIPTION = """\
 Plays episodes with the policy of a run and reports their returns: true rewards, greedy actions, episodes that
@@ -50,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument(
         "--backend",
-        choices=("gymnasium", "envpool", "ale"),
+        choices=get_args(Backend),
         help="whose implementation of the environment to play (default: evaluation.final_backend, "
         "else the one that was trained on)",
     )

@@ -1,7 +1,7 @@
 """gymnasium's environments, and every environment that a user registers with it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -14,6 +14,8 @@ from actor.unplayable import UnplayableError, first_line, import_extra, import_o
 from protocol.spec import EnvironmentSpec
 
 Camera = Callable[[np.ndarray], None]
+
+_CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
 class GymnasiumEnvironments:
@@ -95,12 +97,13 @@ class MakeOne:
 
     def __call__(self) -> gymnasium.Env:
         """One environment; whatever it raises when it is made."""
-        spec = self.spec
+        spec, registered = self.spec, registration(self.spec.id)
         kwargs = _kwargs(spec)
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
+        drawn_late = registered.entry_point == _CAR_RACING and self.wrap is None
         environment = gymnasium.make(
-            registration(spec.id),
+            _undrawn(registered, spec.backend) if drawn_late else registered,
             disable_env_checker=True,  # it costs a tenth of the speed, and warns on behalf of others
             **kwargs,
         )
@@ -110,6 +113,10 @@ class MakeOne:
             environment = RepeatedSteps(
                 environment, repeat=spec.action_repeat, patience=spec.patience, camera=self.camera
             )
+        if drawn_late:
+            from actor.car_racing import Drawn  # needs packages that are optional
+
+            environment = Drawn(environment)
         return environment
 
     @property
@@ -129,6 +136,10 @@ def make_gymnasium(
     camera: Camera | None = None,
 ) -> GymnasiumEnvironments:
     """By the environment's own vector entry point if it has one that will do, else in turn, else in processes."""
+    if spec.backend == "sketch" and registration(spec.id).entry_point != _CAR_RACING:
+        raise UnplayableError(
+            f"environment.backend=sketch draws CarRacing-v3 only, not {spec.id}: --set environment.backend=gymnasium"
+        )
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError("a camera films one environment in render_mode 'rgb_array'")
     try:
@@ -165,12 +176,19 @@ def registration(environment_id: str) -> EnvSpec:
         ) from None
 
 
+def _undrawn(registered: EnvSpec, backend: str) -> EnvSpec:
+    """CarRacing's registration, for one that draws late: most of its time goes into frames that nobody sees."""
+    from actor.car_racing import SketchedCarRacing, UndrawnCarRacing
+
+    return replace(registered, entry_point=SketchedCarRacing if backend == "sketch" else UndrawnCarRacing)
+
+
 def _make_vector(make_one: MakeOne, count: int) -> Any:
     spec, registered = make_one.spec, registration(make_one.spec.id)
     # ALE's vectorised form is another environment: it stacks, shrinks and clips by itself (that is backend=ale).
     if registered.vector_entry_point is not None and registered.namespace != "ALE" and make_one.is_plain:
         return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))
-    if spec.processes and make_one.camera is None:
+    if spec.processes and spec.backend == "gymnasium" and make_one.camera is None:
         return EnvironmentProcesses([make_one] * count)
     return SyncVectorEnv([make_one] * count, autoreset_mode=AutoresetMode.NEXT_STEP)
 

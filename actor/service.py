@@ -153,6 +153,10 @@ class ActorService:
         )
         loaded = -1
         while True:
+            self._wait(lambda: self._uploader.has_room)  # before playing: what is played now is of the newest policy
+            if not welcome.spec.synchronous:
+                self._read_inbox(welcome)
+                self._doubt(welcome)
             if self._snapshot.policy_version != loaded:
                 collector.load(self._snapshot.weights)
                 loaded = self._snapshot.policy_version
@@ -163,16 +167,12 @@ class ActorService:
                 learner_epoch=welcome.learner_epoch,
             )
             payload = encode(collector.collect(identity, loaded))
-            self._wait(lambda: self._uploader.has_room)
             with self._changed:
                 self._uploader.add(self._sequence, payload)
             self._send_due()
             self._sequence += 1
             if welcome.spec.synchronous:
                 self._await_snapshot(welcome, newer_than=loaded)
-            else:
-                self._read_inbox(welcome)
-                self._doubt(welcome)
 
     def _runtime(self, welcome: Welcome, snapshot: Snapshot, spaces: Spaces) -> PolicyRuntime:
         if self._config.runtime == "torch":

@@ -67,8 +67,8 @@ class BarrierBuffer:
 class StreamBuffer:
     """Asynchronous: a batch is the next `batch_rollouts` rollouts that are not too old, whoever sent them.
 
-    Holds one batch beyond the one being filled: enough to keep the learner busy, and every rollout more would
-    only add policy lag.
+    Holds the batch that the learner takes next, and two rollouts at least: enough to keep it busy, and every one more
+    would only add policy lag.
     """
 
     def __init__(self, batch_rollouts: int, max_policy_lag: int) -> None:
@@ -78,7 +78,7 @@ class StreamBuffer:
 
     def has_room_for(self, rollout: Rollout) -> bool:
         """See RolloutBuffer: there is room again once a batch was taken."""
-        return len(self._waiting) < 2 * self._batch_rollouts
+        return len(self._waiting) < max(self._batch_rollouts, 2)
 
     def add(self, rollout: Rollout) -> None:
         """See RolloutBuffer."""

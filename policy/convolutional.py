@@ -58,6 +58,18 @@ def nature(space: ArraySpace) -> ImageEncoder:
     return ImageEncoder(layout, convolutions, lambda inputs: _rectified(inputs, 512))
 
 
+def small(space: ArraySpace) -> ImageEncoder:
+    """The network of Mnih et al. (2013), which A3C also used: a third of nature's work."""
+    layout = ImageLayout("small", space)
+    convolutions = nn.Sequential(
+        orthogonal(_first(space)(layout.shape[0], 16, 8, 4), _GAIN),
+        nn.ReLU(),
+        orthogonal(nn.Conv2d(16, 32, 4, 2), _GAIN),
+        nn.ReLU(),
+    )
+    return ImageEncoder(layout, convolutions, lambda inputs: _rectified(inputs, 256))
+
+
 def impala(space: ArraySpace) -> ImageEncoder:
     """The residual network of Espeholt et al. (2018), figure 3, right; without its memory."""
     layout = ImageLayout("impala", space)

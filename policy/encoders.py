@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from policy.convolutional import ArticleEncoder, ImageEncoder, impala, nature
+from policy.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from policy.custom_encoder import CustomEncoder
 from policy.layers import orthogonal
 from protocol.spec import ArraySpace, PolicySpec
@@ -55,6 +55,8 @@ def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
             return MultilayerPerceptron(space, spec.hidden, spec.activation)
         case "nature":
             return nature(space)
+        case "small":
+            return small(space)
         case "impala":
             return impala(space)
         case "article":

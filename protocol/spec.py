@@ -68,6 +68,9 @@ class Spaces(Specification):
 # ------------------------------------------------------------------------------------------ the run
 
 
+Backend = Literal["gymnasium", "envpool", "ale", "sketch"]  # sketch: gymnasium's CarRacing, cheaply drawn
+
+
 class EnvironmentSpec(Specification):
     """Which environment the actors play, and what they do to its pixels, actions and rewards.
 
@@ -76,7 +79,7 @@ class EnvironmentSpec(Specification):
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
-    backend: Literal["gymnasium", "envpool", "ale"] = "gymnasium"  # whose implementation of it
+    backend: Backend = "gymnasium"  # whose implementation of it
     kwargs: dict[str, JsonValue] = {}
     processes: bool = False  # on gymnasium's backend: each in a process of its own, where the environment is slow
     max_episode_steps: PositiveInt | None = None  # in the environment's own steps
@@ -94,7 +97,7 @@ class EnvironmentSpec(Specification):
     reward_clip: Annotated[float, Field(gt=0.0)] | None = None  # to +- this
     reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
 
-    def as_evaluated(self, backend: Literal["gymnasium", "envpool", "ale"] | None = None) -> "EnvironmentSpec":
+    def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
         """The same environment for a score: episodes are played to their true end, on another backend if named."""
         return self.model_copy(update={"patience": None, "backend": backend or self.backend})
 
@@ -102,7 +105,7 @@ class EnvironmentSpec(Specification):
 class PolicySpec(Specification):
     """The network: an encoder, a memory if it has one, then a head for the policy and one for the value."""
 
-    encoder: Annotated[str, Field(pattern=r"^(mlp|nature|impala|article|[\w.]+:\w+)$", max_length=200)] = "mlp"
+    encoder: Annotated[str, Field(pattern=r"^(mlp|small|nature|impala|article|[\w.]+:\w+)$", max_length=200)] = "mlp"
     hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)  # of the mlp
     activation: Literal["tanh", "relu"] = "tanh"  # of the mlp
     memory: Literal["none", "gru"] = "none"
@@ -115,7 +118,7 @@ class CollectionSpec(Specification):
     actors: PositiveInt = 2  # started by `daedalus train`; a2c waits for as many before its first update
     envs_per_actor: Annotated[int, Field(ge=1, le=4096)] = 16
     rollout_length: Annotated[int, Field(ge=1, le=4096)] = 16
-    window: Annotated[int, Field(ge=1, le=64)] = 2  # rollouts an actor may have unanswered at once
+    window: Annotated[int, Field(ge=1, le=64)] = 2  # an actor's rollouts that are being played or not yet taken in
 
 
 class TrainingSpec(Specification):
@@ -173,7 +176,7 @@ class EvaluationSpec(Specification):
     seconds: Annotated[float, Field(gt=0.0)] | None = None  # from one evaluation's start to the next's; unset: none
     episodes: Annotated[int, Field(ge=1, le=10_000)] = 10
     final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100  # with the best policy, once training has ended
-    final_backend: Literal["gymnasium", "envpool", "ale"] | None = None  # unset: the one that was trained on
+    final_backend: Backend | None = None  # unset: the one that was trained on
 
 
 class ServiceSpec(Specification):

@@ -146,6 +146,15 @@ def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNe
     assert learner.receive()[0].identity.sequence == 2
 
 
+def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    first, second = learner.receive(), learner.receive()
+    learner.publish(4)  # while the window is full
+    acknowledge(first[1], "accepted")
+    assert [second[0].policy_version, learner.receive()[0].policy_version] == [3, 4]
+
+
 def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
     policy = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
     environment = SPEC.environment.model_copy(update={"frame_stack": 3})

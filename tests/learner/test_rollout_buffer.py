@@ -1,5 +1,6 @@
 """learner/rollout_buffer.py: when a batch is complete, and of what."""
 
+import pytest
 from building import identity, make_rollout
 
 from learner.rollout_buffer import BarrierBuffer, StreamBuffer, Taken
@@ -124,11 +125,12 @@ def test_stale_rollouts_are_given_back_though_no_batch_is_complete() -> None:
     assert sequences(buffer.take(set(), 1).rollouts) == [1, 2]
 
 
-def test_the_stream_has_room_for_two_batches() -> None:
-    buffer = StreamBuffer(2, 0)
-    for sequence in range(4):
+@pytest.mark.parametrize(("batch", "room"), [(1, 2), (2, 2), (3, 3)])
+def test_the_stream_has_room_for_a_batch_and_for_two_rollouts(batch: int, room: int) -> None:
+    buffer = StreamBuffer(batch, 0)
+    for sequence in range(room):
         assert buffer.has_room_for(rollout("a", sequence))
         buffer.add(rollout("a", sequence))
-    assert not buffer.has_room_for(rollout("a", 4))
+    assert not buffer.has_room_for(rollout("a", room))
     buffer.take(set(), 0)
-    assert buffer.has_room_for(rollout("a", 4))
+    assert buffer.has_room_for(rollout("a", room))

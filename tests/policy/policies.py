@@ -79,6 +79,7 @@ POLICIES: dict[str, tuple[dict[str, Any], Spaces]] = {
     "one action": ({"hidden": (3,)}, spaces((1,), "float32", actions=1)),
     "mlp, gru": ({"hidden": (16,)} | _GRU, spaces((4,), "float32")),
     "gru alone": ({"hidden": ()} | _GRU, spaces((4,), "float32")),
+    "small": ({"encoder": "small"}, spaces((84, 84), frames=4, actions=6)),
     "nature": ({"encoder": "nature"}, spaces((84, 84), frames=4, actions=6)),
     "nature, gru": ({"encoder": "nature"} | _GRU, spaces((40, 44), frames=2)),
     "nature, floats": ({"encoder": "nature"}, spaces((40, 44, 3), "float32")),

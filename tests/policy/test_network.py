@@ -15,7 +15,7 @@ from policy.memory import Gru
 from policy.network import ActorCritic
 from protocol.spec import ArraySpace, PolicySpec
 
-ENCODERS = ("nature", "impala", "article")
+ENCODERS = ("small", "nature", "impala", "article")
 
 
 @pytest.fixture(scope="module", params=POLICIES)
@@ -153,7 +153,7 @@ def encoder_of(name: str, shape: tuple[int, ...], dtype: str = "uint8", frames: 
 
 @pytest.mark.parametrize(
     ("name", "shape", "features"),
-    [("nature", (84, 84), 512), ("impala", (84, 84), 256), ("article", (96, 96), 1152)],
+    [("small", (84, 84), 256), ("nature", (84, 84), 512), ("impala", (84, 84), 256), ("article", (96, 96), 1152)],
 )
 def test_the_networks_of_the_literature(name: str, shape: tuple[int, ...], features: int) -> None:
     encoder = encoder_of(name, shape, frames=4)
@@ -162,6 +162,7 @@ def test_the_networks_of_the_literature(name: str, shape: tuple[int, ...], featu
     assert encoder(torch.zeros((2, 4, *shape), dtype=torch.uint8)).shape == (2, features)
     counts = {
         # Weights and biases, layer by layer.
+        "small": (4 * 64 * 16 + 16) + (16 * 16 * 32 + 32) + (2592 * 256 + 256),
         "nature": (4 * 64 * 32 + 32) + (32 * 16 * 64 + 64) + (64 * 9 * 64 + 64) + (3136 * 512 + 512),
         "impala": (4 * 9 * 16 + 16) + 4 * (16 * 9 * 16 + 16) + (16 * 9 * 32 + 32) + 4 * (32 * 9 * 32 + 32)
         + (32 * 9 * 32 + 32) + 4 * (32 * 9 * 32 + 32) + (3872 * 256 + 256),
@@ -200,7 +201,7 @@ def test_layouts_of_one_frame(name: str) -> None:
     torch.testing.assert_close(first(channels_first), deeper(torch.from_numpy(colours)), atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["nature", "impala"])
+@pytest.mark.parametrize("name", ["small", "nature", "impala"])
 def test_bytes_count_as_numbers_from_0_to_1(name: str) -> None:
     seen = torch.from_numpy(observations(ArraySpace(shape=(40, 44), dtype="uint8"), (2,)))
     ours, plain = encoder_of(name, (40, 44), "uint8"), encoder_of(name, (40, 44), "float32")

@@ -1,0 +1,92 @@
+"""CarRacing drawn late and as a sketch, beside gymnasium's own."""
+
+import itertools
+
+import gymnasium
+import numpy as np
+import pytest
+
+from actor.environments import UnplayableError, make_environments
+from protocol.spec import EnvironmentSpec
+
+TABLE = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.8), (-0.4, 0.3, 0.0), (0.4, 0.3, 0.0))
+ROAD = slice(0, 84)  # the rows above the dashboard
+
+
+def _spec(**fields) -> EnvironmentSpec:
+    return EnvironmentSpec.model_validate({"id": "CarRacing-v3", "action_table": TABLE, "action_repeat": 4, **fields})
+
+
+def _original(seed: int, actions: list[int], limit: int) -> list[tuple]:
+    """(frame, reward, terminated, truncated) of gymnasium.make's own, each action repeated four times."""
+    environment = gymnasium.make("CarRacing-v3", max_episode_steps=limit)
+    frame, _ = environment.reset(seed=seed)
+    rows = [(frame, 0.0, False, False)]
+    for action in actions:
+        total, repeats = 0.0, 0
+        terminated = truncated = False
+        while repeats < 4 and not (terminated or truncated):
+            frame, reward, terminated, truncated, _ = environment.step(np.array(TABLE[action], np.float32))
+            total, repeats = total + float(reward), repeats + 1
+        rows.append((frame, total, terminated, truncated))
+    environment.close()
+    return rows
+
+
+def _ours(backend: str, seed: int, actions: list[int], limit: int) -> list[tuple]:
+    environments = make_environments(_spec(backend=backend, max_episode_steps=limit), 1)
+    try:
+        rows = [(environments.reset(seed)[0], 0.0, False, False)]
+        for action in actions:
+            frames, rewards, terminated, truncated = environments.step(np.array([action]))
+            rows.append((frames[0].copy(), float(rewards[0]), bool(terminated[0]), bool(truncated[0])))
+        return rows
+    finally:
+        environments.close()
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[int, list[int], int]:
+    """A seed, the actions of a drive with turns that leaves the road, and the limit that ends it."""
+    actions = np.random.default_rng(5).choice(5, size=60, p=(0.1, 0.4, 0.05, 0.3, 0.15)).tolist()
+    return 11, actions, 240
+
+
+def test_gymnasiums_own_is_the_same_though_drawn_late(drive: tuple[int, list[int], int]) -> None:
+    original, ours = _original(*drive), _ours("gymnasium", *drive)
+    assert [row[1:] for row in ours] == [row[1:] for row in original]
+    assert original[-1][3]
+    for one, other in zip(ours, original, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+
+
+def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tuple[int, list[int], int]) -> None:
+    original, ours = _original(*drive), _ours("sketch", *drive)
+    assert [row[1:] for row in ours] == [row[1:] for row in original]
+    different = [np.abs(one[0][ROAD].astype(int) - other[0][ROAD]) for one, other in zip(ours, original, strict=True)]
+    assert max(difference.mean() for difference in different) < 3.0
+    dashboards = [np.abs(one[0][84:].astype(int) - other[0][84:]) for one, other in zip(ours, original, strict=True)]
+    beside_the_score = [dashboard[:, 12:] for dashboard in dashboards]
+    assert max(dashboard.mean() for dashboard in beside_the_score) < 5.0
+    moved = [np.abs(before[0].astype(int) - after[0]).mean() for before, after in itertools.pairwise(ours)]
+    assert np.mean(moved) > 3.0  # than which consecutive frames differ more, so that the bounds above say something
+
+
+def test_the_sketch_is_of_car_racing_only() -> None:
+    with pytest.raises(UnplayableError, match=r"sketch draws CarRacing-v3 only, not CartPole-v1"):
+        make_environments(EnvironmentSpec(id="CartPole-v1", backend="sketch"), 1)
+
+
+def brightened(environment: gymnasium.Env) -> gymnasium.Env:
+    """A user's own wrapper, which looks at the frames."""
+    space = environment.observation_space
+    return gymnasium.wrappers.TransformObservation(environment, lambda frame: np.minimum(frame, 235) + 20, space)
+
+
+def test_a_users_own_wrapper_sees_the_frames() -> None:
+    plain, wrapped = make_environments(_spec(), 1), make_environments(_spec(), 1, wrap=f"{__name__}:brightened")
+    try:
+        np.testing.assert_array_equal(wrapped.reset(3), np.minimum(plain.reset(3), 235) + 20)
+    finally:
+        plain.close()
+        wrapped.close()
