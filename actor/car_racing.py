@@ -34,9 +34,11 @@ class UndrawnCarRacing(car_racing.CarRacing):
         """The frame [96, 96, 3] uint8 of this moment."""
         score, self.reward = self.reward, self._score
         try:
-            return super()._render("state_pixels")
+            frame = super()._render("state_pixels")
         finally:
             self.reward = score
+        assert isinstance(frame, np.ndarray)
+        return frame
 
 
 class SketchedCarRacing(UndrawnCarRacing):

@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import math
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ examples:
   daedalus plot runs/cartpole-*-s1-* --output algorithms.png"""
 
 _PANELS = (
-    ("episode_return_mean", "return (mean of the last episodes, band: one std)"),
+    ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: greedy evaluations)"),
     ("entropy", "entropy (nats)"),
     ("value_loss", "value loss"),
     ("policy_lag_mean", "policy lag (updates)"),
@@ -53,6 +54,13 @@ def _read(directory: Path) -> dict[str, list[float]]:
     return {name: [float(row[name]) if row[name] else float("nan") for row in rows] for name in rows[0]}
 
 
+def _evaluations(run: dict[str, list[float]]) -> tuple[list[float], list[float]]:
+    """At which env_steps a run was evaluated, and the mean returns; empty where it was not."""
+    env_steps, returns = run.get("evaluation_env_steps", []), run.get("evaluation_return_mean", [])
+    by_env_steps = {at: mean for at, mean in zip(env_steps, returns, strict=True) if not math.isnan(at)}
+    return list(by_env_steps), list(by_env_steps.values())
+
+
 def _draw(runs: dict[str, dict[str, list[float]]], output: Path) -> None:
     import matplotlib
 
@@ -68,6 +76,7 @@ def _draw(runs: dict[str, dict[str, list[float]]], output: Path) -> None:
                 low = [m - s for m, s in zip(mean, std, strict=True)]
                 high = [m + s for m, s in zip(mean, std, strict=True)]
                 axis.fill_between(run["env_steps"], low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+                axis.plot(*_evaluations(run), "o--", color=line.get_color(), linewidth=1, markersize=4)
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.3)
     for axis in axes[1]:

@@ -12,7 +12,7 @@ _MOST_RESTARTS = 1000  # of one actor killed from outside
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
 
 # Where there are fewer cores than processes, the learner comes first: it is the one that all others wait for.
-_ACTORS_NICENESS = 5
+_ACTORS_NICENESS = 5  # beyond the learner's
 
 # An actor has one core at most: pools of threads in its libraries would only spin on everybody else's.
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -52,7 +52,8 @@ class SupervisedActor:
         identity = ("--connect", self.connect, "--name", self.name)
         self.process = start("actor", *identity, "--quiet", *self.options, one_thread=True)
         with suppress(AttributeError, OSError):  # not everywhere, and it may be gone already
-            os.setpriority(os.PRIO_PROCESS, self.process.pid, _ACTORS_NICENESS)
+            niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
+            os.setpriority(os.PRIO_PROCESS, self.process.pid, niceness)
 
     def check(self) -> str | None:
         """Restarts the process if it died; returns what there is to say about that.
