@@ -1,0 +1,141 @@
+"""Agent steps a second on Pong at full learning: beside stable-baselines3's A2C, and beside what computing alone takes.
+
+    python benchmarks/pong_throughput.py --rounds 3
+
+84 x 84 grey, skip 4, stack 4, Nature CNN, 256 rows an update and one pass over them, for both. The limit is of this
+machine's cores, were there nothing to do but step the environments, run the policy and update: each measured alone, on
+one core. All take turns, round by round; ratios are those of each round.
+"""
+
+import argparse
+import csv
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from learner_speed import NETWORKS, fastest, updater
+from running import COMMAND, machine, table
+
+from actor.environments import make_environments
+from learner.allocator import keep_freed_memory
+from learner.settings import read_preset, run_spec
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import OnnxRuntime
+from protocol.spec import ChoiceSpace, Spaces
+
+ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
+SETTINGS = {
+    "collection.envs_per_actor": ENVIRONMENTS,
+    "collection.rollout_length": ROWS,
+    "training.algorithm": "impala",
+    "training.batch_rollouts": 1,
+    "training.passes": 1,
+    "training.minibatches": 1,
+    "training.stop_when_solved": "false",
+    "evaluation.seconds": 1e6,
+    "evaluation.final_episodes": 1,
+}
+_WARM_SECONDS = 10.0  # from the first row of the metrics: processes start, pages are touched
+
+
+def ours(env_steps: int) -> float:
+    """env_steps/s of `daedalus train pong` once it is warm."""
+    with tempfile.TemporaryDirectory() as folder:
+        directory = Path(folder) / "run"
+        words = ["train", "pong", "--env-steps", str(env_steps), "--run-dir", str(directory)]
+        words += [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")]
+        finished = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
+        if finished.returncode not in (0, 3):
+            raise SystemExit(f"daedalus train pong failed:\n{finished.stdout}{finished.stderr}")
+        with open(directory / "metrics.csv", newline="", encoding="utf-8") as file:
+            points = [(float(row["wall_seconds"]), int(row["env_steps"])) for row in csv.DictReader(file)]
+    warm = next(point for point in points if point[0] >= points[0][0] + _WARM_SECONDS)
+    return (points[-1][1] - warm[1]) / (points[-1][0] - warm[0])
+
+
+def peer(env_steps: int) -> float:
+    """env_steps/s of stable-baselines3's A2C."""
+    script = os.path.join(os.path.dirname(__file__), "peer_a2c.py")
+    command = [sys.executable, script, "--pong", "--env-steps", str(env_steps)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+
+
+def limit(seconds: float) -> tuple[float, dict[str, float]]:
+    """env_steps/s of all cores if only computing counted; and microseconds an env_step of each part of it."""
+    environments = make_environments(run_spec(read_preset("pong")).environment, ENVIRONMENTS)
+    try:
+        environments.reset(1)
+        actions = np.random.default_rng(1).integers(0, environments.spaces.action.count, (1000, ENVIRONMENTS))
+        stepping = _per_call(lambda index: environments.step(actions[index % 1000]), seconds)
+        count = environments.spaces.action.count
+    finally:
+        environments.close()
+    policy, space, _, _ = NETWORKS["nature"]
+    network = ActorCritic(policy, Spaces(observation=space, action=ChoiceSpace(count=count)))
+    runtime = OnnxRuntime(export_program(network, space))
+    runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
+    random = np.random.default_rng(1)
+    seen = random.integers(0, 256, (ENVIRONMENTS, *space.stacked_shape), dtype=np.uint8)
+    state = np.zeros((ENVIRONMENTS, network.state_size), np.float32)
+    acting = _per_call(lambda _: runtime.act(seen, state, random), seconds)
+    torch.set_num_threads(1)
+    learning = fastest(updater(policy, space, ROWS, ENVIRONMENTS, bfloat16=True), seconds) / ROWS
+    parts = {"environment": stepping, "forward": acting, "update": learning}
+    microseconds = {name: 1e6 * spent / ENVIRONMENTS for name, spent in parts.items()}
+    return 1e6 * (os.cpu_count() or 1) / sum(microseconds.values()), microseconds
+
+
+def _per_call(call: Callable[[int], object], seconds: float) -> float:
+    """Seconds of CPU time a call, the first ones left out."""
+    for index in range(20):
+        call(index)
+    calls, began, ends = 0, time.process_time(), time.monotonic() + seconds
+    while time.monotonic() < ends:
+        call(calls)
+        calls += 1
+    return (time.process_time() - began) / calls
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--rounds", type=int, default=3)
+    options.add_argument("--env-steps", type=int, default=120_000)
+    options.add_argument("--peer-env-steps", type=int, default=20_000)
+    options.add_argument("--seconds", type=float, default=5.0, help="for each part of the limit")
+    parsed = options.parse_args()
+    keep_freed_memory()
+    rows, ratios, shares = [], [], []
+    for index in range(parsed.rounds):
+        most, parts = limit(parsed.seconds)
+        rate, other = ours(parsed.env_steps), peer(parsed.peer_env_steps)
+        ratios.append(rate / other)
+        shares.append(rate / most)
+        spent = " + ".join(f"{part:.0f}" for part in parts.values())
+        rows.append(
+            (
+                index + 1,
+                f"{rate:,.0f}",
+                f"{other:,.0f}",
+                f"{ratios[-1]:.1f}",
+                spent,
+                f"{most:,.0f}",
+                f"{shares[-1]:.0%}",
+            )
+        )
+    print(machine())
+    header = ("round", "env_steps/s", "stable-baselines3 A2C", "ratio")
+    header += ("environment + forward + update, us", "limit, env_steps/s", "share")
+    print(table(header, rows))
+    print(f"median {statistics.median(ratios):.1f} x the peer, {statistics.median(shares):.0%} of the limit")
+
+
+if __name__ == "__main__":
+    main()
