@@ -73,6 +73,7 @@ class Collector:
         self._environments = environments
         self._runtime = runtime
         self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
+        self._continuing = spec.continuing
         environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
         self._random = np.random.default_rng(action_seed)
         self._episodes = EpisodeCounter(count)
@@ -117,6 +118,9 @@ class Collector:
         if self._reward_clip is not None:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
         self._rewards *= self._reward_scale
+        if self._continuing:
+            self._truncated |= self._terminated
+            self._terminated[:] = False
         finished = self._episodes.take_finished()
         return Rollout(
             identity=identity,

@@ -93,9 +93,10 @@ class EnvironmentSpec(Specification):
     resize: tuple[PositiveInt, PositiveInt] | None = None  # to height, width: the mean of what each pixel covers
     frame_stack: Annotated[int, Field(ge=1, le=16)] = 1
 
-    # Learning sees these rewards; logs and evaluations show the true return.
+    # Learning sees these rewards and ends; logs and evaluations show the true ones.
     reward_clip: Annotated[float, Field(gt=0.0)] | None = None  # to +- this
     reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
+    continuing: bool = False  # a terminated episode counts as cut: where its end is no loss, and cannot be foreseen
 
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
         """The same environment for a score: episodes are played to their true end, on another backend if named."""

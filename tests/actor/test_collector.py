@@ -131,6 +131,22 @@ def test_rewards_are_clipped_then_scaled_for_learning_and_not_in_returns() -> No
     np.testing.assert_allclose(returns, [(REWARD * (EPISODE == episode)).sum() for episode in range(4)], rtol=1e-6)
 
 
+def test_a_continuing_task_has_no_ends_but_cuts() -> None:
+    def collect(spec: EnvironmentSpec) -> list[Rollout]:
+        collector = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=4, seed=1)
+        return [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+
+    episodic, continuing = collect(COUNTING), collect(COUNTING.model_copy(update={"continuing": True}))
+    terminated, truncated = rows(episodic, "terminated"), rows(episodic, "truncated")
+    assert terminated.any()
+    assert truncated.any()
+    assert not rows(continuing, "terminated").any()
+    np.testing.assert_array_equal(rows(continuing, "truncated"), terminated | truncated)
+    for name in ("valid", "rewards", "episode_returns", "episode_lengths"):
+        for ours, plain in zip(continuing, episodic, strict=True):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
+
+
 class _Losing(gymnasium.Env[np.ndarray, np.int64]):
     """Every step costs 3."""
 

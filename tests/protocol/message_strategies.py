@@ -69,6 +69,7 @@ run_specs = st.builds(
         frame_stack=st.integers(1, 16),
         reward_clip=st.none() | st.floats(0.1, 10),
         reward_scale=st.floats(1e-6, 1e6),
+        continuing=st.booleans(),
     ),
     policy=st.builds(
         PolicySpec,
