@@ -33,6 +33,7 @@ from protocol.spec import ChoiceSpace, Spaces
 
 ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
 SETTINGS = {
+    "policy.encoder": "nature",
     "collection.envs_per_actor": ENVIRONMENTS,
     "collection.rollout_length": ROWS,
     "training.algorithm": "impala",
@@ -46,12 +47,13 @@ SETTINGS = {
 _WARM_SECONDS = 10.0  # from the first row of the metrics: processes start, pages are touched
 
 
-def ours(env_steps: int) -> float:
+def ours(backend: str, env_steps: int) -> float:
     """env_steps/s of `daedalus train pong` once it is warm."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
+        settings = {"environment.backend": backend, **SETTINGS}
         words = ["train", "pong", "--env-steps", str(env_steps), "--run-dir", str(directory)]
-        words += [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")]
+        words += [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
         finished = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
         if finished.returncode not in (0, 3):
             raise SystemExit(f"daedalus train pong failed:\n{finished.stdout}{finished.stderr}")
@@ -68,9 +70,10 @@ def peer(env_steps: int) -> float:
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
 
 
-def limit(seconds: float) -> tuple[float, dict[str, float]]:
+def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
     """env_steps/s of all cores if only computing counted; and microseconds an env_step of each part of it."""
-    environments = make_environments(run_spec(read_preset("pong")).environment, ENVIRONMENTS)
+    spec = run_spec(read_preset("pong")).environment.model_copy(update={"backend": backend})
+    environments = make_environments(spec, ENVIRONMENTS)
     try:
         environments.reset(1)
         actions = np.random.default_rng(1).integers(0, environments.spaces.action.count, (1000, ENVIRONMENTS))
@@ -109,13 +112,14 @@ def main() -> None:
     options.add_argument("--rounds", type=int, default=3)
     options.add_argument("--env-steps", type=int, default=120_000)
     options.add_argument("--peer-env-steps", type=int, default=20_000)
+    options.add_argument("--backend", choices=("envpool", "ale"), default="envpool")
     options.add_argument("--seconds", type=float, default=5.0, help="for each part of the limit")
     parsed = options.parse_args()
     keep_freed_memory()
     rows, ratios, shares = [], [], []
     for index in range(parsed.rounds):
-        most, parts = limit(parsed.seconds)
-        rate, other = ours(parsed.env_steps), peer(parsed.peer_env_steps)
+        most, parts = limit(parsed.backend, parsed.seconds)
+        rate, other = ours(parsed.backend, parsed.env_steps), peer(parsed.peer_env_steps)
         ratios.append(rate / other)
         shares.append(rate / most)
         spent = " + ".join(f"{part:.0f}" for part in parts.values())

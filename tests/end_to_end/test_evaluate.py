@@ -297,6 +297,11 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
     assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
 
 
+def test_the_car_that_ships_drives(evaluate: Callable[..., dict]) -> None:
+    result = evaluate("--pretrained", "car_racing", "--backend", "sketch", "--episodes", 4)
+    assert result["return_mean"] > 600  # 905 over 100; one that stands still has -100
+
+
 # ------------------------------------------------------------------------------------------------ after training
 
 
