@@ -33,7 +33,7 @@ class Uploader:
 
     @property
     def has_room(self) -> bool:
-        """Whether one more may be sent."""
+        """Whether one more may be played, and then sent."""
         return len(self.in_flight) < self.window
 
     def add(self, sequence: int, payload: bytes) -> None:

@@ -46,28 +46,12 @@ class ImageEncoder(nn.Module):
 
 def nature(space: ArraySpace) -> ImageEncoder:
     """The network of Mnih et al. (2015), "Human-level control through deep reinforcement learning"."""
-    layout = ImageLayout("nature", space)
-    convolutions = nn.Sequential(
-        orthogonal(_first(space)(layout.shape[0], 32, 8, 4), _GAIN),
-        nn.ReLU(),
-        orthogonal(nn.Conv2d(32, 64, 4, 2), _GAIN),
-        nn.ReLU(),
-        orthogonal(nn.Conv2d(64, 64, 3, 1), _GAIN),
-        nn.ReLU(),
-    )
-    return ImageEncoder(layout, convolutions, lambda inputs: _rectified(inputs, 512))
+    return _atari("nature", space, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
 
 
 def small(space: ArraySpace) -> ImageEncoder:
     """The network of Mnih et al. (2013), which A3C also used: a third of nature's work."""
-    layout = ImageLayout("small", space)
-    convolutions = nn.Sequential(
-        orthogonal(_first(space)(layout.shape[0], 16, 8, 4), _GAIN),
-        nn.ReLU(),
-        orthogonal(nn.Conv2d(16, 32, 4, 2), _GAIN),
-        nn.ReLU(),
-    )
-    return ImageEncoder(layout, convolutions, lambda inputs: _rectified(inputs, 256))
+    return _atari("small", space, ((16, 8, 4), (32, 4, 2)), 256)
 
 
 def impala(space: ArraySpace) -> ImageEncoder:
@@ -103,6 +87,16 @@ class ArticleEncoder(ImageEncoder):
         # One group of one channel: torch is far slower at normalising what lies pixel by pixel.
         images = as_floats(observations).flatten(1).unsqueeze(1)
         return functional.group_norm(images, 1, eps=self._epsilon)
+
+
+def _atari(name: str, space: ArraySpace, convolutions: tuple[tuple[int, int, int], ...], units: int) -> ImageEncoder:
+    """Rectified convolutions (filters, kernel, stride), then a rectified layer of so many units."""
+    layout = ImageLayout(name, space)
+    inputs, make, layers = layout.shape[0], _first(space), []
+    for filters, kernel, stride in convolutions:
+        layers += [orthogonal(make(inputs, filters, kernel, stride), _GAIN), nn.ReLU()]
+        inputs, make = filters, nn.Conv2d
+    return ImageEncoder(layout, nn.Sequential(*layers), lambda inputs: _rectified(inputs, units))
 
 
 class _Residual(nn.Module):

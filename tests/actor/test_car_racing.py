@@ -1,6 +1,7 @@
 """CarRacing drawn late and as a sketch, beside gymnasium's own."""
 
 import itertools
+import sys
 
 import gymnasium
 import numpy as np
@@ -75,6 +76,16 @@ def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tupl
 def test_the_sketch_is_of_car_racing_only() -> None:
     with pytest.raises(UnplayableError, match=r"sketch draws CarRacing-v3 only, not CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPole-v1", backend="sketch"), 1)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "sketch"])
+def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith(("gymnasium.envs.box2d", "actor.car_racing"))]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in ("Box2D", "pygame"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UnplayableError, match=r'needs a package .* pip install "daedalus-rl\[box2d\]"'):
+        make_environments(_spec(backend=backend), 1)
 
 
 def brightened(environment: gymnasium.Env) -> gymnasium.Env:

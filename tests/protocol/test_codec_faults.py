@@ -1,5 +1,6 @@
 """One fault at a time: each is refused by a reason that names it."""
 
+import contextlib
 import copy
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +11,6 @@ from wire_format import (
     SAMPLES,
     SNAPSHOT,
     WELCOME,
-    decoded_or_refused,
     some_rollout,
     unwire,
     wire,
@@ -23,6 +23,7 @@ from protocol.messages import (
     Join,
     Message,
     Refusal,
+    Snapshot,
 )
 
 Edit = Callable[[dict[str, Any]], object]
@@ -91,7 +92,10 @@ def test_an_empty_array_with_huge_sides_is_refused_or_empty(sides: list[int]) ->
     _, content, _ = unwire(SAMPLES["snapshot"])
     for swapped in (False, True):
         content.update(arrays=[["weights/w", "<f4", sides, swapped]], size=0)
-        decoded_or_refused(wire(content))
+        with contextlib.suppress(ProtocolError):
+            snapshot = decode(wire(content), LIMITS)
+            assert isinstance(snapshot, Snapshot)
+            assert snapshot.weights["w"].size == 0
 
 
 @pytest.mark.parametrize("message", [Join(actor="a", incarnation=1), WELCOME, SNAPSHOT, some_rollout()])
