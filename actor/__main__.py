@@ -1,21 +1,16 @@
 """`python -m actor`: constructs one actor and runs it. Exit status: 0 the run is over, 1 failed, 2 bad usage."""
 
 import sys
-import threading
-import time
-from collections.abc import Callable
 
 from actor import options
 from actor.environments import UnplayableError
 from actor.evaluator import Evaluator
 from actor.learner_link import ActorError
-from actor.service import ActorConfig, ActorService
+from actor.service import ActorService
 from policy.runtime import PolicyError
 from protocol.process import exit_with_parent, stop_on_signals
-from protocol.transport import Transport, TransportError
-from protocol.zenoh_transport import connect
-
-_FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+from protocol.transport import TransportError
+from protocol.zenoh_transport import connect_when_there
 
 
 def main() -> int:
@@ -35,7 +30,7 @@ def main() -> int:
             print(f"actor {config.name}: {text}", flush=True)
 
     try:
-        transport = _connect(arguments.connect, config, stop, say)
+        transport = connect_when_there(arguments.connect, stop, say, config.timeout)
         if transport is None:
             return 0
         try:
@@ -47,29 +42,6 @@ def main() -> int:
         print(f"daedalus actor: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def _connect(
-    endpoints: list[str], config: ActorConfig, stop: threading.Event, say: Callable[[str], None]
-) -> Transport | None:
-    """Tries until the address answers; None if told to stop first."""
-    deadline = None if config.timeout is None else time.monotonic() + config.timeout
-    pause = _FIRST_RETRY_SECONDS
-    told = False
-    while True:
-        try:
-            return connect(endpoints)
-        except TransportError as error:
-            if deadline is not None and time.monotonic() > deadline:
-                raise ActorError(
-                    f"{error} within {config.timeout:g} s: is the learner running, and is the address its own?"
-                ) from None
-            if not told and pause >= 0.5:
-                say(f"{error} yet; waiting for the learner")
-                told = True
-        if stop.wait(pause):
-            return None
-        pause = min(2 * pause, _MAX_RETRY_SECONDS)
 
 
 if __name__ == "__main__":

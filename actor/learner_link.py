@@ -28,6 +28,7 @@ _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
 _UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+_REOPEN_SECONDS = 5.0  # nobody answers for so long: perhaps the session is dead, so another is tried
 
 
 class ActorError(Exception):
@@ -52,6 +53,7 @@ class LearnerLink:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, told = _FIRST_RETRY_SECONDS, False
+        reopen_at = time.monotonic() + _REOPEN_SECONDS
         while True:
             welcome = self.join(run, join)
             if welcome is not None:
@@ -66,6 +68,10 @@ class LearnerLink:
             if stop.wait(pause):
                 raise OverError("stopped")
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
+            if time.monotonic() > reopen_at:
+                with contextlib.suppress(TransportError):  # no router there now: the session that is goes on looking
+                    self._transport.reopen()
+                reopen_at = time.monotonic() + _REOPEN_SECONDS
 
     def join(self, run: str, join: Join) -> Welcome | None:
         """One request to join; None if nobody answers now. Raises ActorError or OverError if refused."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from actor.collector import Collector
 from actor.environments import VectorEnvironment, make_environments
-from actor.learner_link import LearnerLink, OverError
+from actor.learner_link import ActorError, LearnerLink, OverError
 from actor.uploader import Uploader
 from policy.runtime import OnnxRuntime, PolicyRuntime
 from protocol import keys
@@ -30,6 +30,7 @@ _ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
 _DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks for it
 _FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be just about to have one
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+_SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
 
 
 class _LearnerLostError(Exception):
@@ -60,9 +61,10 @@ class ActorService:
         self._stop = stop
         self._say = say
         self._link = LearnerLink(transport, say)
-        self._changed = threading.Condition()  # guards what the transport's threads touch: the next two
+        self._changed = threading.Condition()  # guards what the transport's threads touch: the next three
         self._uploader = Uploader(window=1)
         self._learner_left = False
+        self._heard_at = 0.0  # when the learner last said anything
         self._run = ""  # the one that it takes part in
         self._inboxes: dict[str, Inbox] = {}  # by run
         self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
@@ -74,7 +76,7 @@ class ActorService:
     def run(self) -> None:
         """Plays until stopped or until the learner says that the run is over.
 
-        Raises ActorError if the actor is refused or finds no learner within its timeout, and
+        Raises ActorError if the actor is refused, quarantined, or finds no learner within its timeout, and
         UnplayableError if the environment cannot be made here.
         """
         try:
@@ -92,9 +94,11 @@ class ActorService:
     # ----------------------------------------------------------------------------------------- playing
 
     def _find_learner(self) -> Welcome:
-        self._learner_left = False
         join = Join(actor=self._config.name, incarnation=self._config.incarnation)
-        return self._link.find(self._config.run, join, self._config.timeout, self._stop)
+        welcome = self._link.find(self._config.run, join, self._config.timeout, self._stop)
+        with self._changed:
+            self._learner_left, self._heard_at = False, time.monotonic()
+        return welcome
 
     def _take_part(self, welcome: Welcome) -> None:
         """Makes the environments, is counted in, and plays."""
@@ -240,6 +244,7 @@ class ActorService:
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             self._send_due()
+            self._break_silence()
             with self._changed:
                 self._check()
                 if ready():
@@ -251,10 +256,22 @@ class ActorService:
                 until = min(t for t in (deadline, due, now + _HEARTBEAT_SECONDS) if t is not None)
                 self._changed.wait(max(until - now, 0.0))
 
+    def _break_silence(self) -> None:
+        """Raises if nothing was heard for long, and nothing is to be heard: then a session is dead that seems alive."""
+        if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
+            if not self._link.newest(self._run):
+                raise _LearnerLostError
+            with self._changed:
+                self._heard_at = time.monotonic()
+
     def _check(self) -> None:
         """Raises if there is a reason to stop playing."""
         if self._stop.is_set():
             raise OverError("stopped")
+        if self._uploader.over == "quarantined":
+            raise ActorError(
+                f"the learner takes nothing more of this actor: {self._uploader.reason}; mend that and start it again"
+            )
         if self._uploader.over == "finished":
             raise OverError("the run is over")
         if self._learner_left or self._uploader.over == "fenced":
@@ -286,6 +303,8 @@ class ActorService:
             except ProtocolError:
                 answer = None
         with self._changed:
+            if data is not None:
+                self._heard_at = time.monotonic()
             uploader.answered(sequence, answer if isinstance(answer, Acknowledgement) else None, time.monotonic())
             self._changed.notify_all()
 
@@ -297,4 +316,5 @@ class ActorService:
 
     def _notify(self) -> None:
         with self._changed:
+            self._heard_at = time.monotonic()
             self._changed.notify_all()

@@ -29,7 +29,8 @@ class Uploader:
     verdicts: Counter[str] = field(default_factory=Counter)
     newest_version: int = 0  # that any answer told of
     must_replace: bool = False  # the last answer was a rejection: collect another in its place
-    over: str = ""  # "fenced" or "finished" once the learner said so
+    over: str = ""  # "fenced", "quarantined" or "finished" once the learner said so
+    reason: str = ""  # that it gave
 
     @property
     def has_room(self) -> bool:
@@ -42,7 +43,7 @@ class Uploader:
 
     def send_again(self) -> None:
         """Begins anew with the same rollouts, all of them due: answers may have been lost with a connection."""
-        self.over, self.must_replace = "", False
+        self.over, self.reason, self.must_replace = "", "", False
         for rollout in self.in_flight.values():
             rollout.send_at, rollout.attempts = 0.0, 0
 
@@ -78,5 +79,5 @@ class Uploader:
             return
         del self.in_flight[sequence]
         self.must_replace = answer.verdict == "rejected"
-        if answer.verdict in ("fenced", "finished"):
-            self.over = answer.verdict
+        if answer.verdict in ("fenced", "quarantined", "finished"):
+            self.over, self.reason = answer.verdict, answer.reason

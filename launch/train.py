@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from launch.supervisor import ActorFailedError, SupervisedActor, start, stop
+from launch.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from learner import run_directory
 from learner.options import add_settings, resolve
 from learner.settings import SettingsError
@@ -19,6 +19,7 @@ from protocol.process import process_started, stop_on_signals
 from protocol.spec import RunSpec
 
 _POLL_SECONDS = 0.05
+_EVALUATOR = "evaluator"
 
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
@@ -107,13 +108,12 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, s
     """Everything between the settings and the exit status."""
     stopping = stop_on_signals()
     address = listen or f"tcp/127.0.0.1:{_free_port()}"
-    arguments = ["--prepared", str(directory), "--listen", address, "--started", repr(started)]
-    learner = start("learner", *arguments, *(["--resume"] if resume else []))
-    actors: list[SupervisedActor] = []
+    learner = _supervised_learner(directory, address, started, resume)
+    actors: list[Supervised] = []
     try:
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
         options = ("--wrap", wrap) if wrap else ()
-        actors += [SupervisedActor(name, address, options) for name in names]
+        actors += [supervised_actor(name, address, options) for name in names]
         training = spec.training
         print(
             f"{spec.environment.id}: {training.algorithm}, seed {training.seed}, {len(actors)} actors"
@@ -121,13 +121,13 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, s
             flush=True,
         )
         if spec.evaluation.seconds is not None:
-            actors.append(SupervisedActor("evaluator", address, (*options, "--evaluator")))
-        status = _watch(learner, actors, stopping)
-    except ActorFailedError as error:
+            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator")))
+        status = _watch(learner, actors, spec, stopping)
+    except FailedError as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         status = 1
     finally:
-        stop([learner, *(actor.process for actor in actors)])
+        stop([learner.process, *(actor.process for actor in actors)])
     if stopping.is_set():
         print(f"stopped; continue with: daedalus resume {directory}")
         return 1
@@ -139,19 +139,42 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, s
     return status
 
 
-def _watch(learner: subprocess.Popen[bytes], actors: list[SupervisedActor], stopping: threading.Event) -> int:
-    """Waits for the learner's end, restarting actors meanwhile; the learner's exit status."""
+def _supervised_learner(directory: Path, address: str, started: float, resume: bool) -> Supervised:
+    """A learner that goes on from its newest checkpoint when it was killed."""
+
+    def begin(first: bool) -> subprocess.Popen[bytes]:
+        since = started if first else time.monotonic()
+        arguments = ["--prepared", str(directory), "--listen", address, "--started", repr(since)]
+        return start("learner", *arguments, *(["--resume"] if resume or not first else []))
+
+    return Supervised("the learner", begin, ended={0, 3})
+
+
+def _watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping: threading.Event) -> int:
+    """Waits for the learner's end, restarting what dies meanwhile; the learner's exit status.
+
+    Raises FailedError if the learner failed for good, or no actor is left to play.
+    """
     while not stopping.wait(_POLL_SECONDS):
-        status = learner.poll()
-        if status is not None:
-            if status < 0:
-                print(f"daedalus train: the learner was killed by signal {-status}", file=sys.stderr)
-            return status if status >= 0 else 1
-        for actor in actors:
-            news = actor.check()
-            if news:
-                print(f"\n{news}", flush=True)
+        status = learner.process.poll()
+        if status is not None and (status in learner.ended or learner.failed_at_once):
+            return status
+        _say(learner.check())
+        for actor in list(actors):
+            try:
+                _say(actor.check())
+            except FailedError as error:
+                actors.remove(actor)
+                playing = sum(other.name != _EVALUATOR for other in actors)
+                if not playing or spec.synchronous:  # a2c waits for all at its start
+                    raise
+                _say(f"{error}; going on without it")
     return 1
+
+
+def _say(news: str | None) -> None:
+    if news:
+        print(f"\n{news}", flush=True)
 
 
 def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: threading.Event) -> bool:

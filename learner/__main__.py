@@ -6,18 +6,24 @@ Exit status: 0 the target was reached or the asked-for steps were done, 3 the bu
 
 import sys
 import time
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from learner import run_directory
 from learner.allocator import keep_freed_memory
-from learner.options import LISTEN, learner_parser, resolve
+from learner.options import LISTEN, learner_parser, resolve, resolve_again
 from learner.progress import Progress
 from learner.service import LearnerService, Outcome
 from learner.settings import SettingsError
+from policy.saved_policy import checkpoints
 from policy.sealed import DamagedError
 from protocol.process import exit_with_parent, stop_on_signals
 from protocol.spec import RunSpec
 from protocol.transport import TransportError
-from protocol.zenoh_transport import connect, listen
+from protocol.zenoh_transport import connect_when_there, listen
+
+if TYPE_CHECKING:
+    from learner.checkpoint import Checkpoint
 
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
 
@@ -32,9 +38,13 @@ def main() -> int:
         exit_with_parent(stop)
     try:
         if arguments.prepared:
-            directory, spec = arguments.prepared, run_directory.read_config(arguments.prepared)
+            directory, spec, begun = arguments.prepared, run_directory.read_config(arguments.prepared), True
+        elif arguments.resume:
+            spec, directory, begun = resolve_again(arguments)
         else:
             spec, directory = resolve(arguments)
+            begun = False
+        if not begun:
             run_directory.check_free(directory)
     except SettingsError as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
@@ -42,18 +52,22 @@ def main() -> int:
     progress = Progress(sys.stdout, spec.training.env_steps)
     try:
         restored = None
-        if arguments.resume:
-            from learner.checkpoint import load_newest
-
-            restored = load_newest(directory, progress.say)
+        if arguments.resume and begun:
+            restored = _newest_checkpoint(directory, progress)
         address = arguments.listen or LISTEN
-        transport = connect(arguments.connect) if arguments.connect else listen([address])
+        if arguments.connect:
+            transport = connect_when_there(arguments.connect, stop, progress.say)
+        else:
+            transport = listen([address])
+        if transport is None:
+            return FAILED
     except (TransportError, DamagedError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
     try:
-        if arguments.prepared is None:
+        if not begun:
             run_directory.create(directory, spec)
+        if arguments.prepared is None:
             there = ", ".join(arguments.connect) if arguments.connect else address
             progress.say(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
             progress.say(f"actors join with: daedalus actor --connect {there}")
@@ -72,6 +86,19 @@ def main() -> int:
         return FAILED
     finally:
         transport.close()
+
+
+def _newest_checkpoint(directory: Path, progress: Progress) -> "Checkpoint | None":
+    """What to go on from; None if the run ended before its first checkpoint. Raises DamagedError if none is whole."""
+    if not checkpoints(directory):
+        progress.say("there is no checkpoint yet: the run starts from its beginning")
+        return None
+    from learner.checkpoint import load_newest
+
+    restored = load_newest(directory, progress.say)
+    steps = restored.counters["env_steps"]
+    progress.say(f"going on from checkpoint {restored.policy.policy_version} at {steps:,} env_steps")
+    return restored
 
 
 def _status(outcome: Outcome, spec: RunSpec) -> int:

@@ -12,6 +12,7 @@ from protocol.messages import Rollout
 _SAVED = (
     "env_steps",
     "updates",
+    "updates_skipped",
     "episodes",
     "rollouts_accepted",
     "rollouts_trained",
@@ -30,6 +31,7 @@ class RunCounters:
     target_episodes: int  # how many episodes the mean return is over
     env_steps: int = 0  # real steps that were trained on
     updates: int = 0
+    updates_skipped: int = 0  # of them, for a gradient that was not finite
     episodes: int = 0
     rollouts_accepted: int = 0
     rollouts_rejected: Counter[str] = field(default_factory=Counter)  # by cause
@@ -94,7 +96,7 @@ class RunCounters:
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from what `state` returned."""
         for name in _SAVED:
-            setattr(self, name, state[name])
+            setattr(self, name, state.get(name, 0))  # an earlier release counted fewer things
         self.rollouts_rejected = Counter(state["rollouts_rejected"])
         self.wall_seconds = state["wall_seconds"]
         self.returns.extend(state["returns"])

@@ -9,10 +9,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from protocol import keys
 from protocol.messages import Join, Refusal, RolloutIdentity
 from protocol.spec import ActorStatus, Spaces
 
+_MOST_ACTORS = 16_384  # remembered at once
 _REMEMBERED_LIVES = 8
+_UNFIT_IN_A_ROW = 3  # rollouts, after which nothing more is taken from that life of the actor
 _REORDERING = 1024  # sequence numbers that may arrive out of order before the missing ones are given up
 
 
@@ -49,18 +52,47 @@ class Actor:
     incarnation: int = -1  # the newest; -1 before the first Join
     lives: int = 0
     environments: int = 0  # 0 until it has joined with its spaces
-    present: bool = False
     last_seen: float = 0.0
     windows: dict[int, SequenceWindow] = field(default_factory=dict)  # by incarnation, the newest last
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
+    busy: int = 0  # answers that told it to come again later
+    unfit: int = 0  # rollouts in a row whose content no healthy actor sends
+    quarantined: str = ""  # why nothing more is taken from its newest incarnation
     env_steps: int = 0
+    env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of its newest rollout
 
     @property
     def sequences(self) -> SequenceWindow:
         """What was taken of its newest incarnation."""
         return self.windows[self.incarnation]
+
+    @property
+    def missed(self) -> int:
+        """Rollouts that never came, of the incarnations that are remembered."""
+        return min(sum(window.gaps for window in self.windows.values()), 2**53)
+
+    def note_unfit(self, fault: str) -> None:
+        """Counts a rollout of unfit content; the third in a row is the last that is looked at.
+
+        In a row: a simulator that blows up once in a thousand rollouts loses those, a broken machine is shut out.
+        """
+        self.unfit += 1
+        if self.unfit >= _UNFIT_IN_A_ROW:
+            self.quarantined = f"{self.unfit} unfit rollouts in a row, the last: {fault}"
+
+    def begin_life(self, incarnation: int) -> None:
+        """A new process bears the name: it begins with a clean record.
+
+        A life that comes back, after another that used its name, has what it sent remembered.
+        """
+        self.incarnation = incarnation
+        self.lives += 1
+        self.unfit, self.quarantined = 0, ""
+        self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
+        while len(self.windows) > _REMEMBERED_LIVES:
+            del self.windows[next(iter(self.windows))]
 
 
 class Fleet:
@@ -69,13 +101,18 @@ class Fleet:
     def __init__(self, seed: int, spaces: Spaces | None) -> None:
         self._seed = seed
         self.spaces = spaces  # the first actor's, or those of the checkpoint
-        self.actors: dict[str, Actor] = {}
+        self.actors: dict[str, Actor] = {}  # that joined
+        self._present: set[str] = set()  # the names that liveliness tells of, whoever bears them
 
     def join(self, join: Join, now: float) -> Refusal | None:
         """Takes in an actor; returns why not, if it cannot take part.
 
         A new incarnation of a known name replaces the old one. Who comes without spaces only asks what is played.
         """
+        try:
+            keys.check_name(join.actor, "actor name")
+        except ValueError as error:
+            return Refusal(code="malformed", reason=str(error))
         if join.spaces is None:
             return None
         if not 1 <= join.environments <= 4096:
@@ -86,18 +123,24 @@ class Fleet:
                 reason=f"its environment has {join.spaces}; this run has {self.spaces}: "
                 "install the same version of the environment",
             )
+        if join.actor not in self.actors and not self._make_room():
+            return Refusal(code="full", reason=f"{_MOST_ACTORS} actors take part already")
         self.spaces = join.spaces
-        actor = self._actor(join.actor)
+        actor = self.actors.setdefault(join.actor, Actor(join.actor))
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
-            actor.incarnation = join.incarnation
-            actor.lives += 1
-            # A life that comes back, after another that used its name, has what it sent remembered.
-            actor.windows[join.incarnation] = actor.windows.pop(join.incarnation, SequenceWindow())
-            while len(actor.windows) > _REMEMBERED_LIVES:
-                del actor.windows[next(iter(actor.windows))]
+            actor.begin_life(join.incarnation)
         actor.environments = join.environments
         return None
+
+    def _make_room(self) -> bool:
+        """Forgets, where as many as there may be are known, who is away and was not seen for longest."""
+        if len(self.actors) < _MOST_ACTORS:
+            return True
+        away = [actor for actor in self.actors.values() if actor.name not in self._present]
+        if away:
+            del self.actors[min(away, key=lambda actor: actor.last_seen).name]
+        return bool(away)
 
     def seed_for(self, name: str, start_version: int) -> int:
         """The seed of an actor's environments and samples: its own for each life of it, and after each resume."""
@@ -107,7 +150,14 @@ class Fleet:
 
     def set_present(self, name: str, present: bool) -> None:
         """What liveliness says of an actor."""
-        self._actor(name).present = present
+        if present:
+            self._present.add(name)
+        else:
+            self._present.discard(name)
+
+    def is_live(self, actor: Actor) -> bool:
+        """Whether it takes part: it has joined, is present, and what it sends is taken."""
+        return actor.name in self._present and actor.environments > 0 and not actor.quarantined
 
     def expected(self, identity: RolloutIdentity) -> Actor | None:
         """The actor a rollout is from, or None if that life of it has not joined."""
@@ -118,24 +168,26 @@ class Fleet:
 
     @property
     def live(self) -> frozenset[str]:
-        """The names of those that are present and joined: the ones a synchronous batch waits for."""
-        return frozenset(actor.name for actor in self.actors.values() if actor.present and actor.environments)
+        """The names of those that take part: the ones a synchronous batch waits for."""
+        return frozenset(actor.name for actor in self.actors.values() if self.is_live(actor))
 
     def statuses(self, now: float) -> tuple[ActorStatus, ...]:
         """One line for each actor, by name."""
         return tuple(
             ActorStatus(
                 actor=actor.name,
-                alive=actor.present and actor.environments > 0,
+                alive=actor.name in self._present,
+                quarantined=actor.quarantined,
+                lives=actor.lives,
                 seconds_since_seen=max(now - actor.last_seen, 0.0),
                 environments=actor.environments,
+                env_steps=actor.env_steps,
+                env_steps_per_second=actor.env_steps_per_second,
                 rollouts_accepted=actor.accepted,
                 rollouts_rejected=dict(actor.rejected),
-                env_steps=actor.env_steps,
+                rollouts_missed=actor.missed,
+                busy_answers=actor.busy,
                 policy_lag=actor.policy_lag,
             )
             for actor in sorted(self.actors.values(), key=lambda actor: actor.name)
         )
-
-    def _actor(self, name: str) -> Actor:
-        return self.actors.setdefault(name, Actor(name))

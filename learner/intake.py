@@ -23,7 +23,7 @@ _SLACK_BYTES = 64 << 10
 class Rejected:
     """A rollout never to train on; `cause` is what it is counted under, `reason` what its sender is told."""
 
-    verdict: Literal["rejected", "fenced"]
+    verdict: Literal["rejected", "fenced", "quarantined"]
     cause: str
     reason: str
 
@@ -47,6 +47,8 @@ class Intake:
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
         if spaces is None or actor is None or not actor.environments:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"{sender!r} has not joined")
+        if actor.quarantined:
+            return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
         try:
             rollout = decode(data, self._limits(spaces, actor))
         except ProtocolError as error:
@@ -57,7 +59,7 @@ class Intake:
         if stranger is not None:
             return stranger
         fault = self._fault(rollout, spaces, actor)
-        return Rejected(verdict="rejected", cause="malformed", reason=fault) if fault else rollout
+        return Rejected(verdict="rejected", cause="unfit", reason=fault) if fault else rollout
 
     def judge(self, sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
         """Decides over what `read` returned while the newest version is `policy_version`, and counts it."""
@@ -69,7 +71,12 @@ class Intake:
                 actor.rejected[verdict.cause] += 1
             else:
                 actor.accepted += 1
+                actor.unfit = 0
                 actor.policy_lag = policy_version - verdict.policy_version
+            if isinstance(verdict, Rejected) and verdict.cause == "unfit":
+                actor.note_unfit(verdict.reason)
+                if actor.quarantined:
+                    verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 
     def _judge(self, sender: str, rollout: Rollout, policy_version: int) -> Rollout | Rejected:
@@ -81,7 +88,7 @@ class Intake:
             return Rejected(verdict="rejected", cause="duplicate", reason="was taken before")
         lag = policy_version - rollout.policy_version
         if lag < 0:
-            return Rejected(verdict="rejected", cause="malformed", reason="its policy version is yet to come")
+            return Rejected(verdict="rejected", cause="unfit", reason="its policy version is yet to come")
         actor.sequences.add(identity.sequence)
         if lag > self._max_lag:
             return Rejected(
@@ -125,12 +132,19 @@ class Intake:
         if rollout.initial_state.shape[1] != self.state_size:
             return f"its policy remembers {rollout.initial_state.shape[1]} numbers, this run's {self.state_size}"
         if rollout.actions.min() < 0 or rollout.actions.max() >= spaces.action.count:
-            return f"an action is not one of {spaces.action}"
+            return f"actions has a value that is not one of {spaces.action}"
         for name in ("frames", "initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
             if not np.isfinite(getattr(rollout, name)).all():
                 return f"{name} has a value that is not finite"
         if (rollout.behaviour_log_probs > 1e-4).any():
-            return "a log-probability is above 0"
+            return "behaviour_log_probs has a value above 0"
+        environment = self._spec.environment
+        if environment.reward_clip is not None:
+            largest = environment.reward_clip * environment.reward_scale
+            if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
+                return f"rewards has a value beyond the {largest:g} that they are clipped to"
+        if (rollout.episode_lengths < 1).any():
+            return "episode_lengths has a value below 1"
         return ""
 
 

@@ -1,5 +1,6 @@
 """One update at a time: owns the parameters, the optimiser and the policy version. No threads, no I/O."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -69,6 +70,7 @@ class Learner:
         self._optimizer = _optimizer(spec, self._flat.values)
         self._assembler = BatchAssembler(spaces.observation, self._device)
         self.policy_version = 0
+        self.updates_skipped = 0  # whose gradient was not finite: versions that are the same as those before them
         self._metric_sums = torch.zeros(len(METRICS), device=self._device)
         self._metric_count = 0
         self._seen: Tensor | None = None
@@ -140,8 +142,11 @@ class Learner:
         self._flat.gradients.zero_()
         loss.backward()
         norm = self._flat.clip_gradients(spec.max_gradient_norm)
-        self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
         self.policy_version += 1
+        if not math.isfinite(norm):  # one such step would end the run: no number comes back from nan
+            self.updates_skipped += 1
+            return
+        self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
         with torch.no_grad():
             centred = advantages - masked_mean(advantages, valid)
             metrics = [

@@ -2,6 +2,9 @@
 
 import csv
 import io
+import itertools
+import os
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +30,7 @@ COLUMNS = (
     "actors",
     "rollouts_accepted",
     "rollouts_rejected",
+    "updates_skipped",
     "policy_loss",
     "value_loss",
     "entropy",
@@ -77,20 +81,34 @@ class NullWriter:
 
 
 class CsvWriter:
-    """One line a row, appended; a resumed run continues its file, in the columns that it was begun with."""
+    """One line a row, appended; a resumed run continues its file, in the columns that it was begun with.
+
+    A line is there whole or not at all, also where the disk takes only a part of it.
+    """
 
     def __init__(self, path: Path) -> None:
         begun = _header(path)  # another release may have had other columns
         self._columns = begun or COLUMNS
-        self._file = open(path, "a", newline="", encoding="utf-8")  # noqa: SIM115 - closed in close()
-        self._writer = csv.writer(self._file)
+        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         if not begun:
-            self._writer.writerow(COLUMNS)
+            self._append(COLUMNS)
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
-        self._writer.writerow([_cell(row.get(name)) for name in self._columns])
-        self._file.flush()
+        self._append([_cell(row.get(name)) for name in self._columns])
+
+    def _append(self, cells: Sequence[str]) -> None:
+        line = io.StringIO()
+        csv.writer(line).writerow(cells)
+        data = line.getvalue().encode()
+        before = os.fstat(self._file.fileno()).st_size
+        try:
+            written = self._file.write(data)
+            if written != len(data):
+                self._file.write(data[written:])  # says why there was no room for the rest
+        except OSError:
+            self._file.truncate(before)
+            raise
 
     def close(self) -> None:
         """See MetricsWriter."""
@@ -110,18 +128,27 @@ def _cell(value: float | None) -> str:
 
 
 class TensorBoardWriter:
-    """Scalars, distributions and pictures against env_steps, in TensorBoard's own files."""
+    """Scalars, distributions and pictures against env_steps, in TensorBoard's own files.
+
+    Its record writer without its event writer: that one writes on a thread which dies of a full disk, and which waits
+    for an hour where the clock is set back by one.
+    """
+
+    _numbers = itertools.count()
 
     def __init__(self, directory: Path) -> None:
         # Loaded here: a quarter of a second that no run should wait for before it has begun.
         from tensorboard.compat.proto import event_pb2, summary_pb2
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+        from tensorboard.summary.writer.record_writer import RecordWriter
 
         # protobuf makes these classes when it is loaded: no type checker finds them
         self._event: Any = vars(event_pb2)["Event"]
         self._summary: Any = vars(summary_pb2)["Summary"]
         self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
-        self._writer = EventFileWriter(str(directory))
+        now = time.time()
+        name = f"events.out.tfevents.{int(now):010d}.{socket.gethostname()}.{os.getpid()}.{next(self._numbers)}"
+        self._writer = RecordWriter(open(directory / name, "ab"))  # noqa: SIM115 - closed in close()
+        self._add(self._event(wall_time=now, file_version="brain.Event:2"))
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """See MetricsWriter."""
@@ -141,9 +168,11 @@ class TensorBoardWriter:
             values.append(self._summary.Value(tag="action", histo=self._histogram(chosen, edges, ())))
         if details.picture is not None:
             values.append(self._summary.Value(tag="what_the_network_sees", image=self._image(details.picture)))
-        self._writer.add_event(
-            self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values))
-        )
+        self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))
+
+    def _add(self, event: Any) -> None:
+        self._writer.write(event.SerializeToString())
+        self._writer.flush()
 
     def _histogram(self, counts: np.ndarray, edges: np.ndarray, numbers: Sequence[float]) -> Any:
         """TensorBoard's histogram of counts between edges; sums are of the numbers themselves where there are any."""

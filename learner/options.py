@@ -18,7 +18,8 @@ examples:
   daedalus learner cartpole
   daedalus learner cartpole --actors 8 --algorithm impala --listen tcp/127.0.0.1:7447
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
-  daedalus learner cartpole --connect tcp/router:7447"""
+  daedalus learner cartpole --connect tcp/router:7447
+  daedalus learner cartpole --run-dir runs/mine --resume      (from systemd or Kubernetes: the same line each time)"""
 
 
 def add_settings(options: argparse.ArgumentParser) -> None:
@@ -78,6 +79,21 @@ def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
     return spec, arguments.run_dir or run_directory.default_directory(name, spec)
 
 
+def resolve_again(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
+    """The same for `daedalus learner --resume`, and whether its run was begun before. Raises SettingsError."""
+    if arguments.run_dir is None:
+        raise SettingsError("--resume needs --run-dir: the folder of the run to begin or to go on with")
+    if not (arguments.run_dir / run_directory.CONFIG).exists():
+        return *resolve(arguments), False
+    spec = run_directory.read_config(arguments.run_dir)
+    if (arguments.preset is not None or arguments.env is not None) and resolve(arguments)[0] != spec:
+        raise SettingsError(
+            f"{arguments.run_dir} was begun with other settings: leave them out to go on with its own, "
+            "or name another --run-dir"
+        )
+    return spec, arguments.run_dir, True
+
+
 def learner_parser() -> argparse.ArgumentParser:
     """Parses what `daedalus learner` takes."""
     options = argparse.ArgumentParser(
@@ -95,9 +111,14 @@ def learner_parser() -> argparse.ArgumentParser:
         metavar="tcp/HOST:PORT",
         help="use the Zenoh router there instead of an own one",
     )
+    options.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on from the newest checkpoint in --run-dir if there is one, else begin there: "
+        "for a supervisor that starts the same command again",
+    )
     # What the launcher says to the learner it starts: a directory with config.toml that is there already.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
-    options.add_argument("--resume", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options

@@ -2,11 +2,13 @@
 
     transport's threads   answer queries at once; rollouts only go onto a byte-bounded queue
     intake thread         decodes and judges rollouts, answers them, fills the buffer
+    watchdog thread       has the transport reopened where nobody is heard and nobody could reach us
 
 The main thread takes batches out and publishes snapshots. One condition guards what they share: fleet, buffer,
 counters, and the version that rollouts are held against.
 """
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -35,11 +37,12 @@ from protocol.messages import (
     StatusReport,
 )
 from protocol.spec import RunSpec, RunStatus, Spaces
-from protocol.transport import Request, Transport
+from protocol.transport import Request, Transport, TransportError
 
 HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _WAITING_EVALUATIONS = 64  # at once; evaluators beyond that ask again later
 _EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)
+_SILENCE_SECONDS = 10.0  # without a word from anybody for so long, the session may be dead
 _HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
 
 
@@ -68,8 +71,11 @@ class Reception:
         self._buffer = _buffer(spec)
         self._intake = Intake(spec, learner_epoch, self.fleet)
         self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
-        self._requests = RequestQueue(int(spec.service.queue_megabytes * 2**20))
+        self._requests = RequestQueue(spec.service.queue_bytes)
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
+        self._ended = threading.Event()
+        self._heard_at = time.monotonic()
+        self._watching = threading.Thread(target=self._watch_silence, name="watchdog", daemon=True)
         self._program_hash = ""
         self._evaluations: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
 
@@ -78,16 +84,22 @@ class Reception:
         self._judging.start()
         transport, run, desk = self._transport, self._run, self._desk
         transport.watch(keys.presence(run, "*"), self._on_presence)
-        transport.serve(keys.rollouts(run, "*"), self._on_rollout)
-        transport.serve(keys.snapshots(run), lambda request: request.reply(desk.snapshot()))
-        transport.serve(
-            keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key)))
-        )
-        transport.serve(keys.status(run), self._on_status)
-        transport.serve(keys.evaluations(run, "*"), self._on_evaluation)
+        self._serve(keys.rollouts(run, "*"), self._on_rollout)
+        self._serve(keys.snapshots(run), lambda request: request.reply(desk.snapshot()))
+        self._serve(keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key))))
+        self._serve(keys.status(run), self._on_status)
+        self._serve(keys.evaluations(run, "*"), self._on_evaluation)
         transport.announce(keys.learner(run))
         # Last: who is let in finds all else there.
-        transport.serve(keys.join(run), lambda request: request.reply(desk.join(request.payload, time.monotonic())))
+        self._serve(keys.join(run), lambda request: request.reply(desk.join(request.payload, time.monotonic())))
+        self._watching.start()
+
+    def _serve(self, key: str, handler: Callable[[Request], None]) -> None:
+        def heard(request: Request) -> None:
+            self._heard_at = time.monotonic()
+            handler(request)
+
+        self._transport.serve(key, heard)
 
     def close(self, reason: str) -> None:
         """Tells the actors that the run is over, and takes nothing more. Idempotent."""
@@ -98,12 +110,13 @@ class Reception:
             self.lock.notify_all()
         farewell = encode(Farewell(learner_epoch=self._epoch, reason=reason))
         self._desk.close(farewell)
-        self._transport.publish(keys.snapshots(self._run), farewell)
+        self._push(farewell)
         self._requests.close()
         for request, _ in self.take_evaluations():
             request.reply(encode(Refusal(code="finished", reason=reason)))
+        self._ended.set()
         if self._judging.is_alive():
-            self._judging.join(timeout=5.0)
+            self._judging.join(timeout=4.0)
 
     # ------------------------------------------------------------------------------------ the main thread
 
@@ -128,14 +141,16 @@ class Reception:
             if not taken.rollouts and not taken.stale:
                 self.lock.wait(HEARTBEAT_SECONDS)
                 taken = self._take(version)
+            actors = self.fleet.actors  # one that was away for long may be forgotten by now
             for rollout in taken.stale:
                 self._counters.rollouts_rejected["stale"] += 1
-                self.fleet.actors[rollout.identity.actor].rejected["stale"] += 1
+                if rollout.identity.actor in actors:
+                    actors[rollout.identity.actor].rejected["stale"] += 1
             if taken.rollouts:
                 self._counters.trained(taken.rollouts, version, self._spec.training.updates_per_batch)
                 for rollout in taken.rollouts:
-                    steps = int(np.count_nonzero(rollout.valid))
-                    self.fleet.actors[rollout.identity.actor].env_steps += steps
+                    if rollout.identity.actor in actors:
+                        actors[rollout.identity.actor].env_steps += int(np.count_nonzero(rollout.valid))
                 self._version = version + self._spec.training.updates_per_batch
             self.lock.notify_all()
         return taken.rollouts
@@ -149,6 +164,11 @@ class Reception:
             taken = list(self._evaluations)
             self._evaluations.clear()
         return taken
+
+    @property
+    def queue_bytes(self) -> int:
+        """How much waits to be judged."""
+        return self._requests.bytes
 
     def newest_snapshot(self) -> bytes:
         """The snapshot that was published last, encoded."""
@@ -171,8 +191,12 @@ class Reception:
             )
         )
         self._desk.offer_snapshot(snapshot)
-        self._transport.publish(keys.snapshots(self._run), snapshot)
+        self._push(snapshot)
         self._counters.snapshots_published += 1
+
+    def _push(self, news: bytes) -> None:
+        with contextlib.suppress(TransportError):  # in a session that is being replaced: who needs it asks for it
+            self._transport.publish(keys.snapshots(self._run), news)
 
     # ----------------------------------------------------------------------------- the transport's threads
 
@@ -186,6 +210,10 @@ class Reception:
             request.reply(encode(Acknowledgement(verdict="finished")))
         elif not self._requests.offer(request):
             request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._version)))
+            with self.lock:
+                actor = self.fleet.actors.get(keys.last_chunk(request.key))
+                if actor is not None:
+                    actor.busy += 1
 
     def _on_evaluation(self, request: Request) -> None:
         sender = keys.last_chunk(request.key)
@@ -209,6 +237,14 @@ class Reception:
         with self.lock:
             status = self._status(self.fleet)
         request.reply(encode(StatusReport(status=status)))
+
+    # --------------------------------------------------------------------------------- the watchdog thread
+
+    def _watch_silence(self) -> None:
+        while not self._ended.wait(_SILENCE_SECONDS / 2):
+            if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
+                with contextlib.suppress(TransportError):  # no router there now: the session that is goes on looking
+                    self._transport.reopen(unless_served=keys.status(self._run))
 
     # ----------------------------------------------------------------------------------- the intake thread
 

@@ -6,14 +6,15 @@ Works on a thread of its own: a slow disk, and the loading of TensorBoard, cost 
 import contextlib
 import queue
 import threading
-from collections.abc import Callable
+import time
 from pathlib import Path
 
-from learner.metrics import CsvWriter, Details, MetricsWriter, MetricsWriters, NullWriter, TensorBoardWriter
+from learner.metrics import CsvWriter, Details, MetricsWriter, MetricsWriters, TensorBoardWriter
 from learner.progress import Progress
 from learner.run_directory import METRICS
 
 _QUEUED_ROWS = 256  # beyond that rows are left out rather than waited for
+_RETRY_SECONDS = 10.0  # after the disk refused a row
 
 
 class Recorder:
@@ -22,6 +23,8 @@ class Recorder:
     def __init__(self, directory: Path, progress: Progress) -> None:
         self._progress = progress
         self._directory = directory
+        self._writer: MetricsWriter | None = None
+        self._refused_at: float | None = None
         self._rows: queue.Queue[tuple[dict[str, float], Details] | None] = queue.Queue(_QUEUED_ROWS)
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -38,27 +41,32 @@ class Recorder:
         self._progress.end()
 
     def _work(self) -> None:
-        writer: MetricsWriter = NullWriter()
-        opened = False
         while (taken := self._rows.get()) is not None:
             self._progress.show(taken[0])
-            if not opened:
-                writer = self._attempt(self._open, NullWriter())
-                opened = True
-            writer = self._attempt(lambda writer=writer, taken=taken: _written(writer, *taken), NullWriter())
-        self._attempt(writer.close, None)
+            if self._refused_at is None or time.monotonic() >= self._refused_at + _RETRY_SECONDS:
+                self._write(*taken)
+        self._let_go()
 
-    def _open(self) -> MetricsWriter:
-        return MetricsWriters([CsvWriter(self._directory / METRICS), TensorBoardWriter(self._directory)])
-
-    def _attempt(self, action: Callable, otherwise):
+    def _write(self, row: dict[str, float], details: Details) -> None:
+        """Writes a row; where the disk refuses it, it is left out, and files are opened anew for a later one."""
         try:
-            return action()
+            if self._writer is None:
+                self._writer = MetricsWriters(
+                    [CsvWriter(self._directory / METRICS), TensorBoardWriter(self._directory)]
+                )
+            self._writer.write(row, details)
         except OSError as error:
-            self._progress.say(f"metrics are no longer written: {error}")
-            return otherwise
+            self._let_go()
+            if self._refused_at is None:
+                self._progress.say(f"metrics cannot be written ({error.strerror}); training goes on")
+            self._refused_at = time.monotonic()
+            return
+        if self._refused_at is not None:
+            self._refused_at = None
+            self._progress.say("metrics are written again")
 
-
-def _written(writer: MetricsWriter, row: dict[str, float], details: Details) -> MetricsWriter:
-    writer.write(row, details)
-    return writer
+    def _let_go(self) -> None:
+        if self._writer is not None:
+            with contextlib.suppress(OSError):  # what it could not write was told already
+                self._writer.close()
+            self._writer = None

@@ -1,5 +1,6 @@
 """What a run tells of itself: metrics rows, the status, the summary. Reads counters and fleet; no I/O."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,21 +9,53 @@ from learner.counters import RunCounters
 from learner.fleet import Fleet
 from protocol.spec import RunSpec, RunStatus
 
+_STALLED_SECONDS = 60.0  # without an update for so long, something is wrong
+_ALONE_SECONDS = 10.0  # and without an actor
+
+
+@dataclass(slots=True)
+class Health:
+    """What the service observes of itself, on the monotonic clock; from it come the problems that a status tells of."""
+
+    started: float
+    updated: float  # the last update, or the start
+    attended: float  # when an actor last took part, or the start
+    saved: float | None = None  # the last checkpoint
+    save_fault: str = ""  # why the newest attempt at one failed
+    gradient_fault: bool = False  # the last update was skipped
+
+    def problems(self, now: float, live: int) -> tuple[str, ...]:
+        """What keeps the service from doing its work, worst first; none if it is healthy."""
+        found = []
+        if not live and now - self.attended > _ALONE_SECONDS:
+            found.append(f"no actor has taken part for {now - self.attended:.0f} s")
+        elif now - self.updated > _STALLED_SECONDS:
+            found.append(f"no update for {now - self.updated:.0f} s")
+        if self.gradient_fault:
+            found.append("updates are skipped: the gradient is not finite")
+        if self.save_fault:
+            found.append(f"checkpoints cannot be saved: {self.save_fault}")
+        return tuple(found)
+
 
 class RateMeter:
     """Rates since the last look."""
 
     def __init__(self, counters: RunCounters, now: float) -> None:
         self.rates: dict[str, float] = {}  # as of the last look
+        self._actors: dict[str, int] = {}  # their env_steps
         self._mark(counters, now)
 
     def _mark(self, counters: RunCounters, now: float) -> None:
         self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
         self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
 
-    def look(self, counters: RunCounters, now: float) -> dict[str, float]:
-        """env_steps and updates a second, and the mean policy lag, since the last look."""
+    def look(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
+        """env_steps and updates a second, and the mean policy lag, since the last look; each actor is told its own."""
         seconds = max(now - self._then, 1e-9)
+        for actor in fleet.actors.values():
+            actor.env_steps_per_second = (actor.env_steps - self._actors.get(actor.name, 0)) / seconds
+        self._actors = {actor.name: actor.env_steps for actor in fleet.actors.values()}
         rollouts = max(counters.rollouts_trained - self._rollouts, 1)
         self.rates = {
             "env_steps_per_second": (counters.env_steps - self._env_steps) / seconds,
@@ -66,6 +99,7 @@ def metrics_row(
         "actors": len(fleet.live),
         "rollouts_accepted": counters.rollouts_accepted,
         "rollouts_rejected": counters.rollouts_rejected.total(),
+        "updates_skipped": counters.updates_skipped,
         **learning,
     }
 
@@ -77,23 +111,30 @@ def run_status(
     counters: RunCounters,
     fleet: Fleet,
     rates: dict[str, float],
-    started: float,
+    health: Health,
+    queue_bytes: int,
     now: float,
 ) -> RunStatus:
-    """The answer to a status query; `started` and `now` are on the monotonic clock."""
+    """The answer to a status query; `now` is on the monotonic clock."""
     return RunStatus(
         run=run,
         learner_epoch=learner_epoch,
         algorithm=spec.training.algorithm,
         environment=spec.environment.id,
-        uptime_seconds=now - started,
+        problems=health.problems(now, len(fleet.live)),
+        uptime_seconds=now - health.started,
         env_steps=counters.env_steps,
         env_steps_budget=spec.training.env_steps,
         updates=counters.updates,
+        updates_skipped=counters.updates_skipped,
         episode_return_mean=counters.episode_return_mean,
         env_steps_per_second=rates.get("env_steps_per_second", 0.0),
         updates_per_second=rates.get("updates_per_second", 0.0),
         policy_lag_mean=rates.get("policy_lag_mean", 0.0),
+        queue_bytes=queue_bytes,
+        queue_bytes_limit=spec.service.queue_bytes,
+        checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        rollouts_rejected=dict(counters.rollouts_rejected),
         actors=fleet.statuses(now),
     )
 
@@ -119,6 +160,7 @@ def summary(
         "finished": finished,
         "env_steps": counters.env_steps,
         "updates": counters.updates,
+        "updates_skipped": counters.updates_skipped,
         "episodes": counters.episodes,
         "wall_seconds": wall_seconds,
         "seconds_to_target": seconds_to_target,

@@ -18,9 +18,9 @@ class RequestQueue:
     def offer(self, request: Request) -> bool:
         """Takes a request unless that would exceed the bound; an empty queue takes any."""
         with self._lock:
-            if self._bytes and self._bytes + len(request.payload) > self._max_bytes:
+            if self._bytes and self._bytes + request.size > self._max_bytes:
                 return False
-            self._bytes += len(request.payload)
+            self._bytes += request.size
         self._requests.put(request)
         return True
 
@@ -29,8 +29,13 @@ class RequestQueue:
         request = self._requests.get()
         if request is not None:
             with self._lock:
-                self._bytes -= len(request.payload)
+                self._bytes -= request.size
         return request
+
+    @property
+    def bytes(self) -> int:
+        """What the requests that wait hold."""
+        return self._bytes
 
     def close(self) -> None:
         """Lets `take` return None after what is queued already."""

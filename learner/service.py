@@ -18,7 +18,7 @@ from learner.metrics import Details
 from learner.progress import Progress
 from learner.reception import Reception
 from learner.recorder import Recorder
-from learner.report import RateMeter, metrics_row, run_status, summary
+from learner.report import Health, RateMeter, metrics_row, run_status, summary
 from learner.run_directory import SUMMARY, write_json
 from protocol.codec import encode
 from protocol.messages import EvaluationReport, Refusal
@@ -66,6 +66,7 @@ class LearnerService:
             self._counters.restore(restored.counters)
         self._evaluations = Evaluations(directory, self._epoch)
         self._meter = RateMeter(self._counters, started)
+        self._health = Health(started=started, updated=started, attended=started)
         self._reception = Reception(
             self._run,
             spec,
@@ -105,6 +106,7 @@ class LearnerService:
         recorder = Recorder(self._directory, self._progress)
         begun, first_env_steps = time.monotonic(), self._counters.env_steps
         self._meter = RateMeter(self._counters, begun)
+        self._health.updated = self._health.attended = begun
         try:
             seconds_to_target = self._loop(learner, program, recorder)
         finally:
@@ -150,9 +152,17 @@ class LearnerService:
         """One batch, one update, one snapshot; none of them if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
         rollouts = self._reception.take_batch(learner.policy_version)
-        if rollouts:
-            learner.step(rollouts, progress)
-            self._reception.publish(learner.policy_version, learner.weights())
+        if not rollouts:
+            return
+        skipped = learner.updates_skipped
+        learner.step(rollouts, progress)
+        self._reception.publish(learner.policy_version, learner.weights())
+        self._health.updated = self._health.attended = time.monotonic()
+        skipped = learner.updates_skipped - skipped
+        if skipped and not self._health.gradient_fault:
+            self._progress.say("an update was skipped: its gradient was not finite; the weights stay as they were")
+        self._health.gradient_fault = skipped > 0
+        self._counters.updates_skipped += skipped
 
     def _attend_evaluators(self, learner: "Learner", program: bytes) -> None:
         """Gives evaluators the newest policy, a checkpoint of which is kept, and takes in how it played."""
@@ -183,7 +193,9 @@ class LearnerService:
     def _row(self, learner: "Learner", now: float) -> dict[str, float]:
         with self._reception.lock:
             progress = self._counters.env_steps / self._spec.training.env_steps
-            rates = self._meter.look(self._counters, now)
+            rates = self._meter.look(self._counters, self._reception.fleet, now)
+            if self._reception.fleet.live:
+                self._health.attended = now
             learning = {
                 **learner.take_metrics(),
                 **self._evaluations.take_newest(),
@@ -210,7 +222,8 @@ class LearnerService:
             self._counters,
             fleet,
             self._meter.rates,
-            self._started,
+            self._health,
+            self._reception.queue_bytes,
             time.monotonic(),
         )
 
@@ -223,7 +236,7 @@ class LearnerService:
         with self._reception.lock:
             counters = self._counters.state(self._wall_seconds(time.monotonic()))
         try:
-            return save_checkpoint(
+            directory = save_checkpoint(
                 self._directory,
                 spec=self._spec,
                 spaces=spaces,
@@ -236,8 +249,17 @@ class LearnerService:
                 also_keep=self._evaluations.kept,
             )
         except OSError as error:
-            self._progress.say(f"no checkpoint was saved ({error.strerror}); the one before it stays")
+            if not self._health.save_fault:
+                self._progress.say(
+                    f"no checkpoint could be saved ({error.strerror}); the one before it stays, training goes on, "
+                    f"and it is tried again every {self._spec.service.checkpoint_seconds:g} s"
+                )
+            self._health.save_fault = error.strerror or type(error).__name__
             return None
+        if self._health.save_fault:
+            self._progress.say("checkpoints are saved again")
+        self._health.saved, self._health.save_fault = time.monotonic(), ""
+        return directory
 
     def _write_summary(self, outcome: Outcome, wall_seconds: float, env_steps_per_second: float) -> None:
         content = summary(

@@ -32,7 +32,7 @@ from pydantic import ValidationError
 from protocol import schema
 from protocol.messages import Message, Program, Rollout
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")
@@ -110,6 +110,8 @@ def decode(data: bytes, limits: Limits) -> Message:
     kind, fields, arrays, size = _read_header(header)
     if size > limits.max_bytes:
         raise ProtocolError(f"the body declares {size} bytes, the limit is {limits.max_bytes}")
+    if flags == _ZSTD and _KINDS[kind] not in _COMPRESSED:
+        raise ProtocolError(f"a {kind} does not travel compressed")
     layout = _read_layout(arrays, size, limits)
     buffers = _read_arrays(layout, _plain_body(flags, body, size))
     try:

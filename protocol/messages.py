@@ -43,7 +43,7 @@ class Welcome:
 class Refusal:
     """A typed no, in answer to any query."""
 
-    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished"]
+    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full"]
     reason: str
 
 
@@ -133,9 +133,10 @@ class Acknowledgement:
     accepted: it will be trained on, unless the learner ends first or its policy lag outgrows the bound.
     busy: the learner has no room now; send it again. rejected: never; `reason` says why.
     fenced: the rollout belongs to another life of the learner; join again. finished: the run is over.
+    quarantined: nothing more is taken from this life of the actor, whose rollouts were unfit; `reason` says how.
     """
 
-    verdict: Literal["accepted", "busy", "rejected", "fenced", "finished"]
+    verdict: Literal["accepted", "busy", "rejected", "fenced", "quarantined", "finished"]
     reason: str = ""
     policy_version: int = 0  # the newest
 

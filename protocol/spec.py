@@ -188,6 +188,11 @@ class ServiceSpec(Specification):
     log_seconds: Annotated[float, Field(gt=0.0)] = 0.5
     queue_megabytes: Annotated[float, Field(gt=0.0)] = 64.0  # rollouts waiting to be decoded; beyond: `busy`
 
+    @property
+    def queue_bytes(self) -> int:
+        """What the rollouts that wait to be decoded may hold together."""
+        return int(self.queue_megabytes * 2**20)
+
 
 class RunSpec(Specification):
     """All of a run. Written complete as `config.toml`, which reproduces it."""
@@ -231,12 +236,17 @@ class ActorStatus(Specification):
 
     actor: str
     alive: bool
+    quarantined: str  # why nothing is taken from it any more; empty if it is not
+    lives: int  # incarnations that joined
     seconds_since_seen: float
     environments: int
+    env_steps: int  # trained on
+    env_steps_per_second: float
     rollouts_accepted: int
-    rollouts_rejected: dict[str, int]
-    env_steps: int
-    policy_lag: int
+    rollouts_rejected: dict[str, int]  # by cause
+    rollouts_missed: int  # sequence numbers that never came
+    busy_answers: int  # how often it was told to come again later
+    policy_lag: int  # of its newest rollout
 
 
 class RunStatus(Specification):
@@ -246,12 +256,18 @@ class RunStatus(Specification):
     learner_epoch: int
     algorithm: str
     environment: str
-    uptime_seconds: float
+    problems: tuple[str, ...]  # what keeps the service from doing its work; healthy if there are none
+    uptime_seconds: float  # of this life
     env_steps: int
     env_steps_budget: int
     updates: int
+    updates_skipped: int  # of them, those whose gradient was not finite: they changed nothing
     episode_return_mean: float | None
     env_steps_per_second: float
     updates_per_second: float
     policy_lag_mean: float
+    queue_bytes: int  # rollouts that wait to be judged
+    queue_bytes_limit: int
+    checkpoint_age_seconds: float | None  # None before the first of this life
+    rollouts_rejected: dict[str, int]  # by cause, also from senders that never joined
     actors: tuple[ActorStatus, ...]

@@ -31,6 +31,11 @@ class Request(Protocol):
         ...
 
     @property
+    def size(self) -> int:
+        """How many bytes came with it; asking copies nothing."""
+        ...
+
+    @property
     def payload(self) -> bytes:
         """What came with it."""
         ...
@@ -79,6 +84,14 @@ class Transport(Protocol):
         """Calls `on_change(key, present)` for all present now and for every change."""
         ...
 
+    def reopen(self, unless_served: str | None = None) -> bool:
+        """Starts afresh, with all that was declared, in place of a session that may be dead; whether it did.
+
+        With `unless_served` only if that, seen from outside, nobody serves that key. Raises TransportError if there
+        is nothing to connect to; all stays as it was then.
+        """
+        ...
+
     def close(self) -> None:
         """Ends everything that this end declared. Idempotent."""
         ...
@@ -86,7 +99,7 @@ class Transport(Protocol):
 
 class _MemoryRequest:
     def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes | None], None]) -> None:
-        self.key, self.payload = key, payload
+        self.key, self.payload, self.size = key, payload, len(payload)
         self._on_answer: Callable[[bytes | None], None] | None = on_answer
 
     def reply(self, payload: bytes) -> None:
@@ -213,6 +226,10 @@ class MemoryTransport:
             for pattern, on_change in end._watches:
                 if _matches(pattern, key):
                     on_change(key, present)
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        """See Transport. There is no session here that could die."""
+        return False
 
     def close(self) -> None:
         """See Transport."""

@@ -14,6 +14,7 @@ What Zenoh needs to be held to (measured, see docs/results.md):
 import contextlib
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import zenoh
@@ -21,6 +22,8 @@ import zenoh
 from protocol.transport import AddressInUseError, Inbox, Request, Transport, TransportError
 
 _LEASE_MILLISECONDS = 2000  # a peer that is silent for as long is gone
+_FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts to connect at the start
+_PROBE_SECONDS = 2.0  # for a look from outside
 _RETRY_MILLISECONDS = 100  # how soon a client tries again after its router vanished; doubles up to ten times this
 
 
@@ -38,6 +41,31 @@ def connect(endpoints: list[str]) -> Transport:
     Raises TransportError at once if none of them can be reached.
     """
     return _open("client", [], endpoints)
+
+
+def connect_when_there(
+    endpoints: list[str], stop: threading.Event, say: Callable[[str], None], timeout: float | None = None
+) -> Transport | None:
+    """Tries to `connect` until something answers, and says once that it waits; None if told to stop first.
+
+    Raises TransportError after `timeout` seconds.
+    """
+    deadline = None if timeout is None else time.monotonic() + timeout
+    pause, told = _FIRST_PAUSE_SECONDS, False
+    while True:
+        try:
+            return connect(endpoints)
+        except TransportError as error:
+            if deadline is not None and time.monotonic() > deadline:
+                raise TransportError(
+                    f"{error} within {timeout:g} s: is the learner running, and is the address its own?"
+                ) from None
+            if not told and pause >= _MAX_PAUSE_SECONDS / 2:
+                say(f"{error} yet; waiting for it")
+                told = True
+        if stop.wait(pause):
+            return None
+        pause = min(2 * pause, _MAX_PAUSE_SECONDS)
 
 
 def _open(mode: str, listen_on: list[str], connect_to: list[str]) -> "ZenohTransport":
@@ -59,13 +87,16 @@ def _open(mode: str, listen_on: list[str], connect_to: list[str]) -> "ZenohTrans
         "transport/link/tx/lease": _LEASE_MILLISECONDS,
         "transport/shared_memory/enabled": False,
     }
-    try:
-        for name, value in settings.items():
-            config.insert_json5(name, json.dumps(value))
-        session = zenoh.open(config)
-    except zenoh.ZError as error:
-        raise _opening_error(str(error), listen_on, connect_to) from None
-    return ZenohTransport(session)
+
+    def open_session() -> zenoh.Session:
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise _opening_error(str(error), listen_on, connect_to) from None
+
+    return ZenohTransport(open_session, is_client=mode == "client")
 
 
 def _opening_error(text: str, listen_on: list[str], connect_to: list[str]) -> TransportError:
@@ -87,15 +118,32 @@ def _as_transport_error(what: str) -> Iterator[None]:
         raise TransportError(f"cannot {what}: {error}") from None
 
 
+def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
+    """Every answer to a query."""
+    replies = session.get(
+        key,
+        payload=payload,
+        timeout=timeout,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,  # else one answer for each key, of all that serve it
+    )
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
 class _ZenohRequest:
     """One query of Zenoh's; finalised as soon as it is answered or forgotten."""
 
-    __slots__ = ("_query", "key", "payload")
+    __slots__ = ("_buffers", "_query", "key", "size")
 
     def __init__(self, query: zenoh.Query, served: str) -> None:
         self._query: zenoh.Query | None = query
+        self._buffers = query.payload
         self.key = served if "*" in str(query.key_expr) else str(query.key_expr)
-        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.size = 0 if self._buffers is None else len(self._buffers)
+
+    @property
+    def payload(self) -> bytes:
+        return b"" if self._buffers is None else self._buffers.to_bytes()
 
     def reply(self, payload: bytes) -> None:
         query, self._query = self._query, None
@@ -124,10 +172,15 @@ class _ZenohInbox:
 
 
 class ZenohTransport:
-    """A Transport over one Zenoh session."""
+    """A Transport over one Zenoh session, and over another in its place where it was reopened."""
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    def __init__(self, open_session: Callable[[], zenoh.Session], *, is_client: bool) -> None:
+        """Opens its session; `open_session` raises TransportError if it cannot."""
+        self._open_session = open_session
+        self._is_client = is_client
+        self._session = open_session()
+        self._closed = False
+        self._declarations: list[Callable[[zenoh.Session], object]] = []  # to be made again in another session
         self._declared: list[object] = []  # tokens and watches end when they are garbage
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -135,22 +188,21 @@ class ZenohTransport:
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
+
+        def on_query(query: zenoh.Query) -> None:
+            handler(_ZenohRequest(query, key))
+
         with _as_transport_error(f"serve {key}"):
-            self._declared.append(
-                self._session.declare_queryable(key, lambda query: handler(_ZenohRequest(query, key)), complete=True)
-            )
+            self._declare(lambda session: session.declare_queryable(key, on_query, complete=True))
+
+    def _declare(self, declaration: Callable[[zenoh.Session], object]) -> None:
+        self._declarations.append(declaration)
+        self._declared.append(declaration(self._session))
 
     def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
         with _as_transport_error(f"ask {key}"):
-            replies = self._session.get(
-                key,
-                payload=payload,
-                timeout=timeout,
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,  # else one answer for each key, of all that serve it
-            )
-            return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+            return _answers(self._session, key, payload, timeout)
 
     def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
         """See Transport."""
@@ -201,25 +253,54 @@ class ZenohTransport:
             on_news()
 
         with _as_transport_error(f"follow {key}"):
-            self._declared.append(self._session.declare_subscriber(key, on_sample))
+            self._declare(lambda session: session.declare_subscriber(key, on_sample))
         return inbox
 
     def announce(self, key: str) -> None:
         """See Transport."""
         with _as_transport_error(f"announce {key}"):
-            self._declared.append(self._session.liveliness().declare_token(key))
+            self._declare(lambda session: session.liveliness().declare_token(key))
 
     def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
+        present: set[str] = set()
 
         def on_sample(sample: zenoh.Sample) -> None:
-            on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            name, is_there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            (present.add if is_there else present.discard)(name)
+            on_change(name, is_there)
+
+        def declaration(session: zenoh.Session) -> object:
+            while present:  # as seen by a session that was given up: who is still there is told of again
+                on_change(present.pop(), False)
+            # Without history a token declared just after the subscriber is missed now and then.
+            return session.liveliness().declare_subscriber(key, on_sample, history=True)
 
         with _as_transport_error(f"watch {key}"):
-            # Without history a token declared just after the subscriber is missed now and then.
-            self._declared.append(self._session.liveliness().declare_subscriber(key, on_sample, history=True))
+            self._declare(declaration)
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        """See Transport. A router that listens here is never reopened: it would refuse itself the address."""
+        if not self._is_client:
+            return False
+        session = self._open_session()
+        unneeded = unless_served is not None and bool(_answers(session, unless_served, b"", _PROBE_SECONDS))
+        with self._lock:
+            if unneeded or self._closed:
+                session.close()
+                return False
+            given_up, self._session = self._session, session
+            self._queriers.clear()
+            self._publishers.clear()
+        given_up.close()
+        with _as_transport_error("declare again"):
+            self._declared = [declaration(session) for declaration in self._declarations]
+        return True
 
     def close(self) -> None:
         """See Transport."""
-        if not self._session.is_closed():
-            self._session.close()
+        with self._lock:
+            self._closed = True
+            session = self._session
+        if not session.is_closed():
+            session.close()

@@ -56,6 +56,19 @@ def test_nothing_that_executes_what_it_reads_is_used(package: str) -> None:
                 assert ast.unparse(node.func) not in {"eval", "exec", "torch.load", "yaml.load", "np.load"}, path
 
 
+def test_nothing_is_decided_by_the_time_of_day() -> None:
+    """Which may be set at any time; it only dates TensorBoard's events and names run directories."""
+    wall = {"time.time", "time.time_ns", "time.strftime", "datetime.now", "datetime.datetime.now"}
+    users = {
+        (path.name, ast.unparse(node.func))
+        for package in PACKAGES
+        for path, tree in sources(package)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in wall
+    }
+    assert users == {("metrics.py", "time.time"), ("run_directory.py", "time.strftime")}
+
+
 @pytest.mark.parametrize(
     ("module", "absent"),
     [

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from processes import LIMIT
+from processes import LIMIT, until
 
+from actor import learner_link, service
 from actor.learner_link import ActorError
 from actor.service import ActorConfig, ActorService
 from policy.network import ActorCritic
@@ -18,7 +19,7 @@ from protocol import keys
 from protocol.codec import Limits, decode, encode
 from protocol.messages import Acknowledgement, Farewell, Join, Message, Program, Refusal, Rollout, Snapshot, Welcome
 from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
-from protocol.transport import MemoryNetwork, MemoryTransport, Request
+from protocol.transport import MemoryNetwork, MemoryTransport, Request, TransportError
 
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
@@ -327,3 +328,63 @@ def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
     actor = RunningActor(network, timeout=0.05)
     actor.join()
     assert "no learner answered within 0.05 s" in str(actor.error)
+
+
+def test_in_quarantine_it_ends_with_the_reason(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    request.reply(encode(Acknowledgement(verdict="quarantined", reason="3 unfit rollouts in a row")))
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "takes nothing more of this actor: 3 unfit rollouts in a row" in str(actor.error)
+
+
+def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to_be_heard(
+    network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "_SILENCE_SECONDS", 0.1)
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    held = [learner.receive(), learner.receive()]  # never answered
+    asked = threading.Semaphore(0)
+    answering = threading.Event()
+    answering.set()
+
+    def snapshot(request: Request) -> None:
+        asked.release()
+        if answering.is_set():
+            request.reply(learner.snapshot)
+
+    learner.transport.serve(keys.snapshots("r"), snapshot)
+    for _ in range(3):
+        assert asked.acquire(timeout=LIMIT)
+    joins = learner.joins.qsize()
+    assert joins == 2  # it was answered: the learner only takes its time
+    answering.clear()
+    until(lambda: learner.joins.qsize() > joins)
+    assert any("went away" in text for text in actor.said)
+    answering.set()
+    again = learner.receive()
+    assert again[0].identity in [rollout.identity for rollout, _ in held]  # sent again, to be taken at most once
+
+
+def test_while_nobody_answers_it_tries_other_sessions(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learner_link, "_REOPEN_SECONDS", 0.0)
+    reopened = threading.Semaphore(0)
+
+    def reopen(transport: MemoryTransport) -> bool:
+        reopened.release()
+        raise TransportError("nothing answers there")
+
+    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
+    actor = RunningActor(network)
+    for _ in range(3):
+        assert reopened.acquire(timeout=LIMIT)
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    learner.receive()
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None

@@ -75,3 +75,10 @@ def test_fenced_and_finished_end_it() -> None:
         uploader.add(0, b"a")
         uploader.answered(0, answer(verdict), 0.0)
         assert uploader.over == verdict
+
+
+def test_a_quarantine_is_kept_with_its_reason() -> None:
+    uploader = Uploader(window=2)
+    uploader.add(0, b"a")
+    uploader.answered(0, Acknowledgement(verdict="quarantined", reason="why"), 0.0)
+    assert (uploader.over, uploader.reason, uploader.in_flight) == ("quarantined", "why", {})

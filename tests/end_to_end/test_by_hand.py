@@ -30,7 +30,7 @@ def env_steps(status: dict | None, actor: str) -> int:
 
 def test_an_actor_that_starts_first_waits_and_says_so(start: Start, address: str) -> None:
     actor = start("actor", "--connect", address, "--name", "early")
-    actor.expect("waiting for the learner")
+    actor.expect("waiting for it")
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000)
     actor.expect("joined run 'run' as 'early': 128 x CartPole-v1")
     assert learner.wait() == 3, learner.output
@@ -100,6 +100,6 @@ def test_an_actor_carries_no_torch_and_stays_small(start: Start, address: str) -
 
 def test_sigterm_ends_an_actor_in_good_order(start: Start, address: str) -> None:
     waiting = start("actor", "--connect", address, "--name", "waiting")
-    waiting.expect("waiting for the learner")
+    waiting.expect("waiting for it")
     waiting.process.terminate()
     assert waiting.wait() == 0

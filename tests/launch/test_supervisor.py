@@ -1,17 +1,85 @@
 """launch/supervisor.py: the processes of `daedalus train`."""
 
 import os
+import subprocess
+import sys
+from collections.abc import Set
 
 import pytest
+from processes import LIMIT, until
 
-from launch.supervisor import SupervisedActor, stop
+from launch import supervisor
+from launch.supervisor import FailedError, Supervised, stop, supervised_actor
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="processes have no priorities here")
 def test_actors_come_after_the_learner() -> None:
-    actor = SupervisedActor("actor-0", "tcp/127.0.0.1:1")  # nobody listens there: it goes on looking
+    actor = supervised_actor("actor-0", "tcp/127.0.0.1:1")  # nobody listens there: it goes on looking
     try:
         ours = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, actor.process.pid) == min(ours + 5, 19)
     finally:
         stop([actor.process])
+
+
+def supervised(program: str, ended: Set[int] = frozenset({0})) -> Supervised:
+    """A process that runs a line of Python."""
+
+    def begin(first: bool) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-S", "-c", program, str(first)], stdin=subprocess.PIPE)
+
+    return Supervised("it", begin, ended)
+
+
+def news(process: Supervised) -> str:
+    """What the next check that has something to say tells."""
+    found: list[str] = []
+    until(lambda: found.append(process.check() or "") or found[-1])
+    return found[-1]
+
+
+SLEEP = "import time; time.sleep(1000)"
+
+
+def test_a_killed_process_is_started_again_and_told_that_it_is_not_the_first() -> None:
+    process = supervised(f"import sys; sys.argv[1] == 'True' or sys.exit(0); {SLEEP}")
+    try:
+        assert process.check() is None
+        process.process.kill()
+        assert news(process) == "it was killed by signal 9; started again"
+        assert process.process.wait(LIMIT) == 0
+        assert process.check() is None
+        assert (process.restarts, process.failures) == (1, 0)
+    finally:
+        stop([process.process])
+
+
+def test_a_process_that_fails_by_itself_is_given_up_after_the_third_time() -> None:
+    process = supervised("raise SystemExit(7)")
+    process.process.wait(LIMIT)
+    assert process.failed_at_once
+    assert [news(process), news(process)] == ["it failed with status 7; started again"] * 2
+    assert not process.failed_at_once
+    with pytest.raises(FailedError, match="it failed 3 times"):
+        news(process)
+    stop([process.process])
+
+
+def test_failures_far_apart_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "_SOON_SECONDS", 0.0)
+    process = supervised("raise SystemExit(7)")
+    for _ in range(5):
+        news(process)
+    process.process.wait(LIMIT)
+    assert not process.failed_at_once
+    stop([process.process])
+
+
+def test_who_left_while_the_others_go_on_is_fetched_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    process = supervised("pass")
+    process.process.wait(LIMIT)
+    assert process.check() is None
+    assert process.restarts == 0
+    monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
+    assert news(process) == "it had left; started again"
+    stop([process.process])

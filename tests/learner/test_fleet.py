@@ -1,11 +1,12 @@
 """learner/fleet.py: who takes part, under which identity, and what was taken of them."""
 
+import pytest
 from building import SPACES, identity, joined_fleet
 from hypothesis import given
 from hypothesis import strategies as st
 
 from learner.fleet import Fleet, SequenceWindow
-from protocol.messages import Join
+from protocol.messages import Join, Refusal
 from protocol.spec import ArraySpace, ChoiceSpace, Spaces
 
 WINDOW = 1024
@@ -163,6 +164,55 @@ def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
     assert fleet.live == {"a", "b"}
     fleet.set_present("a", False)
     assert fleet.live == {"b"}
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "*", "x" * 65, "-a", "é"])
+def test_a_name_that_is_no_part_of_a_key_is_refused(name: str) -> None:
+    fleet = Fleet(1, None)
+    refusal = fleet.join(Join(actor=name, incarnation=1, spaces=SPACES, environments=1), 0.0)
+    assert refusal is not None
+    assert refusal.code == "malformed"
+    assert "actor name" in refusal.reason
+    assert not fleet.actors
+
+
+def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_are_forgotten() -> None:
+    fleet = Fleet(1, None)
+
+    def join(number: int) -> Refusal | None:
+        return fleet.join(Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=1), float(number))
+
+    most = 16_384
+    for number in range(most):
+        assert join(number) is None
+        fleet.set_present(f"a{number}", True)
+    refusal = join(most)
+    assert refusal is not None
+    assert (refusal.code, refusal.reason) == ("full", f"{most} actors take part already")
+    for away in (7, 5, 9):
+        fleet.set_present(f"a{away}", False)
+    assert join(most) is None
+    assert len(fleet.actors) == most
+    assert "a5" not in fleet.actors
+    assert {"a7", "a9"} < fleet.actors.keys()
+
+
+def test_presence_alone_makes_nobody_an_actor() -> None:
+    fleet = Fleet(1, None)
+    fleet.set_present("a", True)
+    assert not fleet.actors
+    fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=1), 0.0)
+    assert fleet.live == {"a"}
+
+
+def test_what_never_came_is_counted_and_fits_a_message() -> None:
+    fleet = joined_fleet("a")
+    fleet.actors["a"].sequences.add(WINDOW + 4)
+    assert fleet.statuses(0.0)[0].rollouts_missed == 5
+    fleet.actors["a"].sequences.add(2**63 - 1)
+    fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=1), 0.0)
+    fleet.actors["a"].sequences.add(2**63 - 1)
+    assert fleet.statuses(0.0)[0].rollouts_missed < 2**63
 
 
 def test_seeds_differ_by_actor_life_start_and_run_and_are_otherwise_the_same() -> None:

@@ -32,7 +32,7 @@ class Desk:
     def memory(self) -> list[Any]:
         """All that the fleet knows, but for what a rejection is to leave: when it was, and the count of it."""
         told = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
-        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None} for each in told]]
+        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None, "unfit": None} for each in told]]
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_another_message_is_no_rollout(desk: Desk) -> None:
 )
 def test_other_numbers_of_rows_and_environments_are_malformed(desk: Desk, rollout: Rollout) -> None:
     reason = f"it has {rollout.rows} rows of {rollout.environments} environments, this run has {ROWS} of"
-    assert_rejected(desk, encode(rollout), "malformed", reason)
+    assert_rejected(desk, encode(rollout), "unfit", reason)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_other_numbers_of_rows_and_environments_are_malformed(desk: Desk, rollou
 )
 def test_other_frames_are_malformed_and_both_are_named(desk: Desk, rollout: Rollout) -> None:
     theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
-    verdict = assert_rejected(desk, encode(rollout), "malformed", theirs)
+    verdict = assert_rejected(desk, encode(rollout), "unfit", theirs)
     assert f"this run has float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
 
@@ -154,17 +154,17 @@ def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(desk: Des
 def test_an_action_out_of_range_is_malformed(desk: Desk, action: int) -> None:
     actions = good().actions.astype(np.int32)
     actions[-1, -1] = action
-    assert_rejected(desk, encode(good(actions=actions)), "malformed", "action")
+    assert_rejected(desk, encode(good(actions=actions)), "unfit", "action")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["frames", "behaviour_log_probs", "rewards", "episode_returns"])
 def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(desk: Desk, name: str, value: float) -> None:
-    assert_rejected(desk, encode(with_value(name, value)), "malformed", name)
+    assert_rejected(desk, encode(with_value(name, value)), "unfit", name)
 
 
 def test_a_log_probability_above_0_is_malformed(desk: Desk) -> None:
-    assert_rejected(desk, encode(with_value("behaviour_log_probs", 0.01)), "malformed", "log-probability")
+    assert_rejected(desk, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 
 
 def test_a_log_probability_that_rounding_put_above_0_is_accepted(desk: Desk) -> None:
@@ -172,13 +172,13 @@ def test_a_log_probability_that_rounding_put_above_0_is_accepted(desk: Desk) -> 
 
 
 def test_a_policy_version_yet_to_come_is_malformed(desk: Desk) -> None:
-    assert_rejected(desk, encode(good(version=VERSION + 1)), "malformed", "yet to come")
+    assert_rejected(desk, encode(good(version=VERSION + 1)), "unfit", "yet to come")
 
 
 @pytest.mark.parametrize("size", [1, 7])
 def test_a_memory_where_the_policy_has_none_is_malformed(desk: Desk, size: int) -> None:
     reason = f"its policy remembers {size} numbers, this run's 0"
-    assert_rejected(desk, encode(good(state_size=size)), "malformed", reason)
+    assert_rejected(desk, encode(good(state_size=size)), "unfit", reason)
 
 
 @pytest.mark.parametrize("size", [0, 4, 6])
@@ -248,8 +248,7 @@ def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
 def test_frames_of_another_stack_or_size_are_malformed(frames: np.ndarray) -> None:
     verdict = stacked_desk().receive(encode(good(frames=frames)))
     assert isinstance(verdict, Rejected)
-    assert verdict.cause == "malformed"
-    assert "frames are uint8" in verdict.reason or "the limit is" in verdict.reason
+    assert ("the limit is" if verdict.cause == "malformed" else "frames are uint8") in verdict.reason
 
 
 def test_the_limit_lets_the_largest_rollout_of_the_run_through_and_not_much_more() -> None:
@@ -345,6 +344,65 @@ def test_a2c_takes_the_newest_version_only_whatever_lag_is_allowed() -> None:
     assert isinstance(desk.receive(encode(good(who=identity(sequence=1)))), Rollout)
 
 
+# ------------------------------------------------------------------------------------------- quarantine
+
+
+def broken(sequence: int) -> bytes:
+    return encode(dataclasses.replace(with_value("rewards", np.nan), identity=identity(sequence=sequence)))
+
+
+def verdicts(desk: Desk, *messages: bytes) -> list[str]:
+    return [acknowledgement(desk.receive(data), VERSION).verdict for data in messages]
+
+
+def test_after_three_unfit_rollouts_in_a_row_nothing_is_taken_any_more(desk: Desk) -> None:
+    fit = encode(good(who=identity(sequence=9)))
+    assert verdicts(desk, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
+    actor = desk.fleet.actors["a"]
+    assert actor.quarantined == "3 unfit rollouts in a row, the last: rewards has a value that is not finite"
+    assert actor.rejected == {"unfit": 3, "quarantined": 1}
+    assert desk.fleet.live == {"b"}
+    assert isinstance(desk.receive(encode(good(who=identity("b"))), "b"), Rollout)
+
+
+def test_a_fit_rollout_between_them_keeps_an_actor_out_of_quarantine(desk: Desk) -> None:
+    fit = [encode(good(who=identity(sequence=sequence))) for sequence in (10, 11)]
+    assert "quarantined" not in verdicts(desk, broken(0), broken(1), fit[0], broken(2), broken(3), fit[1])
+
+
+def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(desk: Desk) -> None:
+    verdicts(desk, broken(0), broken(1), broken(2))
+    desk.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    assert verdicts(desk, encode(good(who=identity(sequence=5)))) == ["quarantined"]
+    desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    assert desk.fleet.live == {"a", "b"}
+    assert verdicts(desk, encode(good(who=identity(incarnation=2)))) == ["accepted"]
+
+
+def test_bytes_that_anybody_could_have_sent_quarantine_nobody(desk: Desk) -> None:
+    """Who does not know an actor's incarnation and the learner's epoch cannot have it shut out."""
+    strangers = [identity(incarnation=8), identity(epoch=EPOCH + 1)]
+    noise = [b"noise", encode(good())[:-1], *(encode(good(who=who, rows=ROWS - 1)) for who in strangers)]
+    assert "quarantined" not in verdicts(desk, *noise, *noise)
+    assert verdicts(desk, encode(good())) == ["accepted"]
+
+
+def test_rewards_beyond_what_they_are_clipped_to_are_unfit(desk: Desk) -> None:
+    spec = run_spec(max_policy_lag=MAX_LAG)
+    environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
+    desk.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, desk.fleet)
+    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5, np.float32))
+    beyond = good(who=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
+    assert isinstance(desk.receive(encode(within)), Rollout)
+    verdict = desk.receive(encode(beyond))
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == "rewards has a value beyond the 0.5 that they are clipped to"
+
+
+def test_an_episode_without_a_step_is_unfit(desk: Desk) -> None:
+    assert_rejected(desk, encode(good(episode_lengths=np.array([0], np.int32))), "unfit", "episode_lengths")
+
+
 # ---------------------------------------------------------------------------------------- at most once
 
 TINY = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=ChoiceSpace(count=4))
@@ -353,7 +411,7 @@ SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([
 
 
 class Traffic(RuleBasedStateMachine):
-    """Rollouts that come late, twice, out of order, from lives that are over; held against a set of all taken."""
+    """Rollouts that come late, twice, out of order, broken, from lives that are over; held against all taken."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -362,6 +420,7 @@ class Traffic(RuleBasedStateMachine):
         self.version = 0
         self.lives = {"a": 0, "b": 0}  # incarnations count up from 1
         self.incarnations = {"a": 0, "b": 0}  # the one that joined last
+        self.unfit = {"a": 0, "b": 0}  # in a row, of the life that joined last
         self.taken: dict[tuple[str, int], set[int]] = {}
         self.accepted: list[tuple[str, int, int]] = []
         self.sent: list[tuple[str, Rollout]] = []  # those that were accepted
@@ -377,6 +436,8 @@ class Traffic(RuleBasedStateMachine):
             self._join(name, self.lives[name] - older)
 
     def _join(self, name: str, incarnation: int) -> None:
+        if self.incarnations[name] != incarnation:
+            self.unfit[name] = 0
         self.incarnations[name] = incarnation
         join = Join(actor=name, incarnation=incarnation, spaces=TINY, environments=1)
         assert self.fleet.join(join, 0.0) is None
@@ -392,11 +453,15 @@ class Traffic(RuleBasedStateMachine):
         sequence=SEQUENCES,
         lag=st.sampled_from([0, 0, 1, 2, 3, -1]),
         epoch=st.sampled_from([EPOCH, EPOCH, EPOCH, EPOCH + 1]),
+        reward=st.sampled_from([1.0, 1.0, 1.0, np.nan, np.inf]),
     )
-    def a_rollout_comes(self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int) -> None:
+    def a_rollout_comes(
+        self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int, reward: float
+    ) -> None:
         who = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
         version = max(self.version - lag, 0)
-        rollout = make_rollout(who, version=version, rows=1, environments=1, shape=(1,))
+        rewards = np.full((1, 1), reward, np.float32)
+        rollout = make_rollout(who, version=version, rows=1, environments=1, shape=(1,), rewards=rewards)
         self._deliver(name if key == "own" else key, rollout)
 
     @precondition(lambda self: self.sent)
@@ -409,6 +474,12 @@ class Traffic(RuleBasedStateMachine):
         expected = self._expected(sender, rollout)
         assert (verdict.cause if isinstance(verdict, Rejected) else "") == expected
         who = rollout.identity
+        if expected == "unfit":
+            self.unfit[sender] += 1
+            assert isinstance(verdict, Rejected)
+            assert verdict.verdict == ("quarantined" if self.unfit[sender] == 3 else "rejected")
+        if expected == "":
+            self.unfit[sender] = 0
         if expected in ("", "stale"):
             self.taken.setdefault((who.actor, who.incarnation), set()).add(who.sequence)
         if isinstance(verdict, Rollout):
@@ -420,21 +491,26 @@ class Traffic(RuleBasedStateMachine):
         who = rollout.identity
         if not self.incarnations[sender]:
             return "unknown_actor"
+        if self.unfit[sender] == 3:
+            return "quarantined"
         if who.learner_epoch != EPOCH:
             return "epoch"
         if who.actor != sender or who.incarnation != self.incarnations[sender]:
             return "unknown_actor"
+        if not np.isfinite(rollout.rewards).all():
+            return "unfit"
         taken = self.taken.get((who.actor, who.incarnation), set())
         if who.sequence in taken or who.sequence <= max(taken, default=0) - 1024:
             return "duplicate"
         if rollout.policy_version > self.version:
-            return "malformed"
+            return "unfit"
         return "stale" if self.version - rollout.policy_version > 2 else ""
 
     @invariant()
     def each_was_accepted_at_most_once(self) -> None:
         assert len(set(self.accepted)) == len(self.accepted)
         for name, actor in self.fleet.actors.items():
+            assert bool(actor.quarantined) == (self.unfit[name] == 3)
             assert actor.accepted == sum(accepted[0] == name for accepted in self.accepted)
 
 

@@ -371,3 +371,30 @@ def test_statistics_of_another_optimiser_are_refused(wrote: str, reads: str, tmp
     checkpoint = saved(make_learner(optimizer=wrote), tmp_path)
     with pytest.raises(ValueError, match="another optimiser"):
         restored(make_learner(optimizer=reads), checkpoint)
+
+
+# --------------------------------------------------------------------------------- gradients beyond all numbers
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
+@pytest.mark.parametrize("reward", [3e38, np.nan])
+def test_an_update_whose_gradient_is_not_finite_is_skipped_and_counted(algorithm: str, reward: float) -> None:
+    """Intake lets no nan in; what is finite may still be too large to learn from."""
+    learner = make_learner(algorithm=algorithm, passes=2, minibatches=1)
+    learner.step(make_rollouts(1), 0.0)
+    learner.take_metrics()
+    before, state, version = weights(learner), learner.state(), learner.policy_version
+    state = {name: value.clone() for name, value in state.items()}
+    rewards = np.full_like(make_rollout().rewards, reward)
+    learner.step([make_rollout(rewards=rewards)], 0.0)
+    assert learner.updates_skipped == learner.policy_version - version > 0
+    assert_same(weights(learner), before)
+    after = learner.state()
+    for name in state.keys() - {"torch_random_state"}:
+        assert_close(after[name], state[name], rtol=0, atol=0)
+    assert learner.take_metrics() == {}
+    skipped = learner.updates_skipped
+    learner.step(make_rollouts(2), 0.0)
+    assert learner.updates_skipped == skipped
+    assert all(np.isfinite(array).all() for array in learner.weights().values())
+    assert all(np.isfinite(value) for value in learner.take_metrics().values())

@@ -1,5 +1,6 @@
 """learner/reception.py over the memory transport: which versions are welcome, what evaluators ask and tell."""
 
+import queue
 import threading
 from collections.abc import Iterator
 
@@ -8,6 +9,7 @@ import pytest
 from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_spec
 from processes import LIMIT
 
+import learner.reception
 from learner.counters import RunCounters
 from learner.fleet import Fleet
 from learner.reception import Reception
@@ -24,7 +26,7 @@ from protocol.messages import (
     Snapshot,
 )
 from protocol.spec import RunSpec, RunStatus
-from protocol.transport import MemoryNetwork, MemoryTransport
+from protocol.transport import MemoryNetwork, MemoryTransport, TransportError
 
 REPORT = EvaluationReport(
     evaluator="e",
@@ -210,3 +212,60 @@ def test_many_at_once_are_all_held(reception: Reception, network: MemoryNetwork)
         thread.join()
     taken = {message.evaluator for _, message in reception.take_evaluations()}
     assert taken == {f"e{number}" for number in range(16)}
+
+
+class Silent(MemoryTransport):
+    """Keeps what it is asked to reopen, and cannot."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        super().__init__(network)
+        self.reopened: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        self.reopened.put(unless_served)
+        raise TransportError("nothing answers there")
+
+
+def test_a_reception_that_hears_nobody_has_its_session_reopened(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner.reception, "_SILENCE_SECONDS", 0.02)
+    transport, counters = Silent(network), RunCounters(10)
+    reception = Reception(
+        "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
+    )
+    reception.open()
+    try:
+        for _ in range(3):
+            assert transport.reopened.get(timeout=LIMIT) == keys.status("r")
+    finally:
+        reception.close("the test is over")
+
+
+def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learner.reception, "_SILENCE_SECONDS", 1000.0)
+    reception = made(network, run_spec(), RunCounters(10))
+    try:
+        before = reception._heard_at
+        MemoryTransport(network).ask(keys.snapshots("r"), timeout=LIMIT)
+        assert reception._heard_at > before
+    finally:
+        reception.close("the test is over")
+
+
+def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(network: MemoryNetwork) -> None:
+    counters = RunCounters(10)
+    reception = made(network, run_spec(actors=2, max_policy_lag=0), counters)
+    actor = MemoryTransport(network)
+    try:
+        actor.ask(
+            keys.join("r"),
+            encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)),
+            timeout=LIMIT,
+        )
+        actor.ask(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
+        del reception.fleet.actors["a"]
+        assert reception.take_batch(5) == []
+        assert counters.rollouts_rejected == {"stale": 1}
+    finally:
+        reception.close("the test is over")

@@ -1,6 +1,8 @@
 """learner/report.py: what a run tells of itself."""
 
+import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from building import EPOCH, joined_fleet, make_rollout, run_spec
 from learner.counters import RunCounters
 from learner.learner import METRICS
 from learner.metrics import COLUMNS
-from learner.report import RateMeter, episode_statistics, metrics_row, run_status, summary
+from learner.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
 
 EVERYTHING = np.ones((6, 3), np.bool_)
 
@@ -33,14 +35,14 @@ def test_rates_are_since_the_last_look() -> None:
     assert meter.rates == {}
     counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4, 1)
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
-    assert meter.look(counters, 12.0) == expected
+    assert meter.look(counters, joined_fleet(), 12.0) == expected
     assert meter.rates == expected
-    assert set(meter.look(counters, 13.0).values()) == {0.0}
+    assert set(meter.look(counters, joined_fleet(), 13.0).values()) == {0.0}
 
 
 def test_two_looks_at_once_divide_by_no_0() -> None:
     meter = RateMeter(trained_counters(), 10.0)
-    assert meter.look(trained_counters(), 10.0)["env_steps_per_second"] == 0.0
+    assert meter.look(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
 
 
 def test_episode_statistics_are_those_of_the_newest_episodes() -> None:
@@ -60,7 +62,7 @@ def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", False)
-    rates = RateMeter(counters, 0.0).look(counters, 1.0)
+    rates = RateMeter(counters, 0.0).look(counters, fleet, 1.0)
     learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
@@ -78,11 +80,47 @@ def test_a_row_at_the_start_leaves_out_what_is_unknown() -> None:
 def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    status = run_status("run", EPOCH, spec, counters, fleet, {}, 10.0, 25.0)
+    health = Health(started=10.0, updated=24.0, attended=24.0, saved=20.0)
+    status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
     assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
+    assert (status.problems, status.checkpoint_age_seconds) == ((), 5.0)
+    assert (status.queue_bytes, status.queue_bytes_limit) == (77, 64 * 2**20)
     assert [actor.actor for actor in status.actors] == ["a", "b"]
+
+
+HEALTHY = Health(started=0.0, updated=100.0, attended=100.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "live", "problems"),
+    [
+        ({}, 2, ()),
+        ({"attended": 97.0}, 0, ()),
+        ({"attended": 90.0}, 0, ("no actor has taken part for 15 s",)),
+        ({"attended": 90.0}, 1, ()),
+        ({"updated": 44.0}, 1, ("no update for 61 s",)),
+        ({"updated": 44.0, "attended": 44.0}, 0, ("no actor has taken part for 61 s",)),
+        ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
+        ({"save_fault": "No space left"}, 1, ("checkpoints cannot be saved: No space left",)),
+    ],
+)
+def test_problems_are_what_keeps_the_service_from_its_work(
+    changed: dict[str, Any], live: int, problems: tuple[str, ...]
+) -> None:
+    assert dataclasses.replace(HEALTHY, **changed).problems(105.0, live) == problems
+
+
+def test_the_meter_tells_each_actor_its_own_rate() -> None:
+    counters, fleet = trained_counters(), joined_fleet("a", "b")
+    meter = RateMeter(counters, 10.0)
+    fleet.actors["a"].env_steps = 40
+    meter.look(counters, fleet, 12.0)
+    assert [fleet.actors[name].env_steps_per_second for name in ("a", "b")] == [20.0, 0.0]
+    fleet.actors["a"].env_steps = 50
+    meter.look(counters, fleet, 13.0)
+    assert fleet.actors["a"].env_steps_per_second == 10.0
 
 
 def test_the_summary_is_json_and_counts_bytes_by_the_step() -> None:

@@ -14,7 +14,7 @@ class Asked:
     key = "rollouts/a"
 
     def __init__(self, size: int) -> None:
-        self.payload = bytes(size)
+        self.payload, self.size = bytes(size), size
 
     def reply(self, payload: bytes) -> None:
         raise AssertionError("a queue answers nothing")

@@ -92,15 +92,20 @@ run_specs = st.builds(
 )
 actor_statuses = st.builds(
     ActorStatus,
-    actor=text,
-    seconds_since_seen=floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
-    **dict.fromkeys(("environments", "rollouts_accepted", "env_steps", "policy_lag"), counters),
+    **dict.fromkeys(("actor", "quarantined"), text),
+    **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
+    **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
+    **dict.fromkeys(("busy_answers", "env_steps", "policy_lag"), counters),
 )
 statuses = st.builds(
     RunStatus,
     episode_return_mean=st.none() | floats,
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
+    problems=st.lists(text, max_size=3).map(tuple),
+    checkpoint_age_seconds=st.none() | floats,
+    rollouts_rejected=st.dictionaries(text, counters, max_size=3),
+    **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
     **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), counters),
     **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), floats),

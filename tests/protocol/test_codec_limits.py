@@ -23,6 +23,7 @@ from wire_format import (
 from protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
 from protocol.messages import (
     Farewell,
+    Program,
     Snapshot,
 )
 
@@ -50,8 +51,9 @@ SMALL = Limits(max_bytes=1 << 20, max_header_bytes=4096, max_arrays=4)
 
 
 def bomb(frame: bytes, size: int) -> bytes:
-    _, content, _ = unwire(SAMPLES["snapshot"])
-    content.update(arrays=[["weights/w", "|u1", [size], False]], size=size)
+    """A program, which may travel compressed, of `size` bytes."""
+    _, content, _ = unwire(encode(Program(hash="", model=np.zeros(1, np.uint8))))
+    content.update(arrays=[["model", "|u1", [size], False]], size=size)
     return wire(content, frame, flags=1)
 
 
@@ -74,8 +76,17 @@ def test_a_frame_that_lies_about_its_size_is_unpacked_no_further() -> None:
     assert peak_bytes(bomb(lie, 1 << 16), SMALL) < 2 << 20
 
 
+@pytest.mark.parametrize("name", [name for name in SAMPLES if name not in ("rollout", "pixels", "program")])
+def test_what_is_never_sent_compressed_is_not_unpacked(name: str) -> None:
+    _, content, body = unwire(SAMPLES[name])
+    frame = zstandard.ZstdCompressor().compress(bytes(body))
+    with pytest.raises(ProtocolError, match="does not travel compressed"):
+        decode(wire(content, frame, flags=1), LIMITS)
+
+
 def test_a_frame_that_holds_less_than_it_declares_is_refused() -> None:
     frame = zstandard.ZstdCompressor().compress(bytes(1 << 16))
+    assert isinstance(decode(bomb(frame, 1 << 16), LIMITS), Program)
     for body in (frame[:-4], frame + frame, frame + b"x", b"", b"not zstd", bytes(8)):
         with pytest.raises(ProtocolError):
             decode(bomb(body, 1 << 16), LIMITS)

@@ -394,3 +394,73 @@ def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[T
     }
     with pytest.raises(TransportError, match="d/r/"):
         acts[act]()
+
+
+# ------------------------------------------------------------------------------------------- reopening
+
+
+def test_what_cannot_die_is_not_reopened(make_end: MakeEnd) -> None:
+    assert make_end().reopen() is False
+
+
+@pytest.fixture
+def client(closing: Callable[[Transport], Transport]) -> tuple[Transport, Transport]:
+    """A router, and a client of it."""
+    endpoint, router = listen_somewhere()
+    return closing(router), closing(connect([endpoint]))
+
+
+def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport, Transport]) -> None:
+    router, end = client
+    news, seen, there = Tape(), Tape(), Tape()
+    end.serve("d/r/join", echo)
+    inbox = end.follow("d/r/snapshots", lambda: news("news"))
+    end.announce("d/r/actors/a")
+    router.announce("d/r/learner")
+    end.watch("d/r/learner", seen)
+    router.watch("d/r/actors/*", there)
+    router.serve("d/r/status", echo)
+    assert (seen.next(), there.next()) == (("d/r/learner", True), ("d/r/actors/a", True))
+    answers = Tape()
+    end.send("d/r/status", b"1", timeout=WAIT, on_answer=answers)
+    assert answers.next() == b"d/r/status 1"
+    assert end.reopen() is True
+    # Who was there is gone for a moment: it may have left while the session was dead.
+    assert [seen.next(), seen.next()] == [("d/r/learner", False), ("d/r/learner", True)]
+    assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
+    settle(end, router)
+    assert router.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
+    router.publish("d/r/snapshots", b"7")
+    news.next()
+    assert inbox.take() == b"7"
+    end.send("d/r/status", b"2", timeout=WAIT, on_answer=answers)
+    assert answers.next() == b"d/r/status 2"
+
+
+def test_a_client_that_others_reach_is_left_as_it_is(client: tuple[Transport, Transport]) -> None:
+    router, end = client
+    there = Tape()
+    router.watch("d/r/actors/*", there)
+    end.serve("d/r/status", echo)
+    end.announce("d/r/actors/a")
+    assert there.next() == ("d/r/actors/a", True)
+    assert end.reopen(unless_served="d/r/status") is False
+    assert end.reopen(unless_served="d/r/nobody") is True
+    assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
+
+
+def test_a_client_whose_router_is_gone_stays_as_it_is(closing: Callable[[Transport], Transport]) -> None:
+    endpoint, router = listen_somewhere()
+    closing(router)
+    end = closing(connect([endpoint]))
+    end.serve("d/r/join", echo)
+    router.close()
+    with pytest.raises(TransportError, match="nothing answers"):
+        end.reopen()
+    assert end.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]  # itself
+
+
+def test_a_closed_client_is_not_brought_back(client: tuple[Transport, Transport]) -> None:
+    _, end = client
+    end.close()
+    assert end.reopen() is False

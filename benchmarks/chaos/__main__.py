@@ -1,0 +1,59 @@
+"""Everything that can fail, made to fail, and what became of it: one table at the end.
+
+python -m benchmarks.chaos                     all of it, within 40 minutes on two cores
+python -m benchmarks.chaos freezes fuzz        these sections
+python -m benchmarks.chaos --scale 0.1 ...     a tenth of the events
+"""
+
+import argparse
+import sys
+import time
+
+from benchmarks.chaos import actors, learners, network, wire
+from benchmarks.chaos.scene import FailedError, say
+from benchmarks.running import machine, table
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("sections", nargs="*", metavar="SECTION", help="which (default: all)")
+    options.add_argument("--scale", type=float, default=1.0, help="how many of the events (default: 1.0, all)")
+    arguments = options.parse_args()
+
+    def scaled(events: int) -> int:
+        return max(round(events * arguments.scale), 1)
+
+    sections = {
+        "kills": lambda: actors.kills(scaled(100)),
+        "freezes": lambda: actors.freezes(scaled(20)),
+        "accounting": lambda: actors.accounting(scaled(30)),
+        "learners": lambda: learners.kills(scaled(50)),
+        "routers": lambda: network.routers(scaled(20)),
+        "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),
+        "checkpoints": lambda: learners.damaged(scaled(1000)),
+        "overload": lambda: wire.overload(max(60.0 * arguments.scale, 10.0)),
+        "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),
+        "fuzz": lambda: wire.fuzz(scaled(1_000_000)),
+        "solve": lambda: actors.solve(scaled(3)),
+    }
+    unknown = set(arguments.sections) - sections.keys()
+    if unknown:
+        options.error(f"no section {', '.join(sorted(unknown))}: there are {', '.join(sections)}")
+    rows, failed, began = [], False, time.monotonic()
+    for name in arguments.sections or sections:
+        say(f"--- {name}")
+        section_began = time.monotonic()
+        try:
+            found = sections[name]()
+        except FailedError as error:
+            found, failed = [("FAILED", str(error))], True
+            say(f"FAILED: {error}")
+        taken = f"{time.monotonic() - section_began:.0f} s"
+        rows += [(name if not index else "", *row, taken if not index else "") for index, row in enumerate(found)]
+    print(f"{machine()}; {(time.monotonic() - began) / 60:.1f} minutes\n")
+    print(table(("section", "what", "figure", "took"), rows))
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

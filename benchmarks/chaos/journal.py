@@ -1,0 +1,52 @@
+"""An actor that writes down what it sends before it sends it: `python journal.py ADDRESS NAME FILE`."""
+
+import os
+import secrets
+import sys
+from collections.abc import Callable
+from typing import Any, cast
+
+from actor.service import ActorConfig, ActorService
+from protocol.codec import Limits, decode
+from protocol.messages import Acknowledgement, Rollout
+from protocol.process import stop_on_signals
+from protocol.transport import Transport
+from protocol.zenoh_transport import connect
+
+
+class JournalTransport:
+    """A transport that keeps a journal of `send`; a line is in the file before the next thing happens."""
+
+    def __init__(self, transport: Transport, path: str) -> None:
+        self._transport = transport
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+
+    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+        """See Transport."""
+        rollout = decode(payload, Limits())
+        assert isinstance(rollout, Rollout)
+        identity = rollout.identity
+        name = f"{identity.learner_epoch}/{identity.incarnation}/{identity.sequence}"
+        os.write(self._file, f"sent {name}\n".encode())
+
+        def answered(answer: bytes | None) -> None:
+            message = None if answer is None else decode(answer, Limits())
+            if isinstance(message, Acknowledgement):
+                os.write(self._file, f"answered {name} {message.verdict}\n".encode())
+            on_answer(answer)
+
+        self._transport.send(key, payload, timeout=timeout, on_answer=answered)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
+if __name__ == "__main__":
+    stop = stop_on_signals()
+    transport = connect([sys.argv[1]])
+    try:
+        config = ActorConfig(name=sys.argv[2], incarnation=secrets.randbits(62))
+        journal = cast(Transport, JournalTransport(transport, sys.argv[3]))
+        ActorService(config, journal, stop, print).run()
+    finally:
+        transport.close()

@@ -1,0 +1,155 @@
+"""Learners that are killed, at every stage of saving; checkpoints that are torn or flipped."""
+
+import os
+import random
+import shutil
+import signal
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
+from learner.checkpoint import load_newest, save_checkpoint
+from learner.learner import Learner
+from policy.sealed import DamagedError
+from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
+
+
+def kills(count: int) -> list[tuple[str, str]]:
+    """The learner of `daedalus train` is killed while it saves, and between; the run goes on each time."""
+    choose, back, stages = random.Random(3), [], Counter[str]()
+    with scene() as here:
+        saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "policy.hidden=[512,512]")
+        few = ("--set", "collection.envs_per_actor=16")
+        training = here.start(
+            "train", "cartpole", "--listen", here.address, "--run-dir", "fallen", *few, *saving, *ENDLESS
+        )
+        here.wait_for_training()
+        checkpoints = here.folder / "fallen" / "checkpoints"
+        here.wait("a checkpoint", lambda: _durable(checkpoints) > -1)
+        for number in range(count):
+            victim = here.process("--prepared", here.address)
+            if number % 5:
+                stage = _await_stage(checkpoints, choose)
+            else:
+                time.sleep(choose.uniform(0.0, 0.3))
+                stage = "at any time"
+            durable, status = _durable(checkpoints), here.status()
+            epoch = status.learner_epoch if status else None
+            os.kill(victim, signal.SIGKILL)
+            stages[stage] += 1
+            began = time.monotonic()
+            here.wait("the learner", lambda epoch=epoch: _lives_anew(here, epoch))
+            here.wait_for_training()
+            back.append(time.monotonic() - began)
+            line = [line for line in training.lines if "going on from checkpoint" in line][-1]
+            version = int(line.split("checkpoint ")[1].split()[0])
+            if version < durable:
+                raise FailedError(f"went on from {version}, {durable} was on the disk:\n{training.output}")
+            say(f"learner kill {number + 1} of {count} ({stage}): back after {back[-1]:.2f} s")
+        partial = [entry.name for entry in checkpoints.glob(".*.partial")]
+    return [
+        ("learner kills", f"{count}: {', '.join(f'{n} {stage}' for stage, n in sorted(stages.items()))}"),
+        ("went on from the last durable checkpoint", f"{count} of {count}; unfinished ones left: {len(partial)}"),
+        ("the next update after", seconds(back)),
+    ]
+
+
+def _durable(checkpoints: Path) -> int:
+    return max((int(entry.name) for entry in checkpoints.glob("0*")), default=-1)
+
+
+def _lives_anew(here: Scene, epoch: int | None) -> bool:
+    status = here.status()
+    return status is not None and status.learner_epoch != epoch
+
+
+def _await_stage(checkpoints: Path, choose: random.Random) -> str:
+    """Waits for a moment within the saving of a checkpoint: so many of its files are there."""
+    files = choose.randrange(6)
+    deadline = time.monotonic() + LIMIT
+    while time.monotonic() < deadline:
+        for partial in checkpoints.glob(".*.partial"):
+            try:
+                there = len(os.listdir(partial))
+            except FileNotFoundError:
+                continue
+            if there >= files:
+                return f"while saving, {there} of 5 files begun"
+    raise FailedError("no checkpoint was being saved")
+
+
+def damaged(count: int) -> list[tuple[str, str]]:
+    """Checkpoints whose files are cut, flipped or missing: none is accepted, the one before it is."""
+    choose = random.Random(4)
+    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"), policy=PolicySpec(hidden=(64, 64)))
+    learner = Learner(spec.training, spec.policy, spaces)
+    kinds, accepted = Counter[str](), 0
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+
+        def save(version: int) -> Path:
+            return save_checkpoint(
+                run,
+                spec=spec,
+                spaces=spaces,
+                policy_version=version,
+                program=learner.program(),
+                parameters=learner.weights(),
+                state=learner.state(),
+                counters={"env_steps": version},
+                keep=2,
+            )
+
+        save(1)
+        newest = save(2)
+        original = Path(folder) / "original"
+        shutil.copytree(newest, original)
+        for _ in range(count):
+            kinds[_damage(newest, choose)] += 1
+            warnings: list[str] = []
+            try:
+                loaded = load_newest(run, warnings.append)
+            except DamagedError as error:
+                raise FailedError(f"the good one was not found: {error}") from None
+            if loaded.policy.policy_version != 1:
+                accepted += 1
+            if any(not np.isfinite(array).all() for array in loaded.policy.weights.values()):
+                raise FailedError("weights that are no numbers")
+            shutil.rmtree(newest)
+            shutil.copytree(original, newest)
+    return [
+        (
+            "damaged checkpoints",
+            f"{count} ({', '.join(f'{n} {kind}' for kind, n in sorted(kinds.items()))}): {accepted} accepted; "
+            f"the one before was loaded {count - accepted} times",
+        )
+    ]
+
+
+def _damage(directory: Path, choose: random.Random) -> str:
+    file = choose.choice(sorted(directory.iterdir()))
+    data = bytearray(file.read_bytes())
+    kind = choose.choice(["torn", "flipped", "zeroed", "missing", "grown"])
+    if kind == "torn":
+        data = data[: choose.randrange(len(data))]
+    elif kind == "flipped":
+        data[choose.randrange(len(data))] ^= 1 << choose.randrange(8)
+    elif kind == "zeroed":  # a block that never reached the disk
+        start = choose.randrange(len(data))
+        end = min(start + 4096, len(data))
+        if not any(data[start:end]):
+            data[start] ^= 1
+        else:
+            data[start:end] = bytes(end - start)
+    elif kind == "grown":
+        data += bytes(choose.randrange(1, 100))
+    if kind == "missing":
+        file.unlink()
+    else:
+        file.write_bytes(data)
+    return kind

@@ -1,0 +1,162 @@
+"""One service under observation: its processes, what its learner tells, and how long things take."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from processes import Running, processes_mentioning
+
+from benchmarks.running import COMMAND
+from protocol import keys
+from protocol.codec import Limits, ProtocolError, decode
+from protocol.messages import StatusReport
+from protocol.spec import ActorStatus, RunStatus
+from protocol.transport import Transport, TransportError
+from protocol.zenoh_transport import connect
+
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+LIMIT = 120.0  # seconds; what takes longer has failed
+_POLL_SECONDS = 0.02
+
+
+class FailedError(Exception):
+    """A promise was not kept."""
+
+
+def free_address() -> str:
+    """A loopback address that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Scene:
+    """Processes in a folder of their own, and the learner at an address."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        self.folder = Path(self._folder.name)
+        self.address = free_address()
+        self._running: list[Running] = []
+        self._transport: Transport | None = None
+
+    def start(self, *arguments: object) -> Running:
+        """Starts `daedalus ARGUMENTS`."""
+        return self.run([*COMMAND, *map(str, arguments)])
+
+    def run(self, command: Sequence[str]) -> Running:
+        """Starts any command."""
+        self._running.append(Running(list(command), self.folder))
+        return self._running[-1]
+
+    def router(self) -> Running:
+        """Starts a router of its own at the address."""
+        program = Path(__file__).parents[2] / "tests" / "router_process.py"
+        running = self.run([sys.executable, str(program), self.address])
+        running.expect("listening")
+        return running
+
+    def status(self) -> RunStatus | None:
+        """What the learner tells; None if it does not answer now."""
+        try:
+            if self._transport is None:
+                self._transport = connect([self.address])
+            answers = self._transport.ask(keys.status("*"), timeout=2.0)
+            report = decode(answers[0], Limits()) if answers else None
+        except (TransportError, ProtocolError):
+            return None
+        return report.status if isinstance(report, StatusReport) else None
+
+    def actor(self, name: str) -> ActorStatus | None:
+        """What the learner tells of one actor."""
+        status = self.status()
+        return next((each for each in status.actors if each.actor == name), None) if status else None
+
+    def env_steps(self, *names: str) -> int:
+        """Trained on, of the named actors together, or of the whole run."""
+        status = self.status()
+        if status is None:
+            return 0
+        return sum(each.env_steps for each in status.actors if each.actor in names) if names else status.env_steps
+
+    def wait(self, what: str, condition: Callable[[], object]) -> float:
+        """Seconds until a condition holds. Raises FailedError after LIMIT of them."""
+        began = time.monotonic()
+        while not condition():
+            if time.monotonic() > began + LIMIT:
+                output = "\n".join(running.output[-2000:] for running in self._running)
+                raise FailedError(f"{what}: not within {LIMIT:g} s\n{output}")
+            time.sleep(_POLL_SECONDS)
+        return time.monotonic() - began
+
+    def wait_for_training(self, *names: str) -> float:
+        """Seconds until something more was trained on, of the named actors or at all."""
+        before = self.env_steps(*names)
+        return self.wait(f"training of {names or 'all'}", lambda: self.env_steps(*names) > before)
+
+    def process(self, *texts: str) -> int:
+        """The one process whose command line holds all of the texts, once it is there."""
+        found: list[int] = []
+
+        def look() -> bool:
+            found[:] = sorted(set.intersection(*(set(processes_mentioning(text)) for text in texts)))
+            return len(found) == 1
+
+        self.wait(f"one process of {texts}", look)
+        return found[0]
+
+    def close(self) -> None:
+        """Ends everything."""
+        if self._transport is not None:
+            self._transport.close()
+        for running in self._running:  # launchers first: they end what they started
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(running.process.pid, signal.SIGCONT)
+                running.process.terminate()
+        for running in self._running:
+            with contextlib.suppress(Exception):
+                running.process.wait(10.0)
+            running.end()
+        self._folder.cleanup()
+
+
+@contextlib.contextmanager
+def scene() -> Iterator[Scene]:
+    """A Scene that is closed in the end."""
+    made = Scene()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def resident_mib(pid: int) -> float:
+    """The memory of a process."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def seconds(values: Sequence[float]) -> str:
+    """Median and worst."""
+    return f"median {np.median(values):.2f} s, worst {max(values):.2f} s of {len(values)}"
+
+
+def say(text: str) -> None:
+    """Progress, beside the results."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A run's summary."""
+    return json.loads(path.read_text())

@@ -1,0 +1,33 @@
+"""A whole run, every process of which ends at once if it unpickles anything that could execute."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from processes import Running
+
+
+@pytest.fixture(autouse=True)
+def audited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent / "audit"))
+
+
+def test_the_hook_ends_a_process_that_unpickles() -> None:
+    program = "import pickle; pickle.loads(pickle.dumps(print))"
+    ended = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr[:9]) == (97, "UNPICKLED")
+
+
+def test_training_resuming_and_evaluating_unpickle_nothing(start: Callable[..., Running], tmp_path: Path) -> None:
+    saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "evaluation.seconds=0.2")
+    first = start("train", "cartpole", "--env-steps", 200_000, "--run-dir", "run", *saving)
+    assert first.wait() in (0, 3), first.output
+    again = start("resume", "run", "--env-steps", 400_000)
+    assert again.wait() in (0, 3), again.output
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["evaluation_return_mean"] > 5
+    assert (tmp_path / "run" / "checkpoints").is_dir()
+    assert "UNPICKLED" not in first.output + again.output

@@ -1,0 +1,142 @@
+"""What goes wrong out there, made here: a link that stalls, and a sender that is no actor of ours."""
+
+import contextlib
+import secrets
+import socket
+import threading
+from typing import Any
+
+import numpy as np
+
+from actor.learner_link import LearnerLink
+from protocol import keys
+from protocol.codec import Limits, decode, encode
+from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
+from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from protocol.zenoh_transport import connect
+
+CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+ANSWER_SECONDS = 60.0
+
+
+def port_of(address: str) -> int:
+    """Of tcp/HOST:PORT."""
+    return int(address.rsplit(":", 1)[1])
+
+
+class StallingProxy:
+    """Forwards TCP connections to an address, until it is told to stall: then all stay open and nothing moves."""
+
+    def __init__(self, target: str) -> None:
+        self._target = port_of(target)
+        self._flowing = threading.Event()
+        self._flowing.set()
+        self._closed = False
+        self._sockets: list[socket.socket] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def stall(self) -> None:
+        """Half-open from now on, as when a cable is pulled: no byte, no error; new connections are not served."""
+        self._flowing.clear()
+
+    def resume(self) -> None:
+        """Lets everything flow that was held back."""
+        self._flowing.set()
+
+    def close(self) -> None:
+        """Ends all connections."""
+        self._closed = True
+        self._flowing.set()
+        for each in [self._listener, *self._sockets]:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            self._sockets.append(near)
+            threading.Thread(target=self._connect, args=(near,), daemon=True).start()
+
+    def _connect(self, near: socket.socket) -> None:
+        self._flowing.wait()
+        try:
+            far = socket.create_connection(("127.0.0.1", self._target))
+        except OSError:
+            near.close()
+            return
+        self._sockets.append(far)
+        for ends in ((near, far), (far, near)):
+            threading.Thread(target=self._pump, args=ends, daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._flowing.wait()
+                sink.sendall(data)
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+
+class Sender:
+    """Takes part in a CartPole run under a name of its own, and sends what a test makes."""
+
+    def __init__(self, address: str, name: str, environments: int = 2) -> None:
+        self.transport = connect([address])
+        self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
+        self._link = LearnerLink(self.transport, lambda text: None)
+        join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
+        self.welcome: Welcome = self._link.find(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
+        self.transport.announce(keys.presence(self.welcome.run, name))
+        self.key = keys.rollouts(self.welcome.run, name)
+
+    def version(self) -> int:
+        """The newest, or 0 before there is one."""
+        newest = [message for message in self._link.newest(self.welcome.run) if isinstance(message, Snapshot)]
+        return newest[0].policy_version if newest else 0
+
+    def rollout(self, sequence: int, version: int, **changed: Any) -> bytes:
+        """An encoded rollout of plausible numbers, but for what is changed."""
+        random = np.random.default_rng(sequence)
+        shape = (self.welcome.spec.collection.rollout_length, self.environments)
+        content: dict[str, Any] = {
+            "frames": random.normal(0, 0.05, (shape[0] + 1, self.environments, 4)).astype(np.float32),
+            "initial_state": np.zeros((self.environments, 0), np.float32),
+            "actions": random.integers(0, 2, shape).astype(np.uint8),
+            "behaviour_log_probs": np.full(shape, np.log(0.5), np.float32),
+            "rewards": np.ones(shape, np.float32),
+            "terminated": np.zeros(shape, np.bool_),
+            "truncated": np.zeros(shape, np.bool_),
+            "valid": np.ones(shape, np.bool_),
+            "episode_returns": np.zeros(0, np.float32),
+            "episode_lengths": np.zeros(0, np.int32),
+        }
+        identity = RolloutIdentity(
+            actor=self.name,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            learner_epoch=self.welcome.learner_epoch,
+        )
+        return encode(Rollout(identity=identity, policy_version=version, **{**content, **changed}))
+
+    def poison(self, sequence: int, version: int) -> bytes:
+        """One with a nan in it."""
+        shape = (self.welcome.spec.collection.rollout_length, self.environments)
+        return self.rollout(sequence, version, rewards=np.full(shape, np.nan, np.float32))
+
+    def send(self, payload: bytes) -> Acknowledgement:
+        """Sends bytes as a rollout and waits for what becomes of them."""
+        (answer,) = self.transport.ask(self.key, payload, timeout=ANSWER_SECONDS)
+        message = decode(answer, Limits())
+        assert isinstance(message, Acknowledgement)
+        return message
+
+    def close(self) -> None:
+        """Leaves."""
+        self.transport.close()

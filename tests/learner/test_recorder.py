@@ -1,0 +1,101 @@
+"""learner/recorder.py: rows reach the disk, and a disk that refuses them costs nothing but those rows."""
+
+import csv
+import errno
+import io
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from processes import until
+
+from learner import recorder
+from learner.metrics import CsvWriter, Details
+from learner.progress import Progress
+from learner.recorder import Recorder
+
+ROW = {
+    "wall_seconds": 1.0,
+    "env_steps_per_second": 1.0,
+    "updates_per_second": 1.0,
+    "policy_lag_mean": 0.0,
+    "actors": 1,
+}
+
+
+def row(env_steps: int) -> dict[str, float]:
+    return {**ROW, "env_steps": env_steps}
+
+
+def env_steps(directory: Path) -> list[str]:
+    with open(directory / "metrics.csv", newline="") as file:
+        return [line["env_steps"] for line in csv.DictReader(file)]
+
+
+def test_rows_are_written_in_their_order(tmp_path: Path) -> None:
+    recording = Recorder(tmp_path, Progress(io.StringIO(), 100))
+    for number in range(5):
+        recording.record(row(number), Details())
+    recording.close()
+    assert env_steps(tmp_path) == ["0", "1", "2", "3", "4"]
+
+
+def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = threading.Event()
+    full.set()
+
+    class OnThisDisk(CsvWriter):
+        def write(self, row: Mapping[str, float], details: Details) -> None:
+            if full.is_set():
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().write(row, details)
+
+    monkeypatch.setattr(recorder, "_RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(recorder, "CsvWriter", OnThisDisk)
+    output = io.StringIO()
+    recording = Recorder(tmp_path, Progress(output, 100))
+    recording.record(row(1), Details())
+    recording.record(row(2), Details())
+    recording.record(row(3), Details())
+    until(lambda: "cannot be written" in output.getvalue())
+    until(lambda: recording._rows.empty())
+    full.clear()
+    recording.record(row(4), Details())
+    recording.record(row(5), Details())
+    recording.close()
+    told = [line for line in output.getvalue().splitlines() if "metrics" in line]
+    assert told == [
+        "metrics cannot be written (No space left on device); training goes on",
+        "metrics are written again",
+    ]
+    assert env_steps(tmp_path)[-2:] == ["4", "5"]
+
+
+def test_a_disk_that_takes_half_a_line_keeps_none_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = CsvWriter(tmp_path / "metrics.csv")
+    writer.write(row(1), Details())
+    whole = (tmp_path / "metrics.csv").read_bytes()
+
+    class Filling:
+        """The same file on a disk with room for three more bytes."""
+
+        def __init__(self, file: io.FileIO) -> None:
+            self._file, self._room = file, 3
+
+        def write(self, data: bytes) -> int:
+            if not self._room:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            written, self._room = self._room, 0
+            return self._file.write(data[:written])
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._file, name)
+
+    monkeypatch.setattr(writer, "_file", Filling(writer._file))
+    with pytest.raises(OSError, match="No space left"):
+        writer.write(row(2), Details())
+    assert (tmp_path / "metrics.csv").read_bytes() == whole
+    writer.close()

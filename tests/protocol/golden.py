@@ -1,0 +1,135 @@
+"""One message of every kind, always the same, and the bytes of each as they lie in golden/v{PROTOCOL_VERSION}/.
+
+A change of the wire shows as other bytes. One that is meant raises PROTOCOL_VERSION, and `PYTHONPATH=. python
+tests/protocol/golden.py` writes the bytes of the new version; those of the old ones stay.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from protocol.codec import PROTOCOL_VERSION, encode
+from protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Farewell,
+    Join,
+    Message,
+    Program,
+    Refusal,
+    Rollout,
+    RolloutIdentity,
+    Snapshot,
+    StatusReport,
+    Welcome,
+)
+from protocol.spec import ActorStatus, ArraySpace, ChoiceSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
+
+FOLDER = Path(__file__).parent / "golden"
+_T, _E, _K = 3, 2, 4
+_PIXELS = np.arange((_K + _T) * _E * 6 * 5, dtype=np.uint8).reshape(_E, _K + _T, 6, 5).swapaxes(0, 1)
+
+
+def _rollout(frames: np.ndarray) -> Rollout:
+    cells = np.arange(_T * _E).reshape(_T, _E)
+    return Rollout(
+        identity=RolloutIdentity(actor="wing-1", incarnation=2**61 + 1, sequence=7, learner_epoch=2**60 + 3),
+        policy_version=41,
+        frames=frames,
+        initial_state=np.full((_E, 2), 0.25, np.float32),
+        actions=cells.astype(np.uint8),
+        behaviour_log_probs=(-0.5 - cells).astype(np.float32),
+        rewards=(cells / 4).astype(np.float32),
+        terminated=cells == 2,
+        truncated=cells == 3,
+        valid=cells != 4,
+        episode_returns=np.array([1.5, -2.0], np.float32),
+        episode_lengths=np.array([12, 9], np.int32),
+    )
+
+
+MESSAGES: dict[str, Message] = {
+    "join": Join(
+        actor="wing-1",
+        incarnation=5,
+        spaces=Spaces(
+            observation=ArraySpace(shape=(6, 5), dtype="uint8", frames=4), action=ChoiceSpace(kind="choice", count=6)
+        ),
+        environments=2,
+    ),
+    "join_asking": Join(actor="wing-1", incarnation=5),
+    "welcome": Welcome(
+        run="r", learner_epoch=9, seed=3, spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}))
+    ),
+    "refusal": Refusal(code="mismatch", reason="other spaces"),
+    "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),
+    "rollout_numbers": _rollout(np.linspace(-1, 1, (_T + 1) * _E * 4, dtype=np.float32).reshape(_T + 1, _E, 4)),
+    "rollout_pixels": _rollout(_PIXELS),
+    "acknowledgement": Acknowledgement(verdict="rejected", reason="policy lag 40", policy_version=81),
+    "snapshot": Snapshot(
+        learner_epoch=9,
+        policy_version=41,
+        program="0" * 64,
+        weights={"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.zeros(3, np.float32)},
+    ),
+    "evaluation_request": EvaluationRequest(evaluator="judge"),
+    "evaluation_report": EvaluationReport(
+        evaluator="judge",
+        learner_epoch=9,
+        policy_version=41,
+        returns=np.array([1.0, 2.5], np.float32),
+        lengths=np.array([10, 20], np.int32),
+    ),
+    "farewell": Farewell(learner_epoch=9, reason="the learner has finished"),
+    "status_report": StatusReport(
+        status=RunStatus(
+            run="r",
+            learner_epoch=9,
+            algorithm="impala",
+            environment="CartPole-v1",
+            problems=("no update for 61 s",),
+            uptime_seconds=1.5,
+            env_steps=100,
+            env_steps_budget=1000,
+            updates=10,
+            updates_skipped=1,
+            episode_return_mean=None,
+            env_steps_per_second=50.0,
+            updates_per_second=5.0,
+            policy_lag_mean=1.0,
+            queue_bytes=0,
+            queue_bytes_limit=2**26,
+            checkpoint_age_seconds=None,
+            rollouts_rejected={"stale": 2, "unfit": 1},
+            actors=(
+                ActorStatus(
+                    actor="wing-1",
+                    alive=True,
+                    quarantined="",
+                    lives=2,
+                    seconds_since_seen=0.25,
+                    environments=2,
+                    env_steps=100,
+                    env_steps_per_second=50.0,
+                    rollouts_accepted=8,
+                    rollouts_rejected={"stale": 2},
+                    rollouts_missed=1,
+                    busy_answers=3,
+                    policy_lag=1,
+                ),
+            ),
+        )
+    ),
+}
+
+
+def path(name: str, version: int = PROTOCOL_VERSION) -> Path:
+    """Where the bytes of a message lie."""
+    return FOLDER / f"v{version}" / f"{name}.bin"
+
+
+if __name__ == "__main__":
+    for name, message in MESSAGES.items():
+        path(name).parent.mkdir(parents=True, exist_ok=True)
+        path(name).write_bytes(encode(message))

@@ -1,0 +1,40 @@
+"""The bytes of every message as they were written down: a change of the wire is seen, and meant."""
+
+import typing
+from pathlib import Path
+
+import pytest
+import zstandard
+from golden import FOLDER, MESSAGES, path
+from wire_format import PREFIX, the_same
+
+from protocol.codec import PROTOCOL_VERSION, Limits, VersionMismatchError, decode, encode
+from protocol.messages import Message
+
+OLD = sorted(FOLDER.glob("v*/*.bin"))
+
+
+def plain(data: bytes) -> bytes:
+    """A message with its body decompressed: zstd's own output may differ from release to release."""
+    magic, version, flags, length = PREFIX.unpack_from(data)
+    start = PREFIX.size + length
+    start += -start % 8
+    body = zstandard.ZstdDecompressor().decompress(data[start:]) if flags else data[start:]
+    return PREFIX.pack(magic, version, flags, length) + data[PREFIX.size : start] + body
+
+
+def test_every_kind_of_message_is_there() -> None:
+    assert {type(message) for message in MESSAGES.values()} == set(typing.get_args(Message))
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_the_bytes_are_those_that_were_written_down(name: str) -> None:
+    written = path(name).read_bytes()
+    assert plain(encode(MESSAGES[name])) == plain(written)
+    assert the_same(decode(written, Limits()), MESSAGES[name])
+
+
+@pytest.mark.parametrize("old", [file for file in OLD if file.parent.name != f"v{PROTOCOL_VERSION}"], ids=str)
+def test_the_bytes_of_other_versions_are_refused_by_their_version(old: Path) -> None:
+    with pytest.raises(VersionMismatchError, match=f"version {old.parent.name[1:]}, this one {PROTOCOL_VERSION}"):
+        decode(old.read_bytes(), Limits())
