@@ -71,7 +71,7 @@ class Reception:
         self._buffer = _buffer(spec)
         self._intake = Intake(spec, learner_epoch, self.fleet)
         self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
-        self._requests = RequestQueue(spec.service.queue_bytes)
+        self._requests = _queue(spec)
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
         self._ended = threading.Event()
         self._heard_at = time.monotonic()
@@ -274,9 +274,22 @@ class Reception:
         self.lock.notify_all()
 
 
+def _queue(spec: RunSpec) -> RequestQueue:
+    """As long as what waits at its end can still be learned from when its turn comes.
+
+    What comes beyond is told to come again: waiting here, it would only grow too old, and its sender would give up
+    waiting for the answer.
+    """
+    batches = spec.training.policy_lag_bound // spec.training.updates_per_batch + 1
+    return RequestQueue(spec.service.queue_bytes, max(batches * _batch_rollouts(spec), 2 * spec.collection.actors))
+
+
+def _batch_rollouts(spec: RunSpec) -> int:
+    default = 1 if spec.training.algorithm == "a3c" else spec.collection.actors
+    return spec.training.batch_rollouts or default
+
+
 def _buffer(spec: RunSpec) -> RolloutBuffer:
-    training, actors = spec.training, spec.collection.actors
-    if training.algorithm == "a2c":
-        return BarrierBuffer(actors)
-    default = 1 if training.algorithm == "a3c" else actors
-    return StreamBuffer(training.batch_rollouts or default, training.policy_lag_bound)
+    if spec.training.algorithm == "a2c":
+        return BarrierBuffer(spec.collection.actors)
+    return StreamBuffer(_batch_rollouts(spec), spec.training.policy_lag_bound)

@@ -1,4 +1,4 @@
-"""Requests that wait to be judged, bounded by the bytes they hold. State with a lock, no threads of its own."""
+"""Requests that wait to be judged, bounded by bytes and by number. State with a lock, no threads of its own."""
 
 import queue
 import threading
@@ -9,18 +9,20 @@ from protocol.transport import Request
 class RequestQueue:
     """First in, first out. `offer` never waits, `take` does."""
 
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._bytes = 0
+    def __init__(self, max_bytes: int, max_requests: int) -> None:
+        self._max_bytes, self._max_requests = max_bytes, max_requests
+        self._bytes = self._number = 0
         self._lock = threading.Lock()
         self._requests: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
 
     def offer(self, request: Request) -> bool:
-        """Takes a request unless that would exceed the bound; an empty queue takes any."""
+        """Takes a request unless that would exceed a bound; an empty queue takes any."""
         with self._lock:
-            if self._bytes and self._bytes + request.size > self._max_bytes:
+            full = self._number >= self._max_requests or self._bytes + request.size > self._max_bytes
+            if self._number and full:
                 return False
             self._bytes += request.size
+            self._number += 1
         self._requests.put(request)
         return True
 
@@ -30,6 +32,7 @@ class RequestQueue:
         if request is not None:
             with self._lock:
                 self._bytes -= request.size
+                self._number -= 1
         return request
 
     @property

@@ -136,7 +136,7 @@ class LearnerService:
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._counters.reached(training.target_return):
-                seconds_to_target = now - self._started
+                seconds_to_target = self._wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
             self._attend_evaluators(learner, program)

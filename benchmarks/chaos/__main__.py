@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, learners, network, wire
+from benchmarks.chaos import actors, clocks, learners, network, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -25,14 +25,17 @@ def main() -> int:
 
     sections = {
         "kills": lambda: actors.kills(scaled(100)),
+        "barriers": lambda: actors.barriers(scaled(12)),
         "freezes": lambda: actors.freezes(scaled(20)),
         "accounting": lambda: actors.accounting(scaled(30)),
         "learners": lambda: learners.kills(scaled(50)),
+        "stops": lambda: learners.stops(scaled(8)),
         "routers": lambda: network.routers(scaled(20)),
         "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),
         "checkpoints": lambda: learners.damaged(scaled(1000)),
         "overload": lambda: wire.overload(max(60.0 * arguments.scale, 10.0)),
         "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),
+        "clocks": lambda: clocks.steps(max(10.0 * arguments.scale, 3.0)),
         "fuzz": lambda: wire.fuzz(scaled(1_000_000)),
         "solve": lambda: actors.solve(scaled(3)),
     }

@@ -40,6 +40,34 @@ def kills(count: int) -> list[tuple[str, str]]:
     ]
 
 
+def barriers(count: int) -> list[tuple[str, str]]:
+    """Under a2c, whose updates wait for every live actor, one of three is killed."""
+    pauses = []
+    with scene() as here:
+        here.start(
+            *("learner", "cartpole", "--algorithm", "a2c", "--actors", 3, "--listen", here.address),
+            *("--run-dir", "run", *_SMALL, *ENDLESS),
+        )
+        names = ["actor-a", "actor-b", "actor-c"]
+        actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in names}
+        for name in names:
+            here.wait_for_training(name)
+        for number in range(count):
+            name = names[number % len(names)]
+            actors[name].process.kill()
+            killed, others = time.monotonic(), [other for other in names if other != name]
+            before = {other: here.env_steps(other) for other in others}
+            here.wait(
+                "the others",
+                lambda others=others, before=before: all(here.env_steps(each) > before[each] for each in others),
+            )
+            pauses.append(time.monotonic() - killed)
+            actors[name].wait()
+            actors[name] = here.start("actor", "--connect", here.address, "--name", name)
+            here.wait_for_training(name)
+    return [("a2c: the others were trained on again after a kill of one of three", seconds(pauses))]
+
+
 def _actors(here: Scene) -> list:
     status = here.status()
     return list(status.actors) if status else []

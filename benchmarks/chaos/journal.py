@@ -11,7 +11,7 @@ from protocol.codec import Limits, decode
 from protocol.messages import Acknowledgement, Rollout
 from protocol.process import stop_on_signals
 from protocol.transport import Transport
-from protocol.zenoh_transport import connect
+from protocol.zenoh_transport import connect_when_there
 
 
 class JournalTransport:
@@ -43,7 +43,9 @@ class JournalTransport:
 
 if __name__ == "__main__":
     stop = stop_on_signals()
-    transport = connect([sys.argv[1]])
+    transport = connect_when_there([sys.argv[1]], stop, print)
+    if transport is None:
+        raise SystemExit(0)
     try:
         config = ActorConfig(name=sys.argv[2], incarnation=secrets.randbits(62))
         journal = cast(Transport, JournalTransport(transport, sys.argv[3]))

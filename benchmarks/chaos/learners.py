@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from processes import processes_mentioning
 
 from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
 from learner.checkpoint import load_newest, save_checkpoint
@@ -80,6 +81,37 @@ def _await_stage(checkpoints: Path, choose: random.Random) -> str:
             if there >= files:
                 return f"while saving, {there} of 5 files begun"
     raise FailedError("no checkpoint was being saved")
+
+
+def stops(count: int) -> list[tuple[str, str]]:
+    """`daedalus train` is told to stop, once or twice, beside an actor that is frozen."""
+    taken, saved = [], 0
+    shared_memory = set(os.listdir("/dev/shm"))
+    for number in range(count):
+        with scene() as here:
+            training = here.start("train", "cartpole", "--listen", here.address, "--run-dir", "stopped", *ENDLESS)
+            here.wait_for_training("actor-0")
+            here.wait_for_training("actor-1")
+            os.kill(here.process("--name", "actor-0", here.address), signal.SIGSTOP)
+            number_of_signal = signal.SIGTERM if number % 2 else signal.SIGINT
+            began = time.monotonic()
+            training.process.send_signal(number_of_signal)
+            if number % 4 > 1:
+                training.process.send_signal(number_of_signal)
+            training.wait()
+            taken.append(time.monotonic() - began)
+            left = processes_mentioning(here.address)
+            if left:
+                raise FailedError(f"{len(left)} processes were left behind")
+            saved += _durable(here.folder / "stopped" / "checkpoints") > 0
+            say(f"stop {number + 1} of {count}: {taken[-1]:.2f} s")
+    segments = set(os.listdir("/dev/shm")) - shared_memory
+    return [
+        (
+            "SIGTERM or SIGINT, once or twice, beside a frozen actor",
+            f"{seconds(taken)}; {saved} checkpoints; no process and {len(segments)} shared-memory segments left",
+        )
+    ]
 
 
 def damaged(count: int) -> list[tuple[str, str]]:

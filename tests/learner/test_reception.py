@@ -3,11 +3,12 @@
 import queue
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_spec
-from processes import LIMIT
+from processes import LIMIT, until
 
 import learner.reception
 from learner.counters import RunCounters
@@ -267,5 +268,43 @@ def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(n
         del reception.fleet.actors["a"]
         assert reception.take_batch(5) == []
         assert counters.rollouts_rejected == {"stale": 1}
+    finally:
+        reception.close("the test is over")
+
+
+@pytest.mark.parametrize(
+    ("training", "most"),
+    [
+        ({"algorithm": "impala", "max_policy_lag": 3}, 8),  # four batches of two
+        ({"algorithm": "a3c", "max_policy_lag": 7}, 8),  # eight batches of one
+        ({"algorithm": "appo", "passes": 2, "minibatches": 2, "max_policy_lag": 13, "batch_rollouts": 3}, 12),
+        ({"algorithm": "impala", "max_policy_lag": 0}, 4),  # two for each actor in any case
+    ],
+)
+def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
+    network: MemoryNetwork, training: dict[str, Any], most: int
+) -> None:
+    """The buffer holds a batch, one is being judged, and the queue what can still be learned from after them."""
+    counters = RunCounters(10)
+    spec = run_spec(actors=2, **training)
+    reception = made(network, spec, counters)
+    actor = MemoryTransport(network)
+    answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    try:
+        join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        held = max(spec.training.batch_rollouts or 2, 2)
+        for sequence in range(held + 1):
+            payload = encode(make_rollout(identity("a", sequence)))
+            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+        until(lambda: counters.rollouts_accepted == held and reception.queue_bytes == 0)
+        for sequence in range(held + 1, held + most + 3):
+            payload = encode(make_rollout(identity("a", sequence)))
+            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+        told = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
+        verdicts = [message.verdict for message in told if isinstance(message, Acknowledgement)]
+        assert verdicts == ["accepted"] * held + ["busy"] * 2
+        assert answers.empty()
+        assert reception.fleet.actors["a"].busy == 2
     finally:
         reception.close("the test is over")

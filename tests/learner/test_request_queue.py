@@ -1,4 +1,4 @@
-"""learner/request_queue.py: bounded by bytes, first in, first out."""
+"""learner/request_queue.py: bounded by bytes and by number, first in, first out."""
 
 import threading
 
@@ -21,13 +21,13 @@ class Asked:
 
 
 def test_requests_come_out_in_the_order_they_went_in() -> None:
-    queue, requests = RequestQueue(100), [Asked(size) for size in (3, 0, 9)]
+    queue, requests = RequestQueue(100, 100), [Asked(size) for size in (3, 0, 9)]
     assert all(queue.offer(request) for request in requests)
     assert [queue.take() for _ in requests] == requests
 
 
 def test_a_request_beyond_the_bound_is_refused_until_there_is_room() -> None:
-    queue = RequestQueue(10)
+    queue = RequestQueue(10, 100)
     assert queue.offer(Asked(6))
     assert queue.offer(Asked(4))
     assert not queue.offer(Asked(1))
@@ -36,8 +36,17 @@ def test_a_request_beyond_the_bound_is_refused_until_there_is_room() -> None:
     assert queue.offer(Asked(6))
 
 
+def test_a_request_beyond_the_number_is_refused_until_one_was_taken() -> None:
+    queue = RequestQueue(100, 2)
+    assert queue.offer(Asked(0))
+    assert queue.offer(Asked(1))
+    assert not queue.offer(Asked(1))
+    queue.take()
+    assert queue.offer(Asked(1))
+
+
 def test_an_empty_queue_takes_a_request_of_any_size() -> None:
-    queue = RequestQueue(10)
+    queue = RequestQueue(10, 100)
     assert queue.offer(Asked(1000))
     assert not queue.offer(Asked(1))
     queue.take()
@@ -46,11 +55,11 @@ def test_an_empty_queue_takes_a_request_of_any_size() -> None:
 
 @given(st.lists(st.integers(0, 12) | st.none(), max_size=40))
 def test_what_is_held_is_what_was_offered_and_not_taken(steps: list[int | None]) -> None:
-    queue, held = RequestQueue(20), list[Asked]()
+    queue, held = RequestQueue(20, 5), list[Asked]()
     for size in steps:
         if size is not None:
             request, before = Asked(size), sum(len(each.payload) for each in held)
-            fits = before == 0 or before + size <= 20
+            fits = not held or (before + size <= 20 and len(held) < 5)
             assert queue.offer(request) == fits
             held += [request] if fits else []
         elif held:
@@ -58,7 +67,7 @@ def test_what_is_held_is_what_was_offered_and_not_taken(steps: list[int | None])
 
 
 def test_after_the_close_what_is_queued_comes_out_and_then_none() -> None:
-    queue, request = RequestQueue(10), Asked(1)
+    queue, request = RequestQueue(10, 100), Asked(1)
     queue.offer(request)
     queue.close()
     assert queue.take() is request
@@ -66,7 +75,7 @@ def test_after_the_close_what_is_queued_comes_out_and_then_none() -> None:
 
 
 def test_take_waits_for_a_request_and_is_woken_by_the_close() -> None:
-    queue, request, taken = RequestQueue(10), Asked(1), []
+    queue, request, taken = RequestQueue(10, 100), Asked(1), []
 
     def work() -> None:
         while (one := queue.take()) is not None:

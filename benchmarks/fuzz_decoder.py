@@ -1,0 +1,64 @@
+"""The decoder under a coverage-guided fuzzer, for as long as one likes; every finding is a bug.
+
+    pip install -c constraints.txt ".[fuzz]"
+    python benchmarks/fuzz_decoder.py CORPUS [-max_total_time=600] [-jobs=2] ...
+
+CORPUS is a folder that grows with every input that reaches something new; it begins with the golden messages of
+tests/protocol. What follows is libFuzzer's. What is read by nobody but us is read too: a rollout that decodes is held
+against a run's specification, as the learner's intake does.
+"""
+
+import importlib
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+atheris: Any = importlib.import_module("atheris")  # an extra of its own, which makes its names when it is loaded
+
+with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
+    from learner.fleet import Fleet
+    from learner.intake import Intake
+    from protocol.codec import Limits, ProtocolError, decode
+    from protocol.messages import Join
+    from protocol.spec import ArraySpace, ChoiceSpace, RunSpec, Spaces
+
+_GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
+_LIMITS = Limits(max_bytes=1 << 20)
+
+
+def _intake() -> Intake:
+    """One that takes the golden rollout of numbers."""
+    spec = RunSpec.model_validate(
+        {"environment": {"id": "CartPole-v1"}, "collection": {"rollout_length": 3, "envs_per_actor": 2}}
+    )
+    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=6))
+    fleet = Fleet(1, spaces)
+    fleet.join(Join(actor="wing-1", incarnation=2**61 + 1, spaces=spaces, environments=2), 0.0)
+    intake = Intake(spec, 2**60 + 3, fleet)
+    intake.state_size = 2
+    return intake
+
+
+_INTAKE = _intake()
+
+
+def one_input(data: bytes) -> None:
+    """What libFuzzer calls."""
+    try:
+        decode(data, _LIMITS)
+    except ProtocolError:
+        return
+    _INTAKE.judge("wing-1", _INTAKE.read("wing-1", data), 81, 0.0)
+
+
+if __name__ == "__main__":
+    corpus = [argument for argument in sys.argv[1:] if not argument.startswith("-")]
+    if not corpus:
+        raise SystemExit(__doc__)
+    Path(corpus[0]).mkdir(parents=True, exist_ok=True)
+    newest = max(_GOLDEN.iterdir(), key=lambda folder: int(folder.name[1:]))
+    for message in newest.iterdir():
+        shutil.copy(message, Path(corpus[0]) / message.name)
+    atheris.Setup(sys.argv, one_input)
+    atheris.Fuzz()
