@@ -1,4 +1,4 @@
-"""Where metrics go: a CSV file, TensorBoard, both, or nowhere."""
+"""Where metrics go: a CSV file, TensorBoard, or both."""
 
 import csv
 import io
@@ -68,16 +68,6 @@ class MetricsWriter(Protocol):
     def close(self) -> None:
         """Brings all to the disk."""
         ...
-
-
-class NullWriter:
-    """Records nothing."""
-
-    def write(self, row: Mapping[str, float], details: Details) -> None:
-        """See MetricsWriter."""
-
-    def close(self) -> None:
-        """See MetricsWriter."""
 
 
 class CsvWriter:

@@ -1,6 +1,6 @@
 """The learner's side of the wire: who is let in, what is taken, what is told. The network never waits for learning.
 
-    transport's threads   answer queries at once; rollouts only go onto a byte-bounded queue
+    transport's threads   answer queries at once; rollouts only go onto a bounded queue
     intake thread         decodes and judges rollouts, answers them, fills the buffer
     watchdog thread       has the transport reopened where nobody is heard and nobody could reach us
 

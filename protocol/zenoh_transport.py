@@ -284,7 +284,12 @@ class ZenohTransport:
         if not self._is_client:
             return False
         session = self._open_session()
-        unneeded = unless_served is not None and bool(_answers(session, unless_served, b"", _PROBE_SECONDS))
+        try:
+            with _as_transport_error(f"ask {unless_served}"):
+                unneeded = unless_served is not None and bool(_answers(session, unless_served, b"", _PROBE_SECONDS))
+        except TransportError:
+            session.close()
+            raise
         with self._lock:
             if unneeded or self._closed:
                 session.close()

@@ -8,6 +8,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from processes import Running
+
 from benchmarks.chaos.scene import ENDLESS, FailedError, Scene, read_json, say, scene, seconds
 
 _SMALL = ("--set", "collection.envs_per_actor=16")
@@ -44,14 +46,8 @@ def barriers(count: int) -> list[tuple[str, str]]:
     """Under a2c, whose updates wait for every live actor, one of three is killed."""
     pauses = []
     with scene() as here:
-        here.start(
-            *("learner", "cartpole", "--algorithm", "a2c", "--actors", 3, "--listen", here.address),
-            *("--run-dir", "run", *_SMALL, *ENDLESS),
-        )
-        names = ["actor-a", "actor-b", "actor-c"]
-        actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in names}
-        for name in names:
-            here.wait_for_training(name)
+        actors = _three_by_hand(here, "--algorithm", "a2c", "--actors", 3)
+        names = list(actors)
         for number in range(count):
             name = names[number % len(names)]
             actors[name].process.kill()
@@ -66,6 +62,16 @@ def barriers(count: int) -> list[tuple[str, str]]:
             actors[name] = here.start("actor", "--connect", here.address, "--name", name)
             here.wait_for_training(name)
     return [("a2c: the others were trained on again after a kill of one of three", seconds(pauses))]
+
+
+def _three_by_hand(here: Scene, *settings: object) -> dict[str, Running]:
+    """A learner and three actors that all contribute, by their names."""
+    here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *settings, *_SMALL, *ENDLESS)
+    names = ("actor-a", "actor-b", "actor-c")
+    actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in names}
+    for name in names:
+        here.wait_for_training(name)
+    return actors
 
 
 def _actors(here: Scene) -> list:
@@ -97,11 +103,8 @@ def freezes(count: int) -> list[tuple[str, str]]:
     """An actor is stopped (SIGSTOP) until it is missed, and let go on."""
     seen, back = [], []
     with scene() as here:
-        here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *_SMALL, *ENDLESS)
-        names = ["actor-a", "actor-b", "actor-c"]
-        actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in names}
-        for name in names:
-            here.wait_for_training(name)
+        actors = _three_by_hand(here)
+        names = list(actors)
         for number in range(count):
             name = names[number % len(names)]
             others = [other for other in names if other != name]

@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Set
 
 import pytest
 from processes import LIMIT, until
 
-from launch import supervisor
+from launch import supervisor, train
 from launch.supervisor import FailedError, Supervised, stop, supervised_actor
+from protocol.spec import RunSpec
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="processes have no priorities here")
@@ -83,3 +85,21 @@ def test_who_left_while_the_others_go_on_is_fetched_back(monkeypatch: pytest.Mon
     monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
     assert news(process) == "it had left; started again"
     stop([process.process])
+
+
+@pytest.mark.parametrize(("algorithm", "told"), [("impala", True), ("a2c", False)])
+def test_training_goes_on_without_an_actor_that_fails_for_good_unless_it_is_needed(
+    algorithm: str, told: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "training": {"algorithm": algorithm}})
+    learner, actors = supervised(SLEEP), [supervised("raise SystemExit(7)") for _ in range(2)]
+    evaluator = supervised("raise SystemExit(7)")
+    evaluator.name = "evaluator"
+    processes = [*actors, evaluator, learner]
+    try:
+        with pytest.raises(FailedError, match="it failed 3 times"):
+            train._watch(learner, [evaluator, *actors], spec, threading.Event())
+        output = capsys.readouterr().out
+        assert ("it failed 3 times; its error is above; going on without it" in output) == told
+    finally:
+        stop([each.process for each in processes])

@@ -8,7 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from learner.learner import METRICS
-from learner.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, NullWriter, TensorBoardWriter
+from learner.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, TensorBoardWriter
 
 NONE = Details()
 
@@ -100,7 +100,7 @@ def test_several_writers_get_all_that_one_gets() -> None:
         def close(self) -> None:
             tape.append((self.name, "closed"))
 
-    writers = MetricsWriters([Tape("one"), NullWriter(), Tape("two")])
+    writers = MetricsWriters([Tape("one"), Tape("two")])
     writers.write({"updates": 1}, NONE)
     writers.close()
     assert tape == [("one", {"updates": 1}, NONE), ("two", {"updates": 1}, NONE), ("one", "closed"), ("two", "closed")]
