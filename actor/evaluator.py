@@ -70,10 +70,10 @@ class Evaluator:
         snapshot = self._link.policy_to_evaluate(welcome.run, self._config.name, self._stop)
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
-        model = self._link.program(welcome.run, snapshot.program)
-        if model is None:
+        program = self._link.program(welcome.run, snapshot.program)
+        if program is None:
             return False
-        runtime = OnnxRuntime(model)
+        runtime = OnnxRuntime(program[1])
         runtime.load(snapshot.weights)
         evaluation = play_episodes(
             runtime, environments, welcome.spec.evaluation.episodes, seed, sampled=False, progress=self._continue

@@ -28,11 +28,20 @@ _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
 _UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
+_TAKEN_SECONDS = 10.0  # for an earlier life of this actor to be found dead
 _REOPEN_SECONDS = 5.0  # nobody answers for so long: perhaps the session is dead, so another is tried
 
 
 class ActorError(Exception):
     """The actor cannot take part; the message says why and what to do."""
+
+
+class LearnerLostError(Exception):
+    """The learner went away, or lives another life; join again."""
+
+
+class NameTakenError(ActorError):
+    """Another actor of that name takes part, or did a moment ago."""
 
 
 class OverError(Exception):
@@ -54,8 +63,16 @@ class LearnerLink:
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, told = _FIRST_RETRY_SECONDS, False
         reopen_at = time.monotonic() + _REOPEN_SECONDS
+        taken_until = time.monotonic() + _TAKEN_SECONDS
         while True:
-            welcome = self.join(run, join)
+            wanted = "a learner"
+            try:
+                welcome = self.join(run, join)
+            except NameTakenError:
+                if time.monotonic() > taken_until:
+                    raise
+                welcome = None
+                wanted = "the other actor of this name to leave"
             if welcome is not None:
                 return welcome
             if deadline is not None and time.monotonic() > deadline:
@@ -63,7 +80,7 @@ class LearnerLink:
                     f"no learner answered within {timeout:g} s: is it running, and is the address its own?"
                 )
             if not told and pause >= _MAX_RETRY_SECONDS:
-                self._say("waiting for a learner")
+                self._say(f"waiting for {wanted}")
                 told = True
             if stop.wait(pause):
                 raise OverError("stopped")
@@ -86,16 +103,22 @@ class LearnerLink:
             if isinstance(refusal, Refusal):
                 if refusal.code == "finished":
                     raise OverError("the run is over")
-                raise ActorError(f"the learner refused this actor: {refusal.reason}")
+                kind = NameTakenError if refusal.code == "name_taken" else ActorError
+                raise kind(f"the learner refused this actor: {refusal.reason}")
         return None
 
-    def program(self, run: str, name: str) -> bytes | None:
-        """The program with that hash; None if nobody has it."""
+    def is_there(self, run: str, join: Join) -> bool:
+        """Whether any learner of `run` answers at all."""
+        return bool(self._ask(keys.join(run), encode(join)))
+
+    def program(self, run: str, name: str = "*") -> tuple[str, bytes] | None:
+        """The program with that hash (`*`: the one that is played now) and its hash; None if nobody has it."""
         for answer in self._ask(keys.program(run, name)):
             if isinstance(answer, Program):
                 model = answer.model.tobytes()
-                if program_hash(model) == name:
-                    return model
+                found = program_hash(model)
+                if found == answer.hash and name in ("*", found):
+                    return found, model
         return None
 
     def newest(self, run: str) -> list[Message]:

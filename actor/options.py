@@ -61,6 +61,13 @@ def parser() -> argparse.ArgumentParser:
         help="this actor's name, the same after a restart (default: from the host's)",
     )
     options.add_argument(
+        "--link",
+        choices=("auto", "lan", "wan"),
+        default="auto",
+        help="wan: fetch weights in bfloat16, as differences, and as often as the link bears, instead of every version "
+        "whole (default: %(default)s, measured when joining)",
+    )
+    options.add_argument(
         "--timeout", type=float, metavar="SECONDS", help="how long to look for a learner (default: for ever)"
     )
     options.add_argument(
@@ -87,6 +94,7 @@ def config(arguments: argparse.Namespace) -> ActorConfig:
         environments=arguments.envs,
         runtime=arguments.runtime,
         wrap=arguments.wrap,
+        link=arguments.link,
         timeout=arguments.timeout,
     )
 

@@ -3,27 +3,26 @@
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from actor.collector import Collector
 from actor.environments import VectorEnvironment, make_environments
-from actor.learner_link import ActorError, LearnerLink, OverError
+from actor.learner_link import ActorError, LearnerLink, LearnerLostError, OverError
+from actor.snapshot_feed import SnapshotFeed
 from actor.uploader import Uploader
 from policy.runtime import OnnxRuntime, PolicyRuntime
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode, encode
 from protocol.messages import (
     Acknowledgement,
-    Farewell,
     Join,
-    Message,
     RolloutIdentity,
     Snapshot,
     Welcome,
 )
 from protocol.spec import EnvironmentSpec, Spaces
-from protocol.transport import Inbox, Transport, TransportError
+from protocol.transport import Transport, TransportError
 
 _ANSWER_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
 _ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
@@ -31,10 +30,10 @@ _DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks 
 _FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be just about to have one
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
+_SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # an answer took longer than this and so many bytes a second
+_SLOW_LINK_WINDOW = 4  # rollouts under way at least, where an answer takes long
 
-
-class _LearnerLostError(Exception):
-    """The learner went away, or lives another life; join again."""
+LinkChoice = Literal["auto", "lan", "wan"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +46,7 @@ class ActorConfig:
     environments: int | None = None  # unset: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
     wrap: str | None = None  # module:function, applied to each environment
+    link: LinkChoice = "auto"  # wan: snapshots are fetched small and as often as it bears; auto: measured
     timeout: float | None = None  # seconds to look for a learner; unset: for ever
 
 
@@ -65,11 +65,11 @@ class ActorService:
         self._uploader = Uploader(window=1)
         self._learner_left = False
         self._heard_at = 0.0  # when the learner last said anything
+        self._feed = SnapshotFeed(transport, self._link, config.name, self._notify)
+        self._join = Join(actor=config.name, incarnation=config.incarnation)
+        self._runs: set[str] = set()  # in which it is announced
         self._run = ""  # the one that it takes part in
-        self._inboxes: dict[str, Inbox] = {}  # by run
         self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
-        self._snapshot: Snapshot | None = None  # the newest of this learner epoch
-        self._news_at = 0.0  # when it came
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout to this learner epoch
 
@@ -83,7 +83,7 @@ class ActorService:
             while True:
                 try:
                     self._take_part(self._find_learner())
-                except _LearnerLostError:
+                except LearnerLostError:
                     self._say("the learner went away; looking for it again")
         except OverError as error:
             self._say(str(error))
@@ -94,8 +94,7 @@ class ActorService:
     # ----------------------------------------------------------------------------------------- playing
 
     def _find_learner(self) -> Welcome:
-        join = Join(actor=self._config.name, incarnation=self._config.incarnation)
-        welcome = self._link.find(self._config.run, join, self._config.timeout, self._stop)
+        welcome = self._link.find(self._config.run, self._join, self._config.timeout, self._stop)
         with self._changed:
             self._learner_left, self._heard_at = False, time.monotonic()
         return welcome
@@ -104,25 +103,20 @@ class ActorService:
         """Makes the environments, is counted in, and plays."""
         self._run = welcome.run
         environments = self._environments(welcome.spec.environment, welcome)
-        self._follow(welcome.run)
-        confirmed = self._link.join(
-            welcome.run,
-            Join(
-                actor=self._config.name,
-                incarnation=self._config.incarnation,
-                spaces=environments.spaces,
-                environments=environments.count,
-            ),
-        )
-        if confirmed is None or confirmed.learner_epoch != welcome.learner_epoch:
-            raise _LearnerLostError
+        self._feed.attend(welcome)
+        self._announce(welcome.run)
+        join = replace(self._join, spaces=environments.spaces, environments=environments.count)
+        confirmed = self._link.find(welcome.run, join, self._config.timeout, self._stop)
+        if confirmed.learner_epoch != welcome.learner_epoch:
+            raise LearnerLostError
         with self._changed:
             if welcome.learner_epoch == self._learner_epoch:  # the network failed, and not the learner
                 self._uploader.send_again()
             else:
                 self._uploader = Uploader(window=welcome.spec.collection.window)
                 self._learner_epoch, self._sequence = welcome.learner_epoch, 0
-        self._snapshot = None
+        if self._config.link == "wan" and not welcome.spec.synchronous:
+            self._spare_the_link()
         self._say(
             f"joined run {welcome.run!r} as {self._config.name!r}: {environments.count} x {welcome.spec.environment.id}"
         )
@@ -138,19 +132,19 @@ class ActorService:
             self._made = spec, make_environments(spec, count, wrap=self._config.wrap)
         return self._made[1]
 
-    def _follow(self, run: str) -> None:
-        if run in self._inboxes:
+    def _announce(self, run: str) -> None:
+        if run in self._runs:
             return
-        self._inboxes[run] = self._transport.follow(keys.snapshots(run), self._notify)
+        self._runs.add(run)
         self._transport.watch(keys.learner(run), self._on_learner)
-        self._transport.announce(keys.presence(run, self._config.name))
+        self._transport.announce(keys.presence(run, self._config.name, self._config.incarnation))
 
     def _play(self, welcome: Welcome, environments: VectorEnvironment) -> None:
-        self._await_snapshot(welcome, newer_than=-1)
-        assert self._snapshot is not None
+        runtime = self._runtime(welcome, environments.spaces)
+        snapshot = self._await_snapshot(newer_than=-1)
         collector = Collector(
             environments,
-            self._runtime(welcome, self._snapshot, environments.spaces),
+            runtime,
             welcome.spec.environment,
             rollout_length=welcome.spec.collection.rollout_length,
             seed=welcome.seed,
@@ -159,11 +153,10 @@ class ActorService:
         while True:
             self._wait(lambda: self._uploader.has_room)  # before playing: what is played now is of the newest policy
             if not welcome.spec.synchronous:
-                self._read_inbox(welcome)
-                self._doubt(welcome)
-            if self._snapshot.policy_version != loaded:
-                collector.load(self._snapshot.weights)
-                loaded = self._snapshot.policy_version
+                snapshot = self._newest_snapshot(snapshot)
+            if snapshot.policy_version != loaded:
+                collector.load(snapshot.weights)
+                loaded = snapshot.policy_version
             identity = RolloutIdentity(
                 actor=self._config.name,
                 incarnation=self._config.incarnation,
@@ -176,21 +169,51 @@ class ActorService:
             self._send_due()
             self._sequence += 1
             if welcome.spec.synchronous:
-                self._await_snapshot(welcome, newer_than=loaded)
+                snapshot = self._await_snapshot(newer_than=loaded)
 
-    def _runtime(self, welcome: Welcome, snapshot: Snapshot, spaces: Spaces) -> PolicyRuntime:
+    def _runtime(self, welcome: Welcome, spaces: Spaces) -> PolicyRuntime:
         if self._config.runtime == "torch":
             from policy.torch_runtime import TorchRuntime  # an actor has no torch unless it asks for it
 
             return TorchRuntime(welcome.spec.policy, spaces)
-        model = self._link.program(welcome.run, snapshot.program)
-        if model is not None:
-            return OnnxRuntime(model)
-        raise _LearnerLostError
+        return OnnxRuntime(self._await_program(welcome))
+
+    def _await_program(self, welcome: Welcome) -> bytes:
+        """The program, once the learner has it; how long it takes to come tells how fast the link is."""
+        pause = _FIRST_DOUBT_SECONDS
+        while True:
+            began = time.monotonic()
+            program = self._link.program(welcome.run)
+            if program is not None:
+                break
+            heard_at = self._heard_at
+            self._wait(lambda heard_at=heard_at: self._heard_at > heard_at, pause)
+            self._feed.read()
+            pause = min(2 * pause, _DOUBT_SECONDS)
+        if self._config.link == "auto" and not welcome.spec.synchronous:
+            self._measure_link(welcome, time.monotonic() - began, len(program[1]))
+        return program[1]
+
+    def _measure_link(self, welcome: Welcome, seconds: float, size: int) -> None:
+        """Spares a link over which the program took long to come, and did so again: once may be a busy machine."""
+        allowed = _SLOW_LINK_SECONDS + size / _SLOW_LINK_RATE
+        for _ in range(2):
+            if seconds <= allowed:
+                return
+            began = time.monotonic()
+            self._link.program(welcome.run)
+            seconds = time.monotonic() - began
+        if seconds > allowed:
+            self._say(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
+            self._spare_the_link()
+
+    def _spare_the_link(self) -> None:
+        self._feed.spare_the_link()
+        self._uploader.window = max(self._uploader.window, _SLOW_LINK_WINDOW)
 
     # --------------------------------------------------------------------------------------- snapshots
 
-    def _await_snapshot(self, welcome: Welcome, newer_than: int) -> None:
+    def _await_snapshot(self, newer_than: int) -> Snapshot:
         """Waits for a snapshot newer than a version; asks for it when in doubt.
 
         Returns early if the rollout that was to bring it was rejected: another must take its place.
@@ -198,44 +221,24 @@ class ActorService:
         first = newer_than < 0
 
         def arrived() -> bool:
-            self._read_inbox(welcome)
-            return self._snapshot is not None and self._snapshot.policy_version > newer_than
+            self._feed.read()
+            return self._feed.newest is not None and self._feed.newest.policy_version > newer_than
 
         pause = _FIRST_DOUBT_SECONDS if first else _DOUBT_SECONDS
         while not self._wait(lambda: arrived() or (self._uploader.must_replace and not first), pause):
             pause = min(2 * pause, _DOUBT_SECONDS)
-            self._ask_news(welcome)
+            self._feed.ask()
         with self._changed:
             self._uploader.must_replace = False
+        assert self._feed.newest is not None
+        return self._feed.newest
 
-    def _doubt(self, welcome: Welcome) -> None:
-        """Asks for the newest snapshot if answers tell of one that was pushed and did not arrive."""
-        assert self._snapshot is not None
-        missed = self._uploader.newest_version > self._snapshot.policy_version
-        if missed and time.monotonic() > self._news_at + _DOUBT_SECONDS:
-            self._news_at = time.monotonic()
-            self._ask_news(welcome)
-
-    def _ask_news(self, welcome: Welcome) -> None:
-        for message in self._link.newest(welcome.run):
-            self._take_news(welcome, message)
-
-    def _read_inbox(self, welcome: Welcome) -> None:
-        news = self._inboxes[welcome.run].take()
-        message = None if news is None else self._link.decode(news)
-        if message is not None:
-            self._take_news(welcome, message)
+    def _newest_snapshot(self, known: Snapshot) -> Snapshot:
+        """What has come by now; asks for what answers tell of and did not come."""
+        self._feed.read()
         self._check()
-
-    def _take_news(self, welcome: Welcome, news: Message) -> None:
-        if isinstance(news, Farewell) and news.learner_epoch == welcome.learner_epoch:
-            raise OverError(f"the run is over: {news.reason}")
-        if not isinstance(news, Snapshot):
-            return
-        if news.learner_epoch != welcome.learner_epoch:
-            raise _LearnerLostError
-        if self._snapshot is None or news.policy_version > self._snapshot.policy_version:
-            self._snapshot, self._news_at = news, time.monotonic()
+        self._feed.keep_up(self._uploader.newest_version)
+        return self._feed.newest or known
 
     # ----------------------------------------------------------------------------------------- waiting
 
@@ -259,8 +262,8 @@ class ActorService:
     def _break_silence(self) -> None:
         """Raises if nothing was heard for long, and nothing is to be heard: then a session is dead that seems alive."""
         if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
-            if not self._link.newest(self._run):
-                raise _LearnerLostError
+            if not self._link.is_there(self._run, self._join):
+                raise LearnerLostError
             with self._changed:
                 self._heard_at = time.monotonic()
 
@@ -275,7 +278,7 @@ class ActorService:
         if self._uploader.over == "finished":
             raise OverError("the run is over")
         if self._learner_left or self._uploader.over == "fenced":
-            raise _LearnerLostError
+            raise LearnerLostError
 
     def _send_due(self) -> None:
         key = keys.rollouts(self._run, self._config.name)

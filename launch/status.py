@@ -22,6 +22,8 @@ examples:
   daedalus status --connect tcp/gpu-box:7447 --json
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo somebody should look
 
+MB/h up: rollouts; down: snapshots, with an s where the link is slow and they are fetched small.
+
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the problems stand in the answer)"""
 
 
@@ -85,7 +87,7 @@ def _table(status: RunStatus) -> str:
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
         f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
-        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6}  rejected",
+        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}  rejected",
         *(f"  {_line(actor)}" for actor in status.actors),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
     ]
@@ -96,9 +98,10 @@ def _line(actor: ActorStatus) -> str:
     state = "quarantined" if actor.quarantined else "alive" if actor.alive else "gone"
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
+    down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.slow_link else ''}"
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
         f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
         f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
-        f"  {rejected or '-'}"
+        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}"
     )

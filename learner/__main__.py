@@ -81,7 +81,7 @@ def main() -> int:
             restored=restored,
         )
         return _status(service.run(), spec)
-    except (ValueError, SettingsError) as error:  # a checkpoint of another network, a folder that cannot be made
+    except (ValueError, SettingsError, TransportError) as error:  # another network's checkpoint, a rival
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
     finally:

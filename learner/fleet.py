@@ -62,6 +62,11 @@ class Actor:
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of its newest rollout
+    slow_link: bool = False  # it asks for snapshots that fit its link; to all others they are pushed
+    received_bytes: int = 0  # rollouts, whatever became of them
+    answered_bytes: int = 0  # snapshots that it asked for
+    bytes_up_per_hour: float = 0.0
+    bytes_down_per_hour: float = 0.0
 
     @property
     def sequences(self) -> SequenceWindow:
@@ -89,7 +94,7 @@ class Actor:
         """
         self.incarnation = incarnation
         self.lives += 1
-        self.unfit, self.quarantined = 0, ""
+        self.unfit, self.quarantined, self.slow_link = 0, "", False
         self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
         while len(self.windows) > _REMEMBERED_LIVES:
             del self.windows[next(iter(self.windows))]
@@ -102,17 +107,25 @@ class Fleet:
         self._seed = seed
         self.spaces = spaces  # the first actor's, or those of the checkpoint
         self.actors: dict[str, Actor] = {}  # that joined
-        self._present: set[str] = set()  # the names that liveliness tells of, whoever bears them
+        self.pushed_bytes = 0  # snapshots, to each that follows them
+        self._present: dict[str, set[int]] = {}  # by name, the incarnations that liveliness tells of
 
     def join(self, join: Join, now: float) -> Refusal | None:
         """Takes in an actor; returns why not, if it cannot take part.
 
-        A new incarnation of a known name replaces the old one. Who comes without spaces only asks what is played.
+        A new incarnation of a known name replaces the old one, once that is gone. Who comes without spaces only asks
+        what is played.
         """
         try:
             keys.check_name(join.actor, "actor name")
         except ValueError as error:
             return Refusal(code="malformed", reason=str(error))
+        known = self.actors.get(join.actor)
+        if known is not None and known.incarnation != join.incarnation and self.is_live(known):
+            return Refusal(
+                code="name_taken",
+                reason=f"an actor named {join.actor!r} takes part already: give this one another --name",
+            )
         if join.spaces is None:
             return None
         if not 1 <= join.environments <= 4096:
@@ -137,7 +150,7 @@ class Fleet:
         """Forgets, where as many as there may be are known, who is away and was not seen for longest."""
         if len(self.actors) < _MOST_ACTORS:
             return True
-        away = [actor for actor in self.actors.values() if actor.name not in self._present]
+        away = [actor for actor in self.actors.values() if not self.is_present(actor)]
         if away:
             del self.actors[min(away, key=lambda actor: actor.last_seen).name]
         return bool(away)
@@ -148,16 +161,27 @@ class Fleet:
         entropy = [self._seed, zlib.crc32(name.encode()), lives, start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
-    def set_present(self, name: str, present: bool) -> None:
-        """What liveliness says of an actor."""
+    def set_present(self, name: str, incarnation: int, present: bool) -> None:
+        """What liveliness says of one life of an actor."""
         if present:
-            self._present.add(name)
-        else:
-            self._present.discard(name)
+            self._present.setdefault(name, set()).add(incarnation)
+        elif name in self._present:
+            self._present[name].discard(incarnation)
+            if not self._present[name]:
+                del self._present[name]
+
+    def is_present(self, actor: Actor) -> bool:
+        """Whether its newest incarnation is there."""
+        return actor.incarnation in self._present.get(actor.name, ())
 
     def is_live(self, actor: Actor) -> bool:
         """Whether it takes part: it has joined, is present, and what it sends is taken."""
-        return actor.name in self._present and actor.environments > 0 and not actor.quarantined
+        return self.is_present(actor) and actor.environments > 0 and not actor.quarantined
+
+    def received(self, name: str, size: int) -> None:
+        """Counts what an actor sent."""
+        if name in self.actors:
+            self.actors[name].received_bytes += size
 
     def expected(self, identity: RolloutIdentity) -> Actor | None:
         """The actor a rollout is from, or None if that life of it has not joined."""
@@ -176,7 +200,7 @@ class Fleet:
         return tuple(
             ActorStatus(
                 actor=actor.name,
-                alive=actor.name in self._present,
+                alive=self.is_present(actor),
                 quarantined=actor.quarantined,
                 lives=actor.lives,
                 seconds_since_seen=max(now - actor.last_seen, 0.0),
@@ -188,6 +212,9 @@ class Fleet:
                 rollouts_missed=actor.missed,
                 busy_answers=actor.busy,
                 policy_lag=actor.policy_lag,
+                slow_link=actor.slow_link,
+                bytes_up_per_hour=actor.bytes_up_per_hour,
+                bytes_down_per_hour=actor.bytes_down_per_hour,
             )
             for actor in sorted(self.actors.values(), key=lambda actor: actor.name)
         )

@@ -33,7 +33,8 @@ class FrontDesk:
         self._fleet = fleet
         self._lock = lock
         self._snapshot = encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
-        self._programs: dict[str, bytes] = {}
+        self._program: Program | None = None
+        self._encoded_program = b""
         self._over = False
 
     def join(self, data: bytes, now: float) -> bytes:
@@ -55,14 +56,14 @@ class FrontDesk:
         return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
 
     def offer_program(self, program: Program) -> None:
-        """Has a program ready for those who ask for its hash."""
-        self._programs[program.hash] = encode(program)
+        """Has the run's program ready for those who ask for it."""
+        self._encoded_program, self._program = encode(program), program
 
     def program(self, program_hash: str) -> bytes:
-        """The answer to a query for a program."""
-        return self._programs.get(program_hash) or encode(
-            Refusal(code="unknown", reason=f"there is no program {program_hash[:64]!r}")
-        )
+        """The answer to a query for a program, or for the one that is played (`*`)."""
+        if self._program is None or program_hash not in ("*", self._program.hash):
+            return encode(Refusal(code="unknown", reason=f"there is no program {program_hash[:64]!r}"))
+        return self._encoded_program
 
     def offer_snapshot(self, encoded: bytes) -> None:
         """Has the newest snapshot ready, as the bytes that were published."""

@@ -2,6 +2,7 @@
 
     transport's threads   answer queries at once; rollouts only go onto a bounded queue
     intake thread         decodes and judges rollouts, answers them, fills the buffer
+    slow links' thread    makes small snapshots for those whose links need them (learner/slow_links.py)
     watchdog thread       has the transport reopened where nobody is heard and nobody could reach us
 
 The main thread takes batches out and publishes snapshots. One condition guards what they share: fleet, buffer,
@@ -22,6 +23,7 @@ from learner.front_desk import FrontDesk
 from learner.intake import Intake, Rejected, acknowledgement
 from learner.request_queue import RequestQueue
 from learner.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, Taken
+from learner.slow_links import SlowLinks
 from policy.runtime import program_hash
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode, encode
@@ -43,6 +45,7 @@ HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _WAITING_EVALUATIONS = 64  # at once; evaluators beyond that ask again later
 _EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)
 _SILENCE_SECONDS = 10.0  # without a word from anybody for so long, the session may be dead
+_RIVAL_SECONDS = 2.0  # for another learner of this run to say that it is there
 _HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
 
 
@@ -72,6 +75,7 @@ class Reception:
         self._intake = Intake(spec, learner_epoch, self.fleet)
         self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         self._requests = _queue(spec)
+        self._slow_links = SlowLinks(learner_epoch, self._desk.snapshot, self._on_small_answer)
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
         self._ended = threading.Event()
         self._heard_at = time.monotonic()
@@ -80,12 +84,18 @@ class Reception:
         self._evaluations: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
 
     def open(self) -> None:
-        """Lets actors in."""
-        self._judging.start()
+        """Lets actors in. Raises TransportError if another learner serves a run of this name."""
         transport, run, desk = self._transport, self._run, self._desk
-        transport.watch(keys.presence(run, "*"), self._on_presence)
+        if transport.ask(keys.status(run), timeout=_RIVAL_SECONDS):
+            raise TransportError(
+                f"another learner serves run {run!r} there already: stop it, "
+                "or name this one otherwise (the last part of --run-dir)"
+            )
+        self._judging.start()
+        self._slow_links.open()
+        transport.watch(keys.presence(run, "*", "*"), self._on_presence)
         self._serve(keys.rollouts(run, "*"), self._on_rollout)
-        self._serve(keys.snapshots(run), lambda request: request.reply(desk.snapshot()))
+        self._serve(keys.snapshots(run), self._on_snapshot)
         self._serve(keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key))))
         self._serve(keys.status(run), self._on_status)
         self._serve(keys.evaluations(run, "*"), self._on_evaluation)
@@ -112,6 +122,7 @@ class Reception:
         self._desk.close(farewell)
         self._push(farewell)
         self._requests.close()
+        self._slow_links.close()
         for request, _ in self.take_evaluations():
             request.reply(encode(Refusal(code="finished", reason=reason)))
         self._ended.set()
@@ -193,6 +204,7 @@ class Reception:
         self._desk.offer_snapshot(snapshot)
         self._push(snapshot)
         self._counters.snapshots_published += 1
+        self.fleet.pushed_bytes += len(snapshot)
 
     def _push(self, news: bytes) -> None:
         with contextlib.suppress(TransportError):  # in a session that is being replaced: who needs it asks for it
@@ -201,9 +213,11 @@ class Reception:
     # ----------------------------------------------------------------------------- the transport's threads
 
     def _on_presence(self, key: str, present: bool) -> None:
-        with self.lock:
-            self.fleet.set_present(keys.last_chunk(key), present)
-            self.lock.notify_all()
+        life = keys.who_is_present(key)
+        if life is not None:
+            with self.lock:
+                self.fleet.set_present(*life, present)
+                self.lock.notify_all()
 
     def _on_rollout(self, request: Request) -> None:
         if self._over:
@@ -214,6 +228,12 @@ class Reception:
                 actor = self.fleet.actors.get(keys.last_chunk(request.key))
                 if actor is not None:
                     actor.busy += 1
+
+    def _on_snapshot(self, request: Request) -> None:
+        if request.size:
+            self._slow_links.offer(request)
+        else:
+            request.reply(self._desk.snapshot())
 
     def _on_evaluation(self, request: Request) -> None:
         sender = keys.last_chunk(request.key)
@@ -238,6 +258,14 @@ class Reception:
             status = self._status(self.fleet)
         request.reply(encode(StatusReport(status=status)))
 
+    # -------------------------------------------------------------------------------- the slow links' thread
+
+    def _on_small_answer(self, name: str, size: int) -> None:
+        with self.lock:
+            actor = self.fleet.actors.get(name)
+            if actor is not None:
+                actor.slow_link, actor.answered_bytes = True, actor.answered_bytes + size
+
     # --------------------------------------------------------------------------------- the watchdog thread
 
     def _watch_silence(self) -> None:
@@ -258,6 +286,7 @@ class Reception:
                         verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor"
                     )
                 verdict = self._intake.judge(sender, content, self._version, time.monotonic())
+                self.fleet.received(sender, request.size)
                 if isinstance(verdict, Rollout):
                     self._store(verdict, len(request.payload))
                 else:

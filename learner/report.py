@@ -43,7 +43,8 @@ class RateMeter:
 
     def __init__(self, counters: RunCounters, now: float) -> None:
         self.rates: dict[str, float] = {}  # as of the last look
-        self._actors: dict[str, int] = {}  # their env_steps
+        self._actors: dict[str, tuple[int, int, int]] = {}  # their env_steps, bytes received, bytes of answers
+        self._pushed_bytes = 0
         self._mark(counters, now)
 
     def _mark(self, counters: RunCounters, now: float) -> None:
@@ -53,9 +54,16 @@ class RateMeter:
     def look(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
         """env_steps and updates a second, and the mean policy lag, since the last look; each actor is told its own."""
         seconds = max(now - self._then, 1e-9)
+        pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
         for actor in fleet.actors.values():
-            actor.env_steps_per_second = (actor.env_steps - self._actors.get(actor.name, 0)) / seconds
-        self._actors = {actor.name: actor.env_steps for actor in fleet.actors.values()}
+            now_at = actor.env_steps, actor.received_bytes, actor.answered_bytes
+            env_steps, received, answered = np.subtract(now_at, self._actors.get(actor.name, (0, 0, 0))) / seconds
+            self._actors[actor.name] = now_at
+            followed = 0.0 if actor.slow_link or not fleet.is_live(actor) else pushed / seconds
+            actor.env_steps_per_second = float(env_steps)
+            actor.bytes_up_per_hour = 3600 * float(received)
+            actor.bytes_down_per_hour = 3600 * float(answered + followed)
+        self._actors = {name: self._actors[name] for name in fleet.actors}  # whom the fleet forgot is forgotten here
         rollouts = max(counters.rollouts_trained - self._rollouts, 1)
         self.rates = {
             "env_steps_per_second": (counters.env_steps - self._env_steps) / seconds,

@@ -30,9 +30,9 @@ import zstandard
 from pydantic import ValidationError
 
 from protocol import schema
-from protocol.messages import Message, Program, Rollout
+from protocol.messages import CompactSnapshot, Message, Program, Rollout
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")
@@ -40,8 +40,8 @@ _PLAIN, _ZSTD = 0, 1
 _ALIGNMENT = 8
 _DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
-_COMPRESSED = (Rollout, Program)  # weights are noise to zstd; the rest is small
-_LEVEL, _PIXEL_LEVEL = -1, 1  # zstd's: what is cheap for numbers leaves pixels twice as large
+_COMPRESSED = (Rollout, Program, CompactSnapshot)  # weights are noise to zstd; the rest is small
+_LEVEL, _BYTES_LEVEL = -1, 1  # zstd's: what is cheap for numbers leaves pixels and byte planes twice as large
 _MAX_DIMENSIONS = 8
 
 
@@ -92,8 +92,10 @@ def encode(message: Message) -> bytes:
     header = cast(bytes, msgpack.packb(content))
     flags = _PLAIN
     if isinstance(message, _COMPRESSED) and body:
-        pixels = any(array.dtype == np.uint8 and array.ndim > 3 for _, array in arrays)
-        smaller = (_zstd.pixel_compressor if pixels else _zstd.compressor).compress(body)
+        in_bytes = isinstance(message, CompactSnapshot) or any(
+            array.dtype == np.uint8 and array.ndim > 3 for _, array in arrays
+        )
+        smaller = (_zstd.bytes_compressor if in_bytes else _zstd.compressor).compress(body)
         if len(smaller) < len(body):
             flags, body = _ZSTD, smaller
     padding = bytes(-(_PREFIX.size + len(header)) % _ALIGNMENT)
@@ -264,7 +266,7 @@ class _Zstd(threading.local):
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)
-        self.pixel_compressor = zstandard.ZstdCompressor(level=_PIXEL_LEVEL, write_content_size=True)
+        self.bytes_compressor = zstandard.ZstdCompressor(level=_BYTES_LEVEL, write_content_size=True)
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=64 << 20)
 
 

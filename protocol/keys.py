@@ -41,9 +41,15 @@ def snapshots(run: str) -> str:
     return f"daedalus/{run}/snapshots"
 
 
-def presence(run: str, actor: str) -> str:
-    """The liveliness token of one actor (`*` for all of them)."""
-    return f"daedalus/{run}/actors/{actor}"
+def presence(run: str, actor: str, incarnation: int | str) -> str:
+    """The liveliness token of one life of an actor (`*` for all of them)."""
+    return f"daedalus/{run}/actors/{actor}/{incarnation}"
+
+
+def who_is_present(key: str) -> tuple[str, int] | None:
+    """The actor's name and incarnation in a presence key; None if it is not one that an actor of ours has."""
+    actor, incarnation = key.split("/")[-2:]
+    return (actor, int(incarnation)) if re.fullmatch(r"[0-9]{1,19}", incarnation) else None
 
 
 def learner(run: str) -> str:
@@ -57,5 +63,5 @@ def status(run: str) -> str:
 
 
 def last_chunk(key: str) -> str:
-    """The actor's name in a presence or rollouts key."""
+    """The actor's name in a rollouts key, the evaluator's in an evaluations key."""
     return key.rsplit("/", 1)[-1]

@@ -43,7 +43,7 @@ class Welcome:
 class Refusal:
     """A typed no, in answer to any query."""
 
-    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full"]
+    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full", "name_taken"]
     reason: str
 
 
@@ -155,6 +155,53 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotRequest:
+    """An actor on a slow link asks for a part of a CompactSnapshot: actor -> learner, on `snapshots`.
+
+    Asking for part 0 has the newest one made, for the version that the actor holds; the others follow by its version.
+    """
+
+    actor: str
+    held_version: int | None  # what differences are to be to; None: it holds none
+    policy_version: int | None = None  # of the one whose part is asked for; None: the newest
+    part: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SnapshotPart:
+    """A piece of an encoded CompactSnapshot, in answer to SnapshotRequest: small enough to hold up nobody's traffic.
+
+    The pieces 0 to parts - 1, one after the other, are the message.
+    """
+
+    learner_epoch: int
+    policy_version: int
+    part: int
+    parts: int
+    data: np.ndarray  # [bytes] uint8
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.part < self.parts:
+            raise ValueError(f"part {self.part} of {self.parts}")
+        if self.data.ndim != 1 or self.data.dtype != np.uint8:
+            raise ValueError(f"data must be uint8 [bytes], not {self.data.dtype} {self.data.shape}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CompactSnapshot:
+    """A Snapshot in bfloat16, whole or as differences to an earlier version (protocol/compact.py).
+
+    Learner -> actors on slow links, in SnapshotParts.
+    """
+
+    learner_epoch: int
+    policy_version: int
+    program: str
+    base_version: int | None  # what the differences are to; None: it is whole
+    weights: dict[str, np.ndarray]  # uint8 [2, *shape]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationRequest:
     """An evaluator asks for a policy to play: evaluator -> learner, on `evaluations/{evaluator}`.
 
@@ -204,6 +251,9 @@ Message = (
     | Rollout
     | Acknowledgement
     | Snapshot
+    | SnapshotRequest
+    | SnapshotPart
+    | CompactSnapshot
     | EvaluationRequest
     | EvaluationReport
     | Farewell

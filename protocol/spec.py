@@ -247,6 +247,9 @@ class ActorStatus(Specification):
     rollouts_missed: int  # sequence numbers that never came
     busy_answers: int  # how often it was told to come again later
     policy_lag: int  # of its newest rollout
+    slow_link: bool  # it asks for snapshots that fit its link; to all others every one is pushed
+    bytes_up_per_hour: float  # rollouts, at the rate of the last seconds
+    bytes_down_per_hour: float  # snapshots
 
 
 class RunStatus(Specification):

@@ -48,6 +48,10 @@ class Request(Protocol):
 class Inbox(Protocol):
     """The newest unread value of a followed key."""
 
+    def close(self) -> None:
+        """Follows no more. Idempotent."""
+        ...
+
     def take(self) -> bytes | None:
         """The newest value that was not taken yet, or None. Never waits."""
         ...
@@ -125,6 +129,9 @@ class _MemoryInbox:
     def take(self) -> bytes | None:
         newest, self.newest = self.newest, None
         return newest
+
+    def close(self) -> None:
+        self.key = ""
 
 
 class MemoryNetwork:

@@ -160,6 +160,7 @@ class _ZenohInbox:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._newest: zenoh.ZBytes | None = None
+        self.undeclare: Callable[[], None] = lambda: None
 
     def put(self, payload: zenoh.ZBytes) -> None:
         with self._lock:
@@ -169,6 +170,9 @@ class _ZenohInbox:
         with self._lock:
             newest, self._newest = self._newest, None
         return None if newest is None else newest.to_bytes()
+
+    def close(self) -> None:
+        self.undeclare()
 
 
 class ZenohTransport:
@@ -180,8 +184,8 @@ class ZenohTransport:
         self._is_client = is_client
         self._session = open_session()
         self._closed = False
-        self._declarations: list[Callable[[zenoh.Session], object]] = []  # to be made again in another session
-        self._declared: list[object] = []  # tokens and watches end when they are garbage
+        # What is to be made again in another session, and what it made in this one: that ends when it is garbage.
+        self._declared: dict[Callable[[zenoh.Session], object], object] = {}
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
@@ -196,8 +200,7 @@ class ZenohTransport:
             self._declare(lambda session: session.declare_queryable(key, on_query, complete=True))
 
     def _declare(self, declaration: Callable[[zenoh.Session], object]) -> None:
-        self._declarations.append(declaration)
-        self._declared.append(declaration(self._session))
+        self._declared[declaration] = declaration(self._session)
 
     def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
@@ -252,9 +255,19 @@ class ZenohTransport:
             inbox.put(sample.payload)
             on_news()
 
+        def declaration(session: zenoh.Session) -> object:
+            return session.declare_subscriber(key, on_sample)
+
         with _as_transport_error(f"follow {key}"):
-            self._declare(lambda session: session.declare_subscriber(key, on_sample))
+            self._declare(declaration)
+        inbox.undeclare = lambda: self._undeclare(declaration)
         return inbox
+
+    def _undeclare(self, declaration: Callable[[zenoh.Session], object]) -> None:
+        subscriber = self._declared.pop(declaration, None)
+        if isinstance(subscriber, zenoh.Subscriber):
+            with contextlib.suppress(zenoh.ZError):  # its session was closed: nothing comes any more anyway
+                subscriber.undeclare()
 
     def announce(self, key: str) -> None:
         """See Transport."""
@@ -299,7 +312,7 @@ class ZenohTransport:
             self._publishers.clear()
         given_up.close()
         with _as_transport_error("declare again"):
-            self._declared = [declaration(session) for declaration in self._declarations]
+            self._declared = {declaration: declaration(session) for declaration in list(self._declared)}
         return True
 
     def close(self) -> None:

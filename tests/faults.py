@@ -1,9 +1,12 @@
 """What goes wrong out there, made here: a link that stalls, and a sender that is no actor of ours."""
 
 import contextlib
+import queue
 import secrets
 import socket
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -84,6 +87,70 @@ class StallingProxy:
                 end.shutdown(socket.SHUT_RDWR)
 
 
+class SlowProxy:
+    """A TCP proxy before a port of this machine that carries so many bytes a second each way, each so much later."""
+
+    def __init__(self, target: str, *, up: float, down: float, delay: float) -> None:
+        """`up` and `down` in bytes a second, `delay` in seconds each way."""
+        self._target, self._rates, self._delay = port_of(target), {"up": up, "down": down}, delay
+        self.carried = {"up": 0, "down": 0}  # bytes
+        self._sockets: list[socket.socket] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._spawn(self._accept)
+
+    def _spawn(self, work: Callable[..., None], *arguments: object) -> None:
+        threading.Thread(target=work, args=arguments, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                far = socket.create_connection(("127.0.0.1", self._target))
+            except OSError:
+                near.close()
+                continue
+            self._sockets += (near, far)
+            for way, source, sink in (("up", near, far), ("down", far, near)):
+                # Buffers as small as a slow link's own: else the first megabytes would seem to have passed at once.
+                source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
+                passing: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+                self._spawn(self._read, way, source, passing)
+                self._spawn(self._write, sink, passing)
+
+    def _read(self, way: str, source: socket.socket, passing: "queue.SimpleQueue[tuple[float, bytes]]") -> None:
+        free_at, data = time.monotonic(), b" "
+        while data:
+            try:
+                data = source.recv(8 << 10)
+            except OSError:
+                data = b""
+            free_at = max(free_at, time.monotonic()) + len(data) / self._rates[way]
+            time.sleep(max(free_at - time.monotonic(), 0.0))
+            self.carried[way] += len(data)
+            passing.put((free_at + self._delay, data))
+
+    def _write(self, sink: socket.socket, passing: "queue.SimpleQueue[tuple[float, bytes]]") -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                at, data = passing.get()
+                time.sleep(max(at - time.monotonic(), 0.0))
+                if not data:
+                    sink.shutdown(socket.SHUT_RDWR)
+                    return
+                sink.sendall(data)
+
+    def close(self) -> None:
+        """Ends every connection."""
+        for end in (self._listener, *self._sockets):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+
 class Sender:
     """Takes part in a CartPole run under a name of its own, and sends what a test makes."""
 
@@ -93,7 +160,7 @@ class Sender:
         self._link = LearnerLink(self.transport, lambda text: None)
         join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
         self.welcome: Welcome = self._link.find(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
-        self.transport.announce(keys.presence(self.welcome.run, name))
+        self.transport.announce(keys.presence(self.welcome.run, name, self.incarnation))
         self.key = keys.rollouts(self.welcome.run, name)
 
     def version(self) -> int:

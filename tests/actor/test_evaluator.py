@@ -59,7 +59,7 @@ class ScriptedLearner:
         self.present: list[str] = []
         self.transport.serve(keys.evaluations("r", "*"), self.told.put)
         self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.watch(keys.presence("r", "*"), lambda key, _: self.present.append(key))
+        self.transport.watch(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
         self.transport.serve(keys.join("r"), self._join)
 
     def _join(self, request: Request) -> None:

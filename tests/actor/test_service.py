@@ -348,24 +348,14 @@ def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to
     learner = ScriptedLearner(network)
     learner.publish(0)
     held = [learner.receive(), learner.receive()]  # never answered
-    asked = threading.Semaphore(0)
-    answering = threading.Event()
-    answering.set()
-
-    def snapshot(request: Request) -> None:
-        asked.release()
-        if answering.is_set():
-            request.reply(learner.snapshot)
-
-    learner.transport.serve(keys.snapshots("r"), snapshot)
+    assert learner.joins.get(timeout=LIMIT).spaces is None
+    assert learner.joins.get(timeout=LIMIT).spaces == SPACES
     for _ in range(3):
-        assert asked.acquire(timeout=LIMIT)
-    joins = learner.joins.qsize()
-    assert joins == 2  # it was answered: the learner only takes its time
-    answering.clear()
-    until(lambda: learner.joins.qsize() > joins)
-    assert any("went away" in text for text in actor.said)
-    answering.set()
+        assert learner.joins.get(timeout=LIMIT).spaces is None  # it asks, and is answered: the learner takes its time
+    assert not any("went away" in text for text in actor.said)
+    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # nothing that makes sense
+    until(lambda: any("went away" in text for text in actor.said))
+    learner.transport.serve(keys.join("r"), learner._join)
     again = learner.receive()
     assert again[0].identity in [rollout.identity for rollout, _ in held]  # sent again, to be taken at most once
 

@@ -301,7 +301,7 @@ def test_bytes_of_any_kind_on_any_key_change_nothing(
             ):
                 assert len(sender.transport.ask(key, payload, timeout=LIMIT)) == 1
             sender.transport.publish(keys.snapshots(run), payload)
-        sender.transport.announce(keys.presence(run, "nobody-ever-joined"))
+        sender.transport.announce(keys.presence(run, "nobody-ever-joined", 1))
         plays_on(status, "good")
     finally:
         sender.close()

@@ -11,7 +11,7 @@ from protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
 from protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
 from protocol.spec import ArraySpace, ChoiceSpace, Spaces
 from protocol.transport import Transport
-from protocol.zenoh_transport import connect
+from protocol.zenoh_transport import connect, listen
 
 CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 Start = Callable[..., Running]
@@ -78,6 +78,36 @@ def test_the_learner_survives_bytes_of_any_kind_on_every_key(stranger: Transport
     answer = ask(stranger, keys.rollouts("run", "stranger"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "rejected"
+
+
+def test_of_two_actors_of_one_name_the_second_is_refused_until_the_first_has_left(start: Start, address: str) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+    learner.expect("actors join with")
+    first = start("actor", "--connect", address, "--name", "arm")
+    first.expect("joined run")
+    second = start("actor", "--connect", address, "--name", "arm")
+    second.expect("waiting for the other actor of this name to leave")
+    assert second.wait() == 1
+    second.expect("an actor named 'arm' takes part already: give this one another --name")
+    third = start("actor", "--connect", address, "--name", "arm")
+    third.expect("waiting for the other actor of this name to leave")
+    first.end()
+    third.expect("joined run 'run' as 'arm'")
+
+
+def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address: str) -> None:
+    router = listen([address])
+    try:
+        first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
+        first.expect("actors join with")
+        until(lambda: router.ask(keys.join("run"), timeout=30.0))
+        second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
+        assert second.wait() == 1
+        second.expect("another learner serves run 'run' there already: stop it, or name this one otherwise")
+        assert first.process.poll() is None
+    finally:
+        router.close()
 
 
 def test_a_refused_actor_says_why_and_ends(start: Start, stranger: Transport, address: str) -> None:

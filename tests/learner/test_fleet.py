@@ -124,6 +124,7 @@ def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected()
     actor = fleet.actors["a"]
     assert fleet.expected(identity("a")) is actor
     actor.sequences.add(0)
+    fleet.set_present("a", 1, False)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
     assert fleet.expected(identity("a")) is actor  # who only asks what is played replaces nobody
     assert fleet.expected(identity("a", incarnation=2)) is None
@@ -158,11 +159,11 @@ def test_an_actor_never_heard_of_is_not_expected() -> None:
 def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
     fleet = joined_fleet("a", "b")
     fleet.join(Join(actor="c", incarnation=1), 0.0)
-    fleet.set_present("c", True)
-    fleet.set_present("d", True)
+    fleet.set_present("c", 1, True)
+    fleet.set_present("d", 1, True)
     fleet.join(Join(actor="e", incarnation=1, spaces=SPACES, environments=1), 0.0)
     assert fleet.live == {"a", "b"}
-    fleet.set_present("a", False)
+    fleet.set_present("a", 1, False)
     assert fleet.live == {"b"}
 
 
@@ -185,21 +186,51 @@ def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_a
     most = 16_384
     for number in range(most):
         assert join(number) is None
-        fleet.set_present(f"a{number}", True)
+        fleet.set_present(f"a{number}", 1, True)
     refusal = join(most)
     assert refusal is not None
     assert (refusal.code, refusal.reason) == ("full", f"{most} actors take part already")
     for away in (7, 5, 9):
-        fleet.set_present(f"a{away}", False)
+        fleet.set_present(f"a{away}", 1, False)
     assert join(most) is None
     assert len(fleet.actors) == most
     assert "a5" not in fleet.actors
     assert {"a7", "a9"} < fleet.actors.keys()
 
 
+def test_a_name_is_taken_for_as_long_as_the_life_that_bears_it_is_there() -> None:
+    fleet = joined_fleet("a")
+    other = Join(actor="a", incarnation=2, spaces=SPACES, environments=1)
+    for asking in (other, Join(actor="a", incarnation=2)):
+        refusal = fleet.join(asking, 1.0)
+        assert refusal is not None
+        assert (refusal.code, "'a'" in refusal.reason) == ("name_taken", True)
+    assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=5), 2.0) is None  # itself
+    fleet.set_present("a", 2, True)  # it may be announced before it is let in
+    assert fleet.join(other, 3.0) is not None
+    fleet.set_present("a", 1, False)
+    assert fleet.join(other, 4.0) is None
+    assert fleet.live == {"a"}
+    assert fleet.actors["a"].lives == 2
+
+
+def test_the_name_of_one_that_is_shut_out_is_free() -> None:
+    fleet = joined_fleet("a")
+    fleet.actors["a"].quarantined = "nonsense"
+    assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=1), 0.0) is None
+
+
+def test_presence_of_another_life_makes_nobody_live() -> None:
+    fleet = joined_fleet("a")
+    fleet.set_present("a", 2, True)
+    fleet.set_present("a", 1, False)
+    assert not fleet.live
+    assert [status.alive for status in fleet.statuses(0.0)] == [False]
+
+
 def test_presence_alone_makes_nobody_an_actor() -> None:
     fleet = Fleet(1, None)
-    fleet.set_present("a", True)
+    fleet.set_present("a", 1, True)
     assert not fleet.actors
     fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=1), 0.0)
     assert fleet.live == {"a"}
@@ -234,7 +265,7 @@ def test_statuses_tell_of_each_actor_by_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
     fleet.actors["b"].accepted = 5
-    fleet.set_present("b", False)
+    fleet.set_present("b", 1, False)
     first, second = fleet.statuses(3.0)
     assert (first.actor, first.alive, first.seconds_since_seen, first.environments) == ("a", True, 3.0, 3)
     assert (second.actor, second.alive, second.rollouts_accepted) == ("b", False, 5)

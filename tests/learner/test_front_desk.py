@@ -50,6 +50,17 @@ def test_programs_are_known_by_their_hash() -> None:
     assert unknown.code == "unknown"
 
 
+def test_the_program_is_given_also_to_those_who_do_not_know_its_hash_yet() -> None:
+    desk, _ = make_desk()
+    early = read(desk.program("*"))
+    assert isinstance(early, Refusal)
+    assert early.code == "unknown"
+    desk.offer_program(Program(hash="abc", model=np.zeros(3, np.uint8)))
+    answer = read(desk.program("*"))
+    assert isinstance(answer, Program)
+    assert answer.hash == "abc"
+
+
 def test_there_is_no_snapshot_then_the_newest_then_a_farewell() -> None:
     desk, _ = make_desk()
     first = read(desk.snapshot())

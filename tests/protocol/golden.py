@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from protocol.codec import PROTOCOL_VERSION, encode
+from protocol.compact import bfloat16, planes
 from protocol.messages import (
     Acknowledgement,
+    CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
     Farewell,
@@ -21,6 +23,8 @@ from protocol.messages import (
     Rollout,
     RolloutIdentity,
     Snapshot,
+    SnapshotPart,
+    SnapshotRequest,
     StatusReport,
     Welcome,
 )
@@ -73,6 +77,21 @@ MESSAGES: dict[str, Message] = {
         program="0" * 64,
         weights={"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.zeros(3, np.float32)},
     ),
+    "snapshot_request": SnapshotRequest(actor="wing-1", held_version=33, policy_version=41, part=2),
+    "snapshot_request_first": SnapshotRequest(actor="wing-1", held_version=None),
+    "snapshot_part": SnapshotPart(
+        learner_epoch=9, policy_version=41, part=2, parts=3, data=np.arange(11, dtype=np.uint8)
+    ),
+    "compact_snapshot": CompactSnapshot(
+        learner_epoch=9,
+        policy_version=41,
+        program="0" * 64,
+        base_version=33,
+        weights=planes(
+            bfloat16({"body.weight": 1.01 * np.eye(3, dtype=np.float32), "body.bias": np.zeros(3, np.float32)}),
+            bfloat16({"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.ones(3, np.float32)}),
+        ),
+    ),
     "evaluation_request": EvaluationRequest(evaluator="judge"),
     "evaluation_report": EvaluationReport(
         evaluator="judge",
@@ -117,6 +136,9 @@ MESSAGES: dict[str, Message] = {
                     rollouts_missed=1,
                     busy_answers=3,
                     policy_lag=1,
+                    slow_link=True,
+                    bytes_up_per_hour=7200.0,
+                    bytes_down_per_hour=1.5,
                 ),
             ),
         )

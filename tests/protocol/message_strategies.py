@@ -8,6 +8,7 @@ from wire_format import DTYPES, bits
 
 from protocol.messages import (
     Acknowledgement,
+    CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
     Farewell,
@@ -17,6 +18,8 @@ from protocol.messages import (
     Rollout,
     RolloutIdentity,
     Snapshot,
+    SnapshotPart,
+    SnapshotRequest,
     StatusReport,
     Welcome,
 )
@@ -95,6 +98,7 @@ actor_statuses = st.builds(
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("actor", "quarantined"), text),
     **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
+    **dict.fromkeys(("bytes_up_per_hour", "bytes_down_per_hour"), floats),
     **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
     **dict.fromkeys(("busy_answers", "env_steps", "policy_lag"), counters),
 )
@@ -163,6 +167,32 @@ def snapshots(draw: st.DrawFn) -> Snapshot:
     return Snapshot(learner_epoch=draw(counters), policy_version=draw(counters), program=draw(text), weights=weights)
 
 
+@st.composite
+def compact_snapshots(draw: st.DrawFn) -> CompactSnapshot:
+    random = draw(generators)
+    layout = draw(st.dictionaries(text, st.lists(st.integers(0, 6), max_size=4), max_size=6))
+    weights = {name: bits(random, "|u1", (2, *shape)) for name, shape in layout.items()}
+    return CompactSnapshot(
+        learner_epoch=draw(counters),
+        policy_version=draw(counters),
+        program=draw(text),
+        base_version=draw(st.none() | counters),
+        weights=weights,
+    )
+
+
+@st.composite
+def snapshot_parts(draw: st.DrawFn) -> SnapshotPart:
+    parts = draw(st.integers(1, 2**60))
+    return SnapshotPart(
+        learner_epoch=draw(counters),
+        policy_version=draw(counters),
+        part=draw(st.integers(0, parts - 1)),
+        parts=parts,
+        data=np.frombuffer(draw(st.binary(max_size=300)), "|u1"),
+    )
+
+
 KINDS: dict[type, st.SearchStrategy[Any]] = {
     Join: st.builds(
         Join, actor=text, incarnation=counters, spaces=st.none() | spaces, environments=st.integers(0, 4096)
@@ -173,6 +203,15 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     Rollout: rollouts(),
     Acknowledgement: st.builds(Acknowledgement, reason=text, policy_version=counters),
     Snapshot: snapshots(),
+    SnapshotRequest: st.builds(
+        SnapshotRequest,
+        actor=text,
+        held_version=st.none() | counters,
+        policy_version=st.none() | counters,
+        part=counters,
+    ),
+    SnapshotPart: snapshot_parts(),
+    CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
     Farewell: st.builds(Farewell, learner_epoch=counters, reason=text),

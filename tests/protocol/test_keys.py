@@ -31,7 +31,7 @@ def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) 
         keys.rollouts(run, actor),
         keys.evaluations(run, actor),
         keys.snapshots(run),
-        keys.presence(run, actor),
+        keys.presence(run, actor, 3),
         keys.learner(run),
         keys.status(run),
     ]
@@ -42,6 +42,16 @@ def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) 
 @offline
 @given(run=names, actor=names)
 def test_the_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
-    assert keys.last_chunk(keys.presence(run, actor)) == actor
     assert keys.last_chunk(keys.rollouts(run, actor)) == actor
     assert keys.last_chunk(keys.evaluations(run, actor)) == actor
+
+
+@offline
+@given(run=names, actor=names, incarnation=st.integers(0, 2**63 - 1))
+def test_a_presence_key_tells_whose_life_it_is(run: str, actor: str, incarnation: int) -> None:
+    assert keys.who_is_present(keys.presence(run, actor, incarnation)) == (actor, incarnation)
+
+
+@pytest.mark.parametrize("life", ["", "x", "-1", "1.0", "*", "9" * 20, "\u0663"])
+def test_a_presence_key_of_no_actor_of_ours_tells_of_nobody(life: str) -> None:
+    assert keys.who_is_present(keys.presence("r", "a", life)) is None

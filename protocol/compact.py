@@ -1,0 +1,72 @@
+"""Weights for slow links: in bfloat16, and as differences to a version that the reader holds.
+
+A bfloat16 is the upper half of a float32, rounded to the nearest even. From one update to the next most of them stay
+as they are and the others move by little, so differences are small numbers of either sign; folded (0, -1, 1, -2, ...
+as 0, 1, 2, 3, ...) and with all high bytes before all low bytes they are mostly zeros, which is what zstd likes: 4 to
+7 % of the float32 that they stand for, where bfloat16 alone has 35 % (docs/results.md). Pure functions.
+"""
+
+import numpy as np
+
+Bits = dict[str, np.ndarray]  # by weight, uint16: bfloat16, or differences of them, of the weight's own shape
+
+
+def bfloat16(weights: dict[str, np.ndarray]) -> Bits:
+    """The bits of the nearest bfloat16 of each float32; NaN stays one.
+
+    Raises ValueError for weights of another dtype: a fault of our own.
+    """
+    return {name: _rounded(name, array) for name, array in weights.items()}
+
+
+def _rounded(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype != np.float32:
+        raise ValueError(f"weight {name!r} has dtype {array.dtype}, only float32 has a bfloat16")
+    bits = np.ascontiguousarray(array).view(np.uint32).reshape(array.shape)
+    rounded = (bits + (0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16)  # wraps for NaN only
+    return np.where(np.isnan(array), np.uint16(0x7FC0), rounded)
+
+
+def float32(bits: Bits) -> dict[str, np.ndarray]:
+    """The float32 that each bfloat16 stands for."""
+    return {name: (array.astype(np.uint32) << 16).view(np.float32) for name, array in bits.items()}
+
+
+def planes(bits: Bits, base: Bits | None) -> dict[str, np.ndarray]:
+    """What travels: uint8 [2, *shape], high bytes and low bytes, of the bits or of their difference to `base`'s."""
+    if base is None:
+        return {name: _split(array) for name, array in bits.items()}
+    return {name: _split(_folded(array, base[name])) for name, array in bits.items()}
+
+
+def bits_of(planes: dict[str, np.ndarray], base: Bits | None) -> Bits:
+    """What `planes` was made of.
+
+    Raises ValueError if they are no planes, or do not fit `base`: the sender's fault.
+    """
+    joined = {name: _joined(name, array) for name, array in planes.items()}
+    if base is None:
+        return joined
+    if {name: array.shape for name, array in joined.items()} != {name: array.shape for name, array in base.items()}:
+        raise ValueError("differences of other weights than those that they are to")
+    return {name: _added(base[name], array) for name, array in joined.items()}
+
+
+def _folded(bits: np.ndarray, base: np.ndarray) -> np.ndarray:
+    signed = (bits.reshape(-1) - base.reshape(-1)).view(np.int16)  # flat: numpy warns of single numbers that wrap
+    return (signed << 1 ^ signed >> 15).view(np.uint16).reshape(bits.shape)
+
+
+def _added(base: np.ndarray, folded: np.ndarray) -> np.ndarray:
+    flat = folded.reshape(-1)
+    return (base.reshape(-1) + (flat >> 1 ^ -(flat & 1))).reshape(base.shape)
+
+
+def _split(bits: np.ndarray) -> np.ndarray:
+    return np.stack([bits >> 8, bits & 0xFF]).astype(np.uint8)
+
+
+def _joined(name: str, planes: np.ndarray) -> np.ndarray:
+    if planes.dtype != np.uint8 or planes.ndim < 1 or len(planes) != 2:
+        raise ValueError(f"weight {name!r} must be uint8 [2, ...], not {planes.dtype} {planes.shape}")
+    return planes[0].astype(np.uint16) << 8 | planes[1]

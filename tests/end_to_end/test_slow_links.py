@@ -1,0 +1,52 @@
+"""An actor whose link is slow: 1 Mbit/s up, 4 Mbit/s down, 100 ms each way. Real processes, a real router."""
+
+import json
+from collections.abc import Callable
+
+import pytest
+from faults import SlowProxy
+from processes import Running, until
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def far(start: Start, address: str) -> Callable[[], dict]:
+    """A learner that never ends by itself, and what its status tells of the actor `far`."""
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+
+    def ask() -> dict:
+        running = start("status", "--connect", address, "--json")
+        actors = json.loads(running.output)["actors"] if running.wait() in (0, 3) else ()
+        return next((actor for actor in actors if actor["actor"] == "far"), {})
+
+    return ask
+
+
+def test_an_actor_finds_out_that_its_link_is_slow_and_is_trained_on(
+    start: Start, address: str, far: Callable[[], dict]
+) -> None:
+    proxy = SlowProxy(address, up=125e3, down=500e3, delay=0.1)
+    try:
+        actor = start("actor", "--connect", proxy.address, "--name", "far")
+        actor.expect("a slow link .* weights come small, and less often")
+        until(lambda: far().get("rollouts_accepted", 0) > 20)
+        report = far()
+        assert report["slow_link"]
+        assert report["rollouts_missed"] == 0
+        assert "unfit" not in report["rollouts_rejected"]
+        until(lambda: 0 < far()["bytes_down_per_hour"] < 3600 * 500e3)
+    finally:
+        proxy.close()
+
+
+def test_an_actor_that_is_told_that_its_link_is_slow_follows_the_learner(
+    start: Start, address: str, far: Callable[[], dict]
+) -> None:
+    start("actor", "--connect", address, "--name", "far", "--link", "wan")
+    until(lambda: far().get("env_steps", 0) > 50_000)
+    # Of new weights all the time: what it played with its first would have grown too old by now.
+    report = far()
+    assert report["slow_link"]
+    assert sum(report["rollouts_rejected"].values()) < report["rollouts_accepted"]

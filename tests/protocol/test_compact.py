@@ -1,0 +1,80 @@
+"""bfloat16 against torch's own, and differences against what they are made of."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from protocol.compact import bfloat16, bits_of, float32, planes
+
+repeatable = settings(max_examples=200, deadline=None, derandomize=True)
+shapes = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5)
+patterns = arrays.arrays(np.uint32, shapes, elements=st.integers(0, 2**32 - 1))
+halves = shapes.flatmap(
+    lambda shape: st.tuples(*[arrays.arrays(np.uint16, shape, elements=st.integers(0, 2**16 - 1))] * 2)
+)
+
+
+@repeatable
+@given(patterns)
+def test_rounding_is_torchs_for_every_bit_pattern(pattern: np.ndarray) -> None:
+    weights = np.asarray(pattern.view(np.float32))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch has a word to say of arrays that cannot be written to
+        expected = torch.from_numpy(weights.copy()).bfloat16().float().numpy()
+    found = float32(bfloat16({"w": weights}))["w"]
+    assert (found.shape, found.dtype) == (weights.shape, np.float32)
+    np.testing.assert_array_equal(found, expected)  # NaN equal to NaN
+
+
+@repeatable
+@given(halves, st.booleans())
+def test_planes_give_back_the_bits(pair: tuple[np.ndarray, np.ndarray], whole: bool) -> None:
+    bits, base = ({"w": np.asarray(array)} for array in pair)
+    there = planes(bits, None if whole else base)
+    assert there["w"].shape == (2, *bits["w"].shape)
+    assert there["w"].dtype == np.uint8
+    back = bits_of(there, None if whole else base)["w"]
+    assert (back.shape, back.dtype) == (bits["w"].shape, np.uint16)
+    np.testing.assert_array_equal(back, bits["w"])
+
+
+def test_a_difference_by_hand() -> None:
+    base = {"w": np.array([5, 5, 0, 0xFFFF], np.uint16)}
+    bits = {"w": np.array([5, 4, 0x0102, 0], np.uint16)}  # by 0, -1, 258 and, round the corner, 1
+    assert planes(bits, base)["w"].tolist() == [[0, 0, 2, 0], [0, 1, 4, 2]]
+    assert planes(bits, None)["w"].tolist() == [[0, 0, 1, 0], [5, 4, 2, 0]]
+
+
+def test_a_small_step_makes_small_planes() -> None:
+    """What it is for: nearly all of the high bytes are 0."""
+    random = np.random.default_rng(1)
+    weights = random.normal(0, 0.05, 10_000).astype(np.float32)
+    step = weights + random.normal(0, 1e-4, 10_000).astype(np.float32)
+    there = planes(bfloat16({"w": step}), bfloat16({"w": weights}))["w"]
+    assert np.mean(there[0] == 0) > 0.95
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        {"w": np.zeros((2, 4), np.uint8)},
+        {"w": np.zeros((2, 3), np.uint8), "v": np.zeros((2, 1), np.uint8)},
+        {},
+        {"w": np.zeros((3, 3), np.uint8)},
+        {"w": np.zeros((2, 3), np.uint16)},
+        {"w": np.zeros((), np.uint8)},
+    ],
+)
+def test_planes_that_do_not_fit_are_refused(damaged: dict[str, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match=r"differences of other weights|must be uint8"):
+        bits_of(damaged, {"w": np.zeros(3, np.uint16)})
+
+
+def test_other_dtypes_have_no_bfloat16() -> None:
+    with pytest.raises(ValueError, match="'w' has dtype float64"):
+        bfloat16({"w": np.zeros(3)})
