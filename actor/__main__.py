@@ -9,6 +9,7 @@ from actor.learner_link import ActorError
 from actor.service import ActorService
 from policy.runtime import PolicyError
 from protocol.process import exit_with_parent, stop_on_signals
+from protocol.security_options import SECURITY_ERRORS, credentials_to_connect
 from protocol.transport import TransportError
 from protocol.zenoh_transport import connect_when_there
 
@@ -17,8 +18,9 @@ def main() -> int:
     """Runs `daedalus actor`."""
     arguments = options.parser().parse_args()
     try:
-        config = options.config(arguments)
-    except ValueError as error:
+        credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
+        config = options.config(arguments, credentials)
+    except (ValueError, *SECURITY_ERRORS) as error:
         print(f"daedalus actor: {error}", file=sys.stderr)
         return 2
     stop = stop_on_signals()
@@ -30,7 +32,7 @@ def main() -> int:
             print(f"actor {config.name}: {text}", flush=True)
 
     try:
-        transport = connect_when_there(arguments.connect, stop, say, config.timeout)
+        transport = connect_when_there(arguments.connect, stop, say, config.timeout, credentials)
         if transport is None:
             return 0
         try:

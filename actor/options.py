@@ -8,6 +8,8 @@ import socket
 
 from actor.service import ActorConfig
 from protocol import keys
+from protocol.credentials import Credentials
+from protocol.security_options import add_tls
 
 DESCRIPTION = """\
 Plays environments for a learner and streams what happens to it. Needs one address; the environment, the
@@ -17,6 +19,7 @@ EXAMPLES = """\
 examples:
   daedalus actor --connect tcp/127.0.0.1:7447
   daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
+  daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator"""
 
 
@@ -75,18 +78,24 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="play greedily on the run's schedule and report, instead of gathering experience",
     )
+    add_tls(options)
     options.add_argument("--quiet", action="store_true", help="say nothing but errors")
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
-def config(arguments: argparse.Namespace) -> ActorConfig:
+def config(arguments: argparse.Namespace, credentials: Credentials | None) -> ActorConfig:
     """The checked configuration; raises ValueError with one line that says what is wrong."""
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:
         raise ValueError(f"--envs must be from 1 to 4096, not {arguments.envs}")
     if arguments.run != keys.ANY_RUN:
         keys.check_name(arguments.run, "run")
-    name = arguments.name or _default_name()
+    name = arguments.name or (f"{credentials.name}.{os.getpid()}" if credentials else _default_name())
+    if credentials and credentials.name not in (name, name.partition(".")[0]):
+        raise ValueError(
+            f"the certificate in {credentials.directory} is not for {name!r}: "
+            f"--name {credentials.name} or {credentials.name}.ANYTHING"
+        )
     return ActorConfig(
         name=keys.check_name(name, "actor name"),
         incarnation=secrets.randbits(62),

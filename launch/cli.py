@@ -17,6 +17,7 @@ by hand, on any machines:
   learner    own the weights, learn from what actors send
   actor      play for a learner; needs nothing but its address
   status     show the fleet as the learner sees it
+  certs      make the certificates for actors on machines that others reach too
 
 afterwards:
   evaluate   play episodes with what a run has learned, or film them
@@ -72,9 +73,16 @@ def _plot(arguments: list[str]) -> int:
     return plot(arguments)
 
 
+def _certs(arguments: list[str]) -> int:
+    from launch.certs import certs
+
+    return certs(arguments)
+
+
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
     "status": _status,
     "plot": _plot,
+    "certs": _certs,
 }

@@ -6,11 +6,12 @@ import sys
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode
 from protocol.messages import StatusReport
+from protocol.security_options import SECURITY_ERRORS, add_tls, credentials_to_connect
 from protocol.spec import ActorStatus, RunStatus
 from protocol.transport import TransportError
 from protocol.zenoh_transport import connect
 
-HEALTHY, NO_ANSWER, UNHEALTHY = 0, 1, 3
+HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
 
 _DESCRIPTION = """\
 Asks the learners at an address how they and their actors fare. As a health check it says by its exit status
@@ -46,9 +47,15 @@ def status(arguments: list[str]) -> int:
     how = options.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print each as one JSON object a line")
     how.add_argument("--quiet", action="store_true", help="print problems only")
+    add_tls(options)
     parsed = options.parse_args(arguments)
     try:
-        transport = connect(parsed.connect)
+        credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
+    except SECURITY_ERRORS as error:
+        print(f"daedalus status: {error}", file=sys.stderr)
+        return BAD_USAGE
+    try:
+        transport = connect(parsed.connect, credentials)
         try:
             answers = transport.ask(keys.status(parsed.run), timeout=5.0)
         finally:

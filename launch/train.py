@@ -16,6 +16,7 @@ from learner import run_directory
 from learner.options import add_settings, resolve
 from learner.settings import SettingsError
 from protocol.process import process_started, stop_on_signals
+from protocol.security_options import SECURITY_ERRORS, add_insecure, add_tls, credentials_to_listen
 from protocol.spec import RunSpec
 
 _POLL_SECONDS = 0.05
@@ -55,12 +56,13 @@ def train(arguments: list[str]) -> int:
     _add_where(options)
     parsed = options.parse_args(arguments)
     try:
+        _check_listening(parsed)
         spec, directory = resolve(parsed)
         run_directory.create(directory, spec)
-    except SettingsError as error:
+    except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
-    return _run(directory, spec, parsed.listen, parsed.wrap, started, resume=False)
+    return _run(directory, spec, parsed, started, resume=False)
 
 
 def resume(arguments: list[str]) -> int:
@@ -72,14 +74,15 @@ def resume(arguments: list[str]) -> int:
     _add_where(options)
     parsed = options.parse_args(arguments)
     try:
+        _check_listening(parsed)
         spec = run_directory.read_config(parsed.directory)
         if parsed.env_steps is not None:
             spec = run_directory.with_budget(spec, parsed.env_steps)
             run_directory.write_config(parsed.directory, spec)
-    except SettingsError as error:
+    except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
-    return _run(parsed.directory, spec, parsed.listen, parsed.wrap, started, resume=True)
+    return _run(parsed.directory, spec, parsed, started, resume=True)
 
 
 def _parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -97,6 +100,8 @@ def _add_where(options: argparse.ArgumentParser) -> None:
         metavar="tcp/HOST:PORT",
         help="where more actors may join (default: a free port of this machine)",
     )
+    add_tls(options)
+    add_insecure(options)
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
@@ -104,11 +109,16 @@ def _add_where(options: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, started: float, *, resume: bool) -> int:
+def _check_listening(parsed: argparse.Namespace) -> None:
+    credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
+
+
+def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
     """Everything between the settings and the exit status."""
     stopping = stop_on_signals()
-    address = listen or f"tcp/127.0.0.1:{_free_port()}"
-    learner = _supervised_learner(directory, address, started, resume)
+    wrap = parsed.wrap
+    listening, address = _where(parsed)
+    learner = _supervised_learner(directory, listening, started, resume)
     actors: list[Supervised] = []
     try:
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
@@ -139,12 +149,22 @@ def _run(directory: Path, spec: RunSpec, listen: str | None, wrap: str | None, s
     return status
 
 
-def _supervised_learner(directory: Path, address: str, started: float, resume: bool) -> Supervised:
+def _where(parsed: argparse.Namespace) -> tuple[list[str], str]:
+    """What the learner is told about listening, and where this machine's own actors connect: never over TLS."""
+    own = f"tcp/127.0.0.1:{_free_port()}" if parsed.listen is None or parsed.tls else parsed.listen
+    addresses = [own] if parsed.listen in (None, own) else [own, parsed.listen]
+    listening = [word for address in addresses for word in ("--listen", address)]
+    if parsed.tls:
+        listening += ["--tls", str(parsed.tls)]
+    return [*listening, *(["--insecure"] if parsed.insecure else [])], own
+
+
+def _supervised_learner(directory: Path, listening: list[str], started: float, resume: bool) -> Supervised:
     """A learner that goes on from its newest checkpoint when it was killed."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         since = started if first else time.monotonic()
-        arguments = ["--prepared", str(directory), "--listen", address, "--started", repr(since)]
+        arguments = ["--prepared", str(directory), *listening, "--started", repr(since)]
         return start("learner", *arguments, *(["--resume"] if resume or not first else []))
 
     return Supervised("the learner", begin, ended={0, 3})

@@ -17,7 +17,9 @@ from learner.service import LearnerService, Outcome
 from learner.settings import SettingsError
 from policy.saved_policy import checkpoints
 from policy.sealed import DamagedError
+from protocol.credentials import CredentialsError
 from protocol.process import exit_with_parent, stop_on_signals
+from protocol.security_options import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from protocol.spec import RunSpec
 from protocol.transport import TransportError
 from protocol.zenoh_transport import connect_when_there, listen
@@ -46,7 +48,12 @@ def main() -> int:
             begun = False
         if not begun:
             run_directory.check_free(directory)
-    except SettingsError as error:
+        addresses = arguments.listen or [LISTEN]
+        if arguments.connect:
+            credentials = credentials_to_connect(arguments.connect, arguments.tls, "learner")
+        else:
+            credentials = credentials_to_listen(addresses, arguments.tls, "learner", insecure=arguments.insecure)
+    except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
     progress = Progress(sys.stdout, spec.training.env_steps)
@@ -54,21 +61,20 @@ def main() -> int:
         restored = None
         if arguments.resume and begun:
             restored = _newest_checkpoint(directory, progress)
-        address = arguments.listen or LISTEN
         if arguments.connect:
-            transport = connect_when_there(arguments.connect, stop, progress.say)
+            transport = connect_when_there(arguments.connect, stop, progress.say, credentials=credentials)
         else:
-            transport = listen([address])
+            transport = listen(addresses, credentials=credentials)
         if transport is None:
             return FAILED
-    except (TransportError, DamagedError) as error:
+    except (TransportError, DamagedError, CredentialsError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
     try:
         if not begun:
             run_directory.create(directory, spec)
         if arguments.prepared is None:
-            there = ", ".join(arguments.connect) if arguments.connect else address
+            there = ", ".join(arguments.connect or addresses)
             progress.say(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
             progress.say(f"actors join with: daedalus actor --connect {there}")
         service = LearnerService(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from learner import run_directory
 from learner.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
+from protocol.security_options import add_insecure, add_tls
 from protocol.spec import RunSpec
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -18,6 +19,7 @@ examples:
   daedalus learner cartpole
   daedalus learner cartpole --actors 8 --algorithm impala --listen tcp/127.0.0.1:7447
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
+  daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
   daedalus learner cartpole --connect tcp/router:7447
   daedalus learner cartpole --run-dir runs/mine --resume      (from systemd or Kubernetes: the same line each time)"""
 
@@ -104,7 +106,9 @@ def learner_parser() -> argparse.ArgumentParser:
     )
     add_settings(options)
     where = options.add_mutually_exclusive_group()
-    where.add_argument("--listen", metavar="tcp/HOST:PORT", help=f"where actors connect (default: {LISTEN})")
+    where.add_argument(
+        "--listen", action="append", metavar="tcp/HOST:PORT", help=f"where actors connect (default: {LISTEN})"
+    )
     where.add_argument(
         "--connect",
         action="append",
@@ -117,6 +121,8 @@ def learner_parser() -> argparse.ArgumentParser:
         help="go on from the newest checkpoint in --run-dir if there is one, else begin there: "
         "for a supervisor that starts the same command again",
     )
+    add_tls(options)
+    add_insecure(options)
     # What the launcher says to the learner it starts: a directory with config.toml that is there already.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)

@@ -22,6 +22,10 @@ class AddressInUseError(TransportError):
     """Somebody else listens on that address already."""
 
 
+class RefusedError(TransportError):
+    """Who listens there does not let us in, or cannot be trusted: no waiting mends it."""
+
+
 class Request(Protocol):
     """One query, held by the side that serves it. Answered at most once, from any thread, or dropped."""
 

@@ -19,7 +19,8 @@ from collections.abc import Callable, Iterator
 
 import zenoh
 
-from protocol.transport import AddressInUseError, Inbox, Request, Transport, TransportError
+from protocol.credentials import Credentials, why_unreachable
+from protocol.transport import AddressInUseError, Inbox, RefusedError, Request, Transport, TransportError
 
 _LEASE_MILLISECONDS = 2000  # a peer that is silent for as long is gone
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts to connect at the start
@@ -27,48 +28,55 @@ _PROBE_SECONDS = 2.0  # for a look from outside
 _RETRY_MILLISECONDS = 100  # how soon a client tries again after its router vanished; doubles up to ten times this
 
 
-def listen(endpoints: list[str], connect: list[str] | None = None) -> Transport:
-    """Opens a router that listens on `endpoints` (`tcp/HOST:PORT`) and may join other routers.
+def listen(endpoints: list[str], connect: list[str] | None = None, credentials: Credentials | None = None) -> Transport:
+    """Opens a router that listens on `endpoints` (`tcp/HOST:PORT`, `tls/HOST:PORT`) and may join other routers.
 
-    Raises AddressInUseError or TransportError.
+    With `credentials` it lets in whom they name, and those that come over plain TCP.
+    Raises AddressInUseError, TransportError, or CredentialsError.
     """
-    return _open("router", endpoints, connect or [])
+    return _open("router", endpoints, connect or [], credentials)
 
 
-def connect(endpoints: list[str]) -> Transport:
+def connect(endpoints: list[str], credentials: Credentials | None = None) -> Transport:
     """Opens a client of the router at one of `endpoints`.
 
-    Raises TransportError at once if none of them can be reached.
+    Raises TransportError at once if none of them can be reached, RefusedError if that is for good.
     """
-    return _open("client", [], endpoints)
+    return _open("client", [], endpoints, credentials)
 
 
 def connect_when_there(
-    endpoints: list[str], stop: threading.Event, say: Callable[[str], None], timeout: float | None = None
+    endpoints: list[str],
+    stop: threading.Event,
+    say: Callable[[str], None],
+    timeout: float | None = None,
+    credentials: Credentials | None = None,
 ) -> Transport | None:
     """Tries to `connect` until something answers, and says once that it waits; None if told to stop first.
 
-    Raises TransportError after `timeout` seconds.
+    Raises TransportError after `timeout` seconds, RefusedError at once.
     """
     deadline = None if timeout is None else time.monotonic() + timeout
     pause, told = _FIRST_PAUSE_SECONDS, False
     while True:
         try:
-            return connect(endpoints)
+            return connect(endpoints, credentials)
+        except RefusedError:
+            raise
         except TransportError as error:
             if deadline is not None and time.monotonic() > deadline:
                 raise TransportError(
-                    f"{error} within {timeout:g} s: is the learner running, and is the address its own?"
+                    f"{error} (for {timeout:g} s): is the learner running, and is the address its own?"
                 ) from None
             if not told and pause >= _MAX_PAUSE_SECONDS / 2:
-                say(f"{error} yet; waiting for it")
+                say(f"{error}; waiting for it")
                 told = True
         if stop.wait(pause):
             return None
         pause = min(2 * pause, _MAX_PAUSE_SECONDS)
 
 
-def _open(mode: str, listen_on: list[str], connect_to: list[str]) -> "ZenohTransport":
+def _open(mode: str, listen_on: list[str], connect_to: list[str], credentials: Credentials | None) -> "ZenohTransport":
     config = zenoh.Config()
     settings = {
         "mode": mode,
@@ -86,6 +94,7 @@ def _open(mode: str, listen_on: list[str], connect_to: list[str]) -> "ZenohTrans
         "scouting/delay": 0,
         "transport/link/tx/lease": _LEASE_MILLISECONDS,
         "transport/shared_memory/enabled": False,
+        **(credentials.settings(listens=bool(listen_on)) if credentials else {}),
     }
 
     def open_session() -> zenoh.Session:
@@ -94,19 +103,23 @@ def _open(mode: str, listen_on: list[str], connect_to: list[str]) -> "ZenohTrans
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
-            raise _opening_error(str(error), listen_on, connect_to) from None
+            raise _opening_error(str(error), listen_on, connect_to, credentials) from None
 
     return ZenohTransport(open_session, is_client=mode == "client")
 
 
-def _opening_error(text: str, listen_on: list[str], connect_to: list[str]) -> TransportError:
+def _opening_error(
+    text: str, listen_on: list[str], connect_to: list[str], credentials: Credentials | None
+) -> TransportError:
     if "in use" in text:
         return AddressInUseError(
             f"address {', '.join(listen_on)} is already in use: "
             "stop what listens there, or choose another with --listen"
         )
     if connect_to:
-        return TransportError(f"nothing answers at {', '.join(connect_to)}")
+        reasons = [why_unreachable(endpoint, credentials) for endpoint in connect_to]
+        for_good = all(final for _, final in reasons)
+        return (RefusedError if for_good else TransportError)("; ".join(reason for reason, _ in reasons))
     return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
 
 

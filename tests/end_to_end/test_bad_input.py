@@ -28,7 +28,11 @@ Start = Callable[..., Running]
         (["evaluate", "nowhere"], 1, r"nowhere has no checkpoints"),
         (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere/metrics.csv"),
         (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"], 1, r"within 0.3 s: is the learner running"),
+        (
+            ["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"],
+            1,
+            r"nothing answers at tcp/127.0.0.1:1 \(for 0.3 s\): is the learner running",
+        ),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs must be from 1 to 4096"),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
         (["trian"], 2, r"unknown command 'trian': did you mean train"),

@@ -1,0 +1,68 @@
+"""Learner, actors and status over TLS, as processes that were given nothing but addresses and folders."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from certificates import make_certificates
+from processes import Running, until
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def certificates(tmp_path: Path) -> Path:
+    return make_certificates(tmp_path / "certs")
+
+
+@pytest.fixture
+def tls(address: str) -> str:
+    return address.replace("tcp/", "tls/")
+
+
+def test_a_run_over_tls_is_solved_by_actors_that_it_knows(start: Start, tls: str, certificates: Path) -> None:
+    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    arm.expect(r"joined run 'run' as 'arm\.\d+'")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("joined run")
+    asking = ("status", "--connect", tls, "--quiet", "--tls")
+    assert start(*asking, certificates / "actor-arm").wait() == 2
+    until(lambda: start(*asking, certificates / "operator").wait() == 0)
+    assert learner.wait() == 0, learner.output
+    assert arm.wait() == 0, arm.output
+
+
+def test_train_lets_in_actors_of_other_machines_over_tls(start: Start, tls: str, certificates: Path) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
+    train = start("train", "cartpole", *training)
+    train.expect("return .* actors 1")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-arm").expect("joined run")
+    train.expect("actors 2")
+
+
+def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certificates: Path, tmp_path: Path) -> None:
+    strange = make_certificates(tmp_path / "strange")
+    learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
+    learner.expect("actors join with")
+    to = ("actor", "--connect", tls)
+    for arguments, status, message in (
+        ((*to, "--tls", strange / "actor-arm"), 1, "the two are of different CAs"),
+        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner: actor was expected"),
+        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': --name arm or arm.ANY"),
+        (to, 2, "needs certificates: --tls DIR"),
+        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "wants --tls"),
+        (
+            ("actor", "--connect", "tls/nowhere.invalid:1", "--tls", certificates / "actor-arm", "--timeout", 0.1),
+            1,
+            "resolves to no address",
+        ),
+        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
+        (("train", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
+        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner was expected"),
+    ):
+        failed = start(*arguments)
+        assert failed.wait() == status, failed.output
+        failed.expect(message)
+        assert "Traceback" not in failed.output
+    assert learner.process.poll() is None
