@@ -15,7 +15,7 @@ from actor.pixels import Pixels
 from actor.unplayable import UnplayableError
 from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
 
-__all__ = ["UnplayableError", "VectorEnvironment", "make_environments"]
+__all__ = ["Transforms", "UnplayableError", "VectorEnvironment", "make_environments"]
 
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -81,24 +81,41 @@ class BareEnvironment(Protocol):
         ...
 
 
-class TransformedEnvironment:
-    """A bare environment seen through a specification's action table and pixel transforms."""
+class Transforms:
+    """A specification's action table and pixel transforms, between an environment's spaces and the run's."""
 
-    def __init__(self, bare: BareEnvironment, spec: EnvironmentSpec) -> None:
-        """Raises UnplayableError if the two do not fit."""
-        observation = bare.observation_space
-        if not isinstance(observation, gymnasium.spaces.Box) or not 1 <= len(observation.shape) <= 4:
+    def __init__(
+        self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
+    ) -> None:
+        """Raises UnplayableError if they do not fit."""
+        if not isinstance(observation_space, gymnasium.spaces.Box) or not 1 <= len(observation_space.shape) <= 4:
             raise UnplayableError(
-                f"observation space {observation} is not supported: it must be a Box of one to four dimensions"
+                f"observation space {observation_space} is not supported: it must be a Box of one to four dimensions"
             )
-        self._bare = bare
-        self._actions = own_actions(spec.action_table, bare.action_space)
-        self._pixels = Pixels(spec, observation)
-        dtype = "uint8" if observation.dtype == np.uint8 else "float32"
-        self._spaces = Spaces(
+        self._actions = own_actions(spec.action_table, action_space)
+        self._pixels = Pixels(spec, observation_space)
+        dtype = "uint8" if observation_space.dtype == np.uint8 else "float32"
+        self.spaces = Spaces(
             observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
             action=ChoiceSpace(count=len(self._actions)),
         )
+
+    def frames(self, frames: np.ndarray) -> np.ndarray:
+        """[E, *the environment's shape] as the run has them: [E, *frame_shape]."""
+        return self._pixels(frames)
+
+    def own_actions(self, choices: np.ndarray) -> np.ndarray:
+        """[E] choices as the environment takes them: [E, *action_shape]."""
+        return self._actions[choices]
+
+
+class TransformedEnvironment:
+    """A bare environment seen through a specification's transforms."""
+
+    def __init__(self, bare: BareEnvironment, spec: EnvironmentSpec) -> None:
+        """Raises UnplayableError if the two do not fit."""
+        self._bare = bare
+        self._transforms = Transforms(spec, bare.observation_space, bare.action_space)
 
     @property
     def count(self) -> int:
@@ -108,16 +125,16 @@ class TransformedEnvironment:
     @property
     def spaces(self) -> Spaces:
         """See VectorEnvironment."""
-        return self._spaces
+        return self._transforms.spaces
 
     def reset(self, seed: int) -> np.ndarray:
         """See VectorEnvironment."""
-        return self._pixels(self._bare.reset(seed))
+        return self._transforms.frames(self._bare.reset(seed))
 
     def step(self, actions: np.ndarray) -> Step:
         """See VectorEnvironment."""
-        frames, rewards, terminated, truncated = self._bare.step(self._actions[actions])
-        return self._pixels(frames), rewards, terminated, truncated
+        frames, rewards, terminated, truncated = self._bare.step(self._transforms.own_actions(actions))
+        return self._transforms.frames(frames), rewards, terminated, truncated
 
     def close(self) -> None:
         """See VectorEnvironment."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actor.collector import EpisodeCounter
 from actor.environments import VectorEnvironment
+from actor.rollout_writer import EpisodeCounter
 from policy.runtime import PolicyRuntime
 from protocol.frames import FrameStack
 from protocol.spec import EnvironmentSpec

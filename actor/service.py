@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from actor.collector import Collector
-from actor.environments import VectorEnvironment, make_environments
 from actor.learner_link import ActorError, LearnerLink, LearnerLostError, OverError
+from actor.player import EnvironmentPlayer, Player
 from actor.snapshot_feed import SnapshotFeed
 from actor.uploader import Uploader
 from policy.runtime import OnnxRuntime, PolicyRuntime
@@ -21,7 +20,7 @@ from protocol.messages import (
     Snapshot,
     Welcome,
 )
-from protocol.spec import EnvironmentSpec, Spaces
+from protocol.spec import Spaces
 from protocol.transport import Transport, TransportError
 
 _ANSWER_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
@@ -54,8 +53,14 @@ class ActorService:
     """One actor over one transport."""
 
     def __init__(
-        self, config: ActorConfig, transport: Transport, stop: threading.Event, say: Callable[[str], None]
+        self,
+        config: ActorConfig,
+        transport: Transport,
+        stop: threading.Event,
+        say: Callable[[str], None],
+        player: Player | None = None,
     ) -> None:
+        """Environments of its own are played, unless a `player` is given."""
         self._config = config
         self._transport = transport
         self._stop = stop
@@ -65,11 +70,11 @@ class ActorService:
         self._uploader = Uploader(window=1)
         self._learner_left = False
         self._heard_at = 0.0  # when the learner last said anything
+        self._player = player or EnvironmentPlayer(config.environments, config.wrap)
         self._feed = SnapshotFeed(transport, self._link, config.name, self._notify)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._runs: set[str] = set()  # in which it is announced
         self._run = ""  # the one that it takes part in
-        self._made: tuple[EnvironmentSpec, VectorEnvironment] | None = None
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout to this learner epoch
 
@@ -88,8 +93,12 @@ class ActorService:
         except OverError as error:
             self._say(str(error))
         finally:
-            if self._made is not None:
-                self._made[1].close()
+            self._player.close()
+
+    def wake(self) -> None:
+        """Has a wait look again at what it waits for. From any thread."""
+        with self._changed:
+            self._changed.notify_all()
 
     # ----------------------------------------------------------------------------------------- playing
 
@@ -100,12 +109,12 @@ class ActorService:
         return welcome
 
     def _take_part(self, welcome: Welcome) -> None:
-        """Makes the environments, is counted in, and plays."""
+        """Makes ready to play, is counted in, and plays."""
         self._run = welcome.run
-        environments = self._environments(welcome.spec.environment, welcome)
+        spaces, count = self._player.prepare(welcome.spec)
         self._feed.attend(welcome)
         self._announce(welcome.run)
-        join = replace(self._join, spaces=environments.spaces, environments=environments.count)
+        join = replace(self._join, spaces=spaces, environments=count)
         confirmed = self._link.find(welcome.run, join, self._config.timeout, self._stop)
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
@@ -117,20 +126,8 @@ class ActorService:
                 self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         if self._config.link == "wan" and not welcome.spec.synchronous:
             self._spare_the_link()
-        self._say(
-            f"joined run {welcome.run!r} as {self._config.name!r}: {environments.count} x {welcome.spec.environment.id}"
-        )
-        self._play(confirmed, environments)
-
-    def _environments(self, spec: EnvironmentSpec, welcome: Welcome) -> VectorEnvironment:
-        """The environments of `spec`; those of an earlier join if they are the same."""
-        if self._made is not None and self._made[0] != spec:
-            self._made[1].close()
-            self._made = None
-        if self._made is None:
-            count = self._config.environments or welcome.spec.collection.envs_per_actor
-            self._made = spec, make_environments(spec, count, wrap=self._config.wrap)
-        return self._made[1]
+        self._say(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
+        self._play(confirmed, spaces)
 
     def _announce(self, run: str) -> None:
         if run in self._runs:
@@ -139,23 +136,17 @@ class ActorService:
         self._transport.watch(keys.learner(run), self._on_learner)
         self._transport.announce(keys.presence(run, self._config.name, self._config.incarnation))
 
-    def _play(self, welcome: Welcome, environments: VectorEnvironment) -> None:
-        runtime = self._runtime(welcome, environments.spaces)
+    def _play(self, welcome: Welcome, spaces: Spaces) -> None:
+        player = self._player
+        player.begin(self._runtime(welcome, spaces), welcome.spec, welcome.seed)
         snapshot = self._await_snapshot(newer_than=-1)
-        collector = Collector(
-            environments,
-            runtime,
-            welcome.spec.environment,
-            rollout_length=welcome.spec.collection.rollout_length,
-            seed=welcome.seed,
-        )
         loaded = -1
         while True:
             self._wait(lambda: self._uploader.has_room)  # before playing: what is played now is of the newest policy
             if not welcome.spec.synchronous:
-                snapshot = self._newest_snapshot(snapshot)
+                snapshot = self._newest_snapshot()
             if snapshot.policy_version != loaded:
-                collector.load(snapshot.weights)
+                player.load(snapshot)
                 loaded = snapshot.policy_version
             identity = RolloutIdentity(
                 actor=self._config.name,
@@ -163,7 +154,7 @@ class ActorService:
                 sequence=self._sequence,
                 learner_epoch=welcome.learner_epoch,
             )
-            payload = encode(collector.collect(identity, loaded))
+            payload = encode(player.collect(identity, self._wait, self._newest_snapshot))
             with self._changed:
                 self._uploader.add(self._sequence, payload)
             self._send_due()
@@ -233,12 +224,13 @@ class ActorService:
         assert self._feed.newest is not None
         return self._feed.newest
 
-    def _newest_snapshot(self, known: Snapshot) -> Snapshot:
+    def _newest_snapshot(self) -> Snapshot:
         """What has come by now; asks for what answers tell of and did not come."""
         self._feed.read()
         self._check()
         self._feed.keep_up(self._uploader.newest_version)
-        return self._feed.newest or known
+        assert self._feed.newest is not None
+        return self._feed.newest
 
     # ----------------------------------------------------------------------------------------- waiting
 

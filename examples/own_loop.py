@@ -1,0 +1,41 @@
+"""A loop that owns its clock, trained from: `python examples/own_loop.py tcp/127.0.0.1:7447`.
+
+The learner, in another terminal, on any machine:
+    daedalus learner cartpole --actors 1 --set collection.rollout_length=64 --set training.batch_rollouts=4
+
+CartPole stands for a robot here: what matters is that the loop calls the policy, and not the other way round.
+"""
+
+import argparse
+
+import gymnasium
+
+from actor import Client
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("address", nargs="?", default="tcp/127.0.0.1:7447", help="default: %(default)s")
+    options.add_argument("--name", help="this actor's name (default: from the host's)")
+    parsed = options.parse_args()
+    robot = gymnasium.make("CartPole-v1")
+    with Client(
+        parsed.address, observation_space=robot.observation_space, action_space=robot.action_space, name=parsed.name
+    ) as client:
+        episodes = 0
+        while not client.is_over:
+            observation, _ = robot.reset()
+            over, total = False, 0.0
+            while not over:
+                observation, reward, terminated, truncated, _ = robot.step(client.act(observation))
+                client.reward(float(reward))
+                total += float(reward)
+                over = terminated or truncated
+            client.end_episode(terminated=terminated, observation=observation)
+            episodes += 1
+            if episodes % 50 == 0:
+                print(f"{episodes} episodes, the last returned {total:g}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

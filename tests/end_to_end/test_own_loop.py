@@ -1,0 +1,44 @@
+"""examples/own_loop.py: a loop that is not ours, trained from by a real learner."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes import Running
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "own_loop.py"
+
+
+@pytest.fixture
+def example(tmp_path: Path, address: str) -> Iterator[Callable[..., Running]]:
+    running: list[Running] = []
+
+    def start_one(*arguments: str) -> Running:
+        running.append(Running([sys.executable, str(EXAMPLE), address, *arguments], tmp_path))
+        return running[-1]
+
+    yield start_one
+    for one in running:
+        one.end()
+
+
+def test_a_loop_that_owns_its_clock_is_learned_from(
+    start: Callable[..., Running], address: str, example: Callable[..., Running]
+) -> None:
+    slow = ("--set", "collection.rollout_length=64", "--set", "training.batch_rollouts=4")
+    learner = start("learner", "cartpole", "--actors", 1, "--listen", address, "--run-dir", "run", *slow)
+    loop = example("--name", "robot")
+    loop.expect("joined run 'run' as 'robot': 1 x CartPole-v1")
+    assert learner.wait() == 0, learner.output
+    assert loop.wait() == 0, loop.output
+    loop.expect("the run is over")
+
+
+def test_what_cannot_be_trained_from_is_told_at_once(
+    start: Callable[..., Running], address: str, example: Callable[..., Running]
+) -> None:
+    start("learner", "cartpole", "--algorithm", "a2c", "--listen", address, "--run-dir", "run")
+    loop = example()
+    assert loop.wait() == 1
+    loop.expect("ActorError: a2c has its actors wait for each update, and a client cannot")
