@@ -25,12 +25,11 @@ def main() -> None:
         episodes = 0
         while not client.is_over:
             observation, _ = robot.reset()
-            over, total = False, 0.0
-            while not over:
+            terminated, truncated, total = False, False, 0.0
+            while not (terminated or truncated):
                 observation, reward, terminated, truncated, _ = robot.step(client.act(observation))
                 client.reward(float(reward))
                 total += float(reward)
-                over = terminated or truncated
             client.end_episode(terminated=terminated, observation=observation)
             episodes += 1
             if episodes % 50 == 0:

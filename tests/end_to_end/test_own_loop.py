@@ -41,4 +41,4 @@ def test_what_cannot_be_trained_from_is_told_at_once(
     start("learner", "cartpole", "--algorithm", "a2c", "--listen", address, "--run-dir", "run")
     loop = example()
     assert loop.wait() == 1
-    loop.expect("ActorError: a2c has its actors wait for each update, and a client cannot")
+    loop.expect("ActorError: a run with a2c has its actors wait for each update, a client cannot")
