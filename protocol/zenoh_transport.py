@@ -8,6 +8,7 @@ What Zenoh needs to be held to (measured, see docs/results.md):
     queries that are answered, and snapshots are put with DROP.
   - A process that ends with a callback declared and its session open hangs for ever: `close` belongs
     in a `finally`.
+  - One that ends while Zenoh's threads still hold callbacks aborts now and then: `close` waits until they do not.
   - A router waits half a second for peers it could scout before it opens, unless told not to.
 """
 
@@ -16,6 +17,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import zenoh
 
@@ -25,6 +27,7 @@ from protocol.transport import AddressInUseError, Inbox, RefusedError, Request, 
 _LEASE_MILLISECONDS = 2000  # a peer that is silent for as long is gone
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts to connect at the start
 _PROBE_SECONDS = 2.0  # for a look from outside
+_LEAVING_SECONDS = 2.0  # for Zenoh to let go of callbacks when a session is closed
 _RETRY_MILLISECONDS = 100  # how soon a client tries again after its router vanished; doubles up to ten times this
 
 
@@ -188,6 +191,34 @@ class _ZenohInbox:
         self.undeclare()
 
 
+class _Callbacks:
+    """Our functions that Zenoh holds, each on a thread of its own, which must be done with Python before that ends."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._held = 0
+
+    def hold(self, function: Callable[[Any], None], at_end: Callable[[], None] = lambda: None) -> Any:
+        """A callback as Zenoh takes them; `at_end` is called once, after the last call of `function`."""
+
+        def drop() -> None:
+            try:
+                at_end()
+            finally:
+                with self._changed:
+                    self._held -= 1
+                    self._changed.notify_all()
+
+        with self._changed:
+            self._held += 1
+        return zenoh.handlers.Callback(function, drop)
+
+    def await_none(self) -> None:
+        """Waits, within bounds, until Zenoh has let go of all of them."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._held, _LEAVING_SECONDS)
+
+
 class ZenohTransport:
     """A Transport over one Zenoh session, and over another in its place where it was reopened."""
 
@@ -202,6 +233,7 @@ class ZenohTransport:
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
+        self._callbacks = _Callbacks()
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
@@ -210,7 +242,7 @@ class ZenohTransport:
             handler(_ZenohRequest(query, key))
 
         with _as_transport_error(f"serve {key}"):
-            self._declare(lambda session: session.declare_queryable(key, on_query, complete=True))
+            self._declare(lambda session: session.declare_queryable(key, self._callbacks.hold(on_query), complete=True))
 
     def _declare(self, declaration: Callable[[zenoh.Session], object]) -> None:
         self._declared[declaration] = declaration(self._session)
@@ -232,7 +264,7 @@ class ZenohTransport:
             on_answer(first[0] if first else None)
 
         with _as_transport_error(f"send to {key}"):
-            self._querier(key, timeout).get(zenoh.handlers.Callback(on_reply, on_end), payload=payload)
+            self._querier(key, timeout).get(self._callbacks.hold(on_reply, on_end), payload=payload)
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
         with self._lock:
@@ -269,7 +301,7 @@ class ZenohTransport:
             on_news()
 
         def declaration(session: zenoh.Session) -> object:
-            return session.declare_subscriber(key, on_sample)
+            return session.declare_subscriber(key, self._callbacks.hold(on_sample))
 
         with _as_transport_error(f"follow {key}"):
             self._declare(declaration)
@@ -300,7 +332,7 @@ class ZenohTransport:
             while present:  # as seen by a session that was given up: who is still there is told of again
                 on_change(present.pop(), False)
             # Without history a token declared just after the subscriber is missed now and then.
-            return session.liveliness().declare_subscriber(key, on_sample, history=True)
+            return session.liveliness().declare_subscriber(key, self._callbacks.hold(on_sample), history=True)
 
         with _as_transport_error(f"watch {key}"):
             self._declare(declaration)
@@ -335,3 +367,4 @@ class ZenohTransport:
             session = self._session
         if not session.is_closed():
             session.close()
+            self._callbacks.await_none()
