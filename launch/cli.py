@@ -17,6 +17,7 @@ by hand, on any machines:
   learner    own the weights, learn from what actors send
   actor      play for a learner; needs nothing but its address
   status     show the fleet as the learner sees it
+  bridge     let actors in that are written in other languages
   certs      make the certificates for actors on machines that others reach too
 
 afterwards:
@@ -46,7 +47,7 @@ def main() -> int:
     return _COMMANDS[command](rest)
 
 
-_MODULES = {"learner": "learner", "actor": "actor", "evaluate": "actor.evaluate"}
+_MODULES = {"learner": "learner", "actor": "actor", "evaluate": "actor.evaluate", "bridge": "bridge"}
 
 
 def _train(arguments: list[str]) -> int:

@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "policy", "actor", "learner", "launch")
+PACKAGES = ("protocol", "policy", "actor", "learner", "launch", "bridge")
 ALLOWED = {
     "protocol": {"protocol"},
     "policy": {"protocol", "policy"},
     "actor": {"protocol", "policy", "actor"},
     "learner": {"protocol", "policy", "learner"},
     "launch": {"protocol", "learner", "launch"},
+    "bridge": {"protocol", "bridge"},
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
 
@@ -81,6 +82,7 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
         ("learner.__main__", {"torch", "actor", "launch", "gymnasium"}),
         ("launch.train", {"torch", "actor", "gymnasium", "zenoh", "onnxruntime"}),
         ("protocol.codec", {"torch", "zenoh", "policy"}),
+        ("bridge.__main__", {"torch", "actor", "learner", "launch", "numpy", "gymnasium"}),
     ],
 )
 def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:

@@ -1,0 +1,273 @@
+"""The bridge over MemoryTransport: what a client asks for it gets, and what it leaves behind is nothing."""
+
+import contextlib
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+from processes import LIMIT, until
+
+from bridge import client as client_module
+from bridge import service as service_module
+from bridge.parcels import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Parcel, encode
+from bridge.service import Bridge
+from protocol.transport import MemoryNetwork, MemoryTransport, Transport, TransportError
+
+HEADER = struct.Struct("<IBBHI")  # once more, by hand
+
+
+class Caller:
+    """A client, as another language would write it."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), LIMIT)
+        self.socket.sendall(GREETING)
+        assert self.read(4) == b"DBR1"
+
+    def send(self, kind: int, number: int, key: str, payload: bytes = b"", milliseconds: int = 60_000) -> None:
+        milliseconds = milliseconds if kind == Kind.QUERY else 0
+        head = HEADER.pack(len(payload), kind, len(key), milliseconds, number)
+        self.socket.sendall(head + key.encode() + payload)
+
+    def read(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size and (chunk := self.socket.recv(size - len(data))):
+            data += chunk
+        return data
+
+    def next(self) -> tuple[int, int, str, bytes]:
+        """Kind, number, key and payload of what comes next."""
+        payload, kind, key, milliseconds, number = HEADER.unpack(self.read(HEADER_BYTES))
+        assert milliseconds == 0
+        return kind, number, self.read(key).decode(), self.read(payload)
+
+    def ended(self) -> bool:
+        """Whether the bridge closes the connection, once what it said before is read."""
+        try:
+            return self.socket.recv(1) == b""
+        except ConnectionError:
+            return True
+
+
+class Scene:
+    """A bridge that runs, and an end of the network that it carries to."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork()
+        self.end = MemoryTransport(self.network)
+        self.open: Callable[[], Transport] = lambda: MemoryTransport(self.network)
+        self.said: list[str] = []
+        listener = socket.create_server(("127.0.0.1", 0))
+        self.port = listener.getsockname()[1]
+        self.stop = threading.Event()
+        self.bridge = Bridge(listener, lambda: self.open(), self.said.append)
+        self.thread = threading.Thread(target=self.bridge.run, args=(self.stop,))
+        self.thread.start()
+        self.callers: list[Caller] = []
+
+    def call(self) -> Caller:
+        self.callers.append(Caller(self.port))
+        return self.callers[-1]
+
+    def close(self) -> None:
+        self.stop.set()
+        self.thread.join(LIMIT)
+        assert not self.thread.is_alive()
+        for caller in self.callers:
+            caller.socket.close()
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    one = Scene()
+    yield one
+    one.close()
+
+
+def test_a_query_gets_every_answer_and_an_end(scene: Scene) -> None:
+    other = MemoryTransport(scene.network)
+    scene.end.serve("daedalus/a/join", lambda request: request.reply(b"a:" + request.payload))
+    other.serve("daedalus/b/join", lambda request: request.reply(b"b:" + request.payload))
+    caller = scene.call()
+    caller.send(Kind.QUERY, 7, "daedalus/*/join", b"hello")
+    answers = {caller.next(), caller.next()}
+    assert answers == {(Kind.ANSWER, 7, "", b"a:hello"), (Kind.ANSWER, 7, "", b"b:hello")}
+    assert caller.next() == (Kind.END, 7, "", b"")
+
+
+def test_a_query_that_nobody_serves_just_ends(scene: Scene) -> None:
+    caller = scene.call()
+    caller.send(Kind.QUERY, 3, "daedalus/r/status")
+    assert caller.next() == (Kind.END, 3, "", b"")
+
+
+def test_queries_do_not_wait_for_one_another(scene: Scene) -> None:
+    held = []
+    scene.end.serve("daedalus/r/rollouts/*", held.append)
+    scene.end.serve("daedalus/r/status", lambda request: request.reply(b"well"))
+    caller = scene.call()
+    caller.send(Kind.QUERY, 1, "daedalus/r/rollouts/wing", b"slow")
+    until(lambda: held)
+    caller.send(Kind.QUERY, 2, "daedalus/r/status")
+    assert caller.next() == (Kind.ANSWER, 2, "", b"well")
+    assert caller.next() == (Kind.END, 2, "", b"")
+    held.pop().reply(b"accepted")
+    assert caller.next() == (Kind.ANSWER, 1, "", b"accepted")
+
+
+def test_what_is_published_under_a_followed_key_comes_as_news(scene: Scene) -> None:
+    caller = scene.call()
+    caller.send(Kind.FOLLOW, 4, "daedalus/r/snapshots")
+    caller.send(Kind.QUERY, 5, "daedalus/r/status")
+    assert caller.next()[0] == Kind.END  # so the one before is done
+    scene.end.publish("daedalus/r/snapshots", b"weights")
+    assert caller.next() == (Kind.NEWS, 4, "daedalus/r/snapshots", b"weights")
+
+
+def test_a_client_that_reads_late_gets_the_newest_news_and_no_pile(scene: Scene) -> None:
+    caller = scene.call()
+    caller.send(Kind.FOLLOW, 4, "daedalus/r/snapshots")
+    caller.send(Kind.QUERY, 5, "daedalus/r/status")
+    assert caller.next()[0] == Kind.END
+    value = bytes(4 << 20)  # more than the sockets hold
+    for _ in range(30):
+        scene.end.publish("daedalus/r/snapshots", value)
+    scene.end.publish("daedalus/r/snapshots", b"the last")
+    came = 0
+    while caller.next()[3] != b"the last":
+        came += 1
+    assert came < 30
+
+
+def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> None:
+    present: dict[str, bool] = {}
+    scene.end.watch("daedalus/r/actors/*", present.__setitem__)
+    scene.end.announce("daedalus/r/learner")
+    caller = scene.call()
+    caller.send(Kind.WATCH, 1, "daedalus/r/learner")
+    assert caller.next() == (Kind.PRESENT, 1, "daedalus/r/learner", b"")
+    caller.send(Kind.ANNOUNCE, 2, "daedalus/r/actors/wing")
+    until(lambda: present.get("daedalus/r/actors/wing"))
+    scene.end.close()
+    assert caller.next() == (Kind.ABSENT, 1, "daedalus/r/learner", b"")
+    watcher = MemoryTransport(scene.network)
+    watcher.watch("daedalus/r/actors/*", present.__setitem__)
+    caller.socket.close()
+    until(lambda: present.get("daedalus/r/actors/wing") is False)
+    until(lambda: len(scene.network.ends) == 1)
+
+
+@pytest.mark.parametrize(
+    ("parcel", "complaint"),
+    [
+        (HEADER.pack(0, 9, 0, 0, 1), "kind 9"),
+        (HEADER.pack(MAX_QUESTION_BYTES + 1, Kind.QUERY, 16, 0, 1), "the limit is"),
+        (HEADER.pack(1, Kind.FOLLOW, 16, 0, 1), "the limit is 0"),
+        (HEADER.pack(0, Kind.QUERY, 4, 0, 1) + b"@/**", "no proper key"),
+        (HEADER.pack(0, Kind.QUERY, 0, 0, 1), "no proper key"),
+        (HEADER.pack(0, Kind.QUERY, 11, 0, 1) + b"daedalus/**", "no proper key"),
+        (HEADER.pack(0, Kind.QUERY, 10, 0, 1) + b"daedalus/\xff", "no proper key"),
+        (HEADER.pack(0, Kind.FOLLOW, 10, 0, 1) + b"daedalus/*", "no proper key"),
+    ],
+    ids=str,
+)
+def test_what_is_no_parcel_is_named_and_ends_the_connection(scene: Scene, parcel: bytes, complaint: str) -> None:
+    caller = scene.call()
+    caller.socket.sendall(parcel)
+    kind, _, _, reason = caller.next()
+    assert kind == Kind.ERROR
+    assert complaint in reason.decode()
+    assert caller.ended()
+    until(lambda: len(scene.network.ends) == 1)
+
+
+def test_who_does_not_greet_is_closed(scene: Scene) -> None:
+    with socket.create_connection(("127.0.0.1", scene.port), LIMIT) as stranger:
+        stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert stranger.recv(4) == GREETING
+        with contextlib.suppress(ConnectionError):  # it is closed with bytes unread
+            assert stranger.recv(1) == b""
+    until(lambda: any("speaks another protocol" in line for line in scene.said))
+
+
+def test_who_stops_within_a_parcel_is_given_up(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "STALL_SECONDS", 0.1)
+    caller = scene.call()
+    caller.send(Kind.QUERY, 1, "daedalus/r/status")
+    assert caller.next()[0] == Kind.END
+    threading.Event().wait(0.3)  # silence between two parcels is no fault
+    caller.send(Kind.QUERY, 2, "daedalus/r/status")
+    assert caller.next()[0] == Kind.END
+    caller.socket.sendall(HEADER.pack(1000, Kind.QUERY, 17, 0, 1))
+    kind, _, _, reason = caller.next()
+    assert (kind, b"no more came" in reason) == (Kind.ERROR, True)
+    assert caller.ended()
+
+
+def test_questions_beyond_the_budget_wait_in_the_connection(scene: Scene) -> None:
+    held = []
+    scene.end.serve("daedalus/r/rollouts/*", held.append)
+    caller = scene.call()
+    for number in range(80):
+        caller.send(Kind.QUERY, number, "daedalus/r/rollouts/wing", b"x")
+    until(lambda: len(held) == 64)
+    assert not threading.Event().wait(0.2)
+    assert len(held) == 64
+    for _ in range(80):
+        until(lambda: held)
+        held.pop().reply(b"accepted")
+        assert caller.next()[0] == Kind.ANSWER
+        assert caller.next()[0] == Kind.END
+
+
+def test_a_client_that_goes_with_its_budget_full_is_missed_at_once(scene: Scene) -> None:
+    held = []
+    scene.end.serve("daedalus/r/rollouts/*", held.append)
+    caller = scene.call()
+    for number in range(80):
+        caller.send(Kind.QUERY, number, "daedalus/r/rollouts/wing", b"x")
+    until(lambda: len(held) == 64)
+    caller.socket.close()
+    until(lambda: len(scene.network.ends) == 1)
+    held.clear()
+
+
+def test_a_client_may_not_declare_without_end(scene: Scene) -> None:
+    caller = scene.call()
+    for number in range(65):
+        caller.send(Kind.ANNOUNCE, number, f"daedalus/r/actors/wing-{number}")
+    kind, _, _, reason = caller.next()
+    assert (kind, b"more than 64 keys" in reason) == (Kind.ERROR, True)
+
+
+def test_a_network_out_of_reach_is_said(scene: Scene) -> None:
+    def unreachable() -> Transport:
+        raise TransportError("nothing answers at tcp/127.0.0.1:1")
+
+    scene.open = unreachable
+    caller = scene.call()
+    assert caller.next() == (Kind.ERROR, 0, "", b"nothing answers at tcp/127.0.0.1:1")
+    assert caller.ended()
+
+
+def test_clients_beyond_the_most_are_turned_away(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_module, "_MOST_CLIENTS", 1)
+    scene.call()
+    with socket.create_connection(("127.0.0.1", scene.port), LIMIT) as late:
+        assert late.recv(1) == b""
+
+
+def test_told_to_stop_it_ends_its_clients_and_their_presence(scene: Scene) -> None:
+    caller = scene.call()
+    caller.send(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing")
+    until(lambda: len(scene.network.ends) == 2)
+    scene.stop.set()
+    assert caller.ended()
+    until(lambda: len(scene.network.ends) == 1)
+
+
+def test_a_parcel_is_its_header_key_and_payload() -> None:
+    parcel = Parcel(Kind.QUERY, 258, "daedalus/r/join", timeout=5.0, payload=b"abc")
+    assert encode(parcel) == bytes.fromhex("03000000 01 0f 8813 02010000") + b"daedalus/r/joinabc"
