@@ -1,8 +1,10 @@
 """The bytes of every message as they were written down: a change of the wire is seen, and meant."""
 
+import json
 import typing
 from pathlib import Path
 
+import golden_values
 import pytest
 import zstandard
 from golden import FOLDER, MESSAGES, path
@@ -38,3 +40,7 @@ def test_the_bytes_are_those_that_were_written_down(name: str) -> None:
 def test_the_bytes_of_other_versions_are_refused_by_their_version(old: Path) -> None:
     with pytest.raises(VersionMismatchError, match=f"version {old.parent.name[1:]}, this one {PROTOCOL_VERSION}"):
         decode(old.read_bytes(), Limits())
+
+
+def test_what_the_messages_hold_is_written_down_for_other_languages() -> None:
+    assert json.loads(golden_values.PATH.read_text()) == json.loads(json.dumps(golden_values.values()))
