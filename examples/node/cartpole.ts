@@ -1,0 +1,97 @@
+/**
+ * CartPole: a pole on a cart, balanced by pushing the cart left or right. Barto, Sutton & Anderson (1983), with the
+ * constants, limits and rewards of gymnasium's CartPole-v1.
+ *
+ * E of them, reset by the NEXT_STEP rule: the step after an episode's end ignores its action and only resets.
+ */
+
+export const ID = "CartPole-v1";
+export const SPACES = {
+  observation: { kind: "array", shape: [4], dtype: "float32", frames: 1 },
+  action: { kind: "choice", count: 2 },
+};
+export const SIZE = 4; // numbers in an observation: position, velocity, angle, angular velocity
+
+const GRAVITY = 9.8;
+const POLE_MASS = 0.1;
+const TOTAL_MASS = 1.0 + POLE_MASS;
+const POLE_HALF_LENGTH = 0.5;
+const FORCE = 10.0;
+const SECONDS = 0.02; // of a step
+const MAX_ANGLE = (12 * 2 * Math.PI) / 360;
+const MAX_POSITION = 2.4;
+const MAX_STEPS = 500;
+
+export interface Step {
+  rewards: Float32Array; // [E]
+  terminated: Uint8Array; // [E]
+  truncated: Uint8Array; // [E]
+}
+
+export class CartPoles {
+  readonly count: number;
+  readonly #random: () => number;
+  readonly #maxSteps: number;
+  readonly #state: Float64Array; // [E, 4]
+  readonly #steps: Int32Array; // [E] of the episode
+  readonly #ended: Uint8Array; // [E] whether the last step ended its episode
+
+  constructor(count: number, random: () => number, maxSteps = MAX_STEPS) {
+    this.count = count;
+    this.#random = random;
+    this.#maxSteps = maxSteps;
+    this.#state = new Float64Array(count * SIZE);
+    this.#steps = new Int32Array(count);
+    this.#ended = new Uint8Array(count);
+    for (let e = 0; e < count; e++) this.#reset(e);
+  }
+
+  /** [E, 4] what is seen now. */
+  get observations(): Float32Array {
+    return Float32Array.from(this.#state);
+  }
+
+  /** One step of each under its action [E]. */
+  step(actions: ArrayLike<number>): Step {
+    const step = {
+      rewards: new Float32Array(this.count),
+      terminated: new Uint8Array(this.count),
+      truncated: new Uint8Array(this.count),
+    };
+    for (let e = 0; e < this.count; e++) {
+      if (this.#ended[e]) {
+        this.#reset(e);
+        continue;
+      }
+      this.#move(e, actions[e] === 1 ? FORCE : -FORCE);
+      const [position, , angle] = this.#state.subarray(e * SIZE);
+      step.rewards[e] = 1;
+      step.terminated[e] = Number(Math.abs(position) > MAX_POSITION || Math.abs(angle) > MAX_ANGLE);
+      step.truncated[e] = Number(++this.#steps[e] >= this.#maxSteps);
+      this.#ended[e] = step.terminated[e] | step.truncated[e];
+    }
+    return step;
+  }
+
+  #reset(e: number): void {
+    for (let i = 0; i < SIZE; i++) this.#state[e * SIZE + i] = 0.1 * this.#random() - 0.05;
+    this.#steps[e] = 0;
+    this.#ended[e] = 0;
+  }
+
+  #move(e: number, force: number): void {
+    const state = this.#state.subarray(e * SIZE, (e + 1) * SIZE);
+    const [position, velocity, angle, spin] = state;
+    const [sine, cosine] = [Math.sin(angle), Math.cos(angle)];
+    const push = (force + POLE_MASS * POLE_HALF_LENGTH * spin ** 2 * sine) / TOTAL_MASS;
+    const angular =
+      (GRAVITY * sine - cosine * push) / (POLE_HALF_LENGTH * (4 / 3 - (POLE_MASS * cosine ** 2) / TOTAL_MASS));
+    const linear = push - (POLE_MASS * POLE_HALF_LENGTH * angular * cosine) / TOTAL_MASS;
+    state.set([
+      position + SECONDS * velocity,
+      velocity + SECONDS * linear,
+      angle + SECONDS * spin,
+      spin + SECONDS * angular,
+    ]);
+  }
+}

@@ -1,0 +1,11 @@
+/** Numbers in [0, 1) from a seed: Marsaglia's xorshift over 32 bits, its state stirred once so that seeds differ. */
+export function seeded(seed: number): () => number {
+  let state = Math.imul((seed >>> 0) ^ 0x9e3779b9, 0x85ebca6b) >>> 0 || 1;
+  return () => {
+    state ^= state << 13;
+    state ^= state >>> 17;
+    state ^= state << 5;
+    state >>>= 0;
+    return state / 2 ** 32;
+  };
+}

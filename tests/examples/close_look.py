@@ -1,0 +1,106 @@
+"""A learner that trains on nothing: it keeps what it is sent, for a test to look at, and answers as it is told to."""
+
+import queue
+import time
+from collections.abc import Callable
+
+import numpy as np
+from processes import LIMIT
+
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import OnnxRuntime, program_hash
+from protocol import keys
+from protocol.codec import Limits, decode, encode
+from protocol.messages import Acknowledgement, Farewell, Join, Program, Refusal, Rollout, Snapshot, Welcome
+from protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
+from protocol.transport import MemoryTransport, Request
+
+SPEC = RunSpec(
+    environment=EnvironmentSpec(id="CartPole-v1", reward_scale=0.05, max_episode_steps=40),
+    policy=PolicySpec(memory="gru", memory_units=8, hidden=(16,)),
+    collection=CollectionSpec(envs_per_actor=6, rollout_length=48),
+)
+# Of two rollouts under way, either may arrive first.
+ONE_AT_A_TIME = SPEC.model_copy(update={"collection": SPEC.collection.model_copy(update={"window": 1})})
+
+
+class CloseLook:
+    """One life of it, for the run `r`; change `epoch` and it is another."""
+
+    def __init__(self, transport: MemoryTransport, spec: RunSpec = SPEC) -> None:
+        self.spec, self.epoch, self.version = spec, 2**62 + 5, 0
+        self.joins: list[Join] = []
+        self.rollouts: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
+        self.verdicts: queue.SimpleQueue[Acknowledgement] = queue.SimpleQueue()  # instead of accepting
+        self.refusals: queue.SimpleQueue[Refusal] = queue.SimpleQueue()  # instead of a welcome
+        self.present: dict[tuple[str, int] | None, bool] = {}
+        self._transport = transport
+        self.model, self.weights = b"", {}
+        transport.announce(keys.learner("r"))
+        transport.watch(keys.presence("r", "*", "*"), self._on_presence)
+        transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot()))
+        transport.serve(keys.program("r", "*"), lambda request: request.reply(self._program()))
+        transport.serve(keys.rollouts("r", "*"), self._on_rollout)
+        transport.serve(keys.join("r"), self._on_join)
+
+    def snapshot(self) -> bytes:
+        if not self.weights:
+            return encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
+        name = program_hash(self.model)
+        return encode(
+            Snapshot(learner_epoch=self.epoch, policy_version=self.version, program=name, weights=self.weights)
+        )
+
+    def publish(self) -> None:
+        self.version += 1
+        self.weights = {name: (array * 1.01).astype(np.float32) for name, array in self.weights.items()}
+        self.push(self.snapshot())
+
+    def push(self, news: bytes) -> None:
+        self._transport.publish(keys.snapshots("r"), news)
+
+    def bid_farewell(self) -> None:
+        self.push(encode(Farewell(learner_epoch=self.epoch, reason="enough")))
+
+    def _program(self) -> bytes:
+        return encode(Program(hash=program_hash(self.model), model=np.frombuffer(self.model, np.uint8)))
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        self.present[keys.who_is_present(key)] = present
+
+    def _on_join(self, request: Request) -> None:
+        join = decode(request.payload, Limits())
+        assert isinstance(join, Join)
+        self.joins.append(join)
+        if not self.refusals.empty():
+            request.reply(encode(self.refusals.get()))
+            return
+        if join.spaces is not None:  # who is counted in is there already
+            assert self.present[join.actor, join.incarnation]
+        if join.spaces is not None and not self.weights:
+            network = ActorCritic(self.spec.policy, join.spaces)
+            self.model = export_program(network, join.spaces.observation)
+            self.weights = {name: p.detach().numpy().copy() for name, p in network.named_parameters()}
+            self.weights = {name: self.weights[name] for name in OnnxRuntime(self.model).weight_names}
+        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=11, spec=self.spec)))
+
+    def _on_rollout(self, request: Request) -> None:
+        rollout = decode(request.payload, Limits())
+        assert isinstance(rollout, Rollout)
+        assert keys.last_chunk(request.key) == rollout.identity.actor
+        self.rollouts.put(rollout)
+        try:
+            verdict = self.verdicts.get_nowait()
+        except queue.Empty:
+            verdict = Acknowledgement(verdict="accepted", policy_version=self.version)
+        request.reply(encode(verdict))
+
+    def next(self) -> Rollout:
+        return self.rollouts.get(timeout=LIMIT)
+
+    def await_rollout(self, wanted: Callable[[Rollout], bool]) -> Rollout:
+        deadline = time.monotonic() + LIMIT
+        while not wanted(rollout := self.next()):
+            assert time.monotonic() < deadline, "no such rollout came"
+        return rollout

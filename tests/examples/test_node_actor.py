@@ -1,0 +1,251 @@
+"""The TypeScript actor in examples/node: its own tests, a learner that looks closely, and one that learns from it."""
+
+import json
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import gymnasium
+import node
+import numpy as np
+import pytest
+import torch
+from close_look import ONE_AT_A_TIME, SPEC, CloseLook
+from processes import LIMIT, Running, until
+
+from bridge.service import Bridge
+from policy.runtime import OnnxRuntime
+from protocol.codec import PROTOCOL_VERSION
+from protocol.messages import Acknowledgement, Refusal
+from protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
+from protocol.transport import MemoryNetwork, MemoryTransport
+
+Start = Callable[..., Running]
+
+
+def test_its_own_tests_pass() -> None:
+    run = subprocess.run([node.program(), "--test"], cwd=node.FOLDER, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.fixture
+def network() -> Iterator[tuple[MemoryNetwork, str]]:
+    """A network within this process, and a bridge to it."""
+    inside, stop = MemoryNetwork(), threading.Event()
+    listener = socket.create_server(("127.0.0.1", 0))
+    address = f"127.0.0.1:{listener.getsockname()[1]}"
+    thread = threading.Thread(
+        target=Bridge(listener, lambda: MemoryTransport(inside), lambda _: None).run, args=(stop,)
+    )
+    thread.start()
+    yield inside, address
+    stop.set()
+    thread.join(LIMIT)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def begin() -> Iterator[Callable[[str], Running]]:
+    """Starts an actor that connects to the bridge at HOST:PORT; one that still runs is killed afterwards."""
+    running: list[Running] = []
+
+    def begin_one(address: str) -> Running:
+        words = [node.program(), "main.ts", "--bridge", address, "--name", "wing-ts", "--envs", "6"]
+        running.append(Running(words, node.FOLDER))
+        return running[-1]
+
+    yield begin_one
+    for one in running:
+        one.end()
+
+
+@pytest.fixture
+def play(
+    network: tuple[MemoryNetwork, str], begin: Callable[[str], Running]
+) -> Callable[..., tuple[CloseLook, Running]]:
+    """A learner that looks closely, and an actor that plays for it."""
+    inside, address = network
+
+    def begin_both(spec: RunSpec = SPEC) -> tuple[CloseLook, Running]:
+        torch.manual_seed(0)
+        return CloseLook(MemoryTransport(inside), spec), begin(address)
+
+    return begin_both
+
+
+def gymnasium_step(state: np.ndarray, action: int) -> tuple[np.ndarray, bool]:
+    cart = gymnasium.make("CartPole-v1").unwrapped
+    cart.reset()
+    cart.state = state.astype(np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+    seen, _, terminated, _, _ = cart.step(action)
+    return seen, bool(terminated)
+
+
+def test_every_row_is_what_the_program_and_the_environment_make_of_it(
+    play: Callable[..., tuple[CloseLook, Running]],
+) -> None:
+    learner, process = play(ONE_AT_A_TIME)
+    seen, ended, running = None, np.zeros(6, np.bool_), np.zeros(6)
+    tail = state = None
+    for expected in range(6):
+        rollout = learner.next()
+        assert (rollout.identity.sequence, rollout.identity.learner_epoch) == (expected, 2**62 + 5)
+        assert rollout.identity.incarnation == learner.joins[-1].incarnation
+        assert rollout.frames.shape == (49, 6, 4)
+        assert rollout.frames.dtype == np.float32
+        runtime = OnnxRuntime(learner.model)
+        runtime.load(learner.weights)
+        assert tail is None or np.array_equal(rollout.frames[0], tail)
+        assert state is None or np.allclose(rollout.initial_state, state, atol=1e-5)
+        state, finished = rollout.initial_state, []
+        for row in range(48):
+            seen = rollout.frames[row]
+            logits, state = acted(runtime, seen, state)
+            log_probs = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
+            chosen = log_probs[np.arange(6), rollout.actions[row]]
+            assert np.allclose(rollout.behaviour_log_probs[row], chosen, atol=1e-5)
+            assert np.array_equal(rollout.valid[row], ~ended)
+            assert np.allclose(rollout.rewards[row], 0.05 * ~ended)
+            for e in range(6):
+                after = rollout.frames[row + 1, e]
+                if ended[e]:
+                    assert (np.abs(after) <= 0.05).all()
+                    assert not rollout.terminated[row, e]
+                    assert not rollout.truncated[row, e]
+                    continue
+                there, terminated = gymnasium_step(seen[e], int(rollout.actions[row, e]))
+                assert np.allclose(after, there, atol=1e-4)
+                assert rollout.terminated[row, e] == terminated
+            running += rollout.valid[row]
+            assert np.array_equal(rollout.truncated[row], (running >= 40) & ~ended)
+            state = state * rollout.valid[row][:, None]
+            ended = rollout.terminated[row] | rollout.truncated[row]
+            finished += running[ended].tolist()
+            running[ended] = 0
+        tail = rollout.frames[-1]
+        assert rollout.episode_lengths.tolist() == finished
+        assert rollout.episode_returns.tolist() == finished
+    learner.bid_farewell()
+    assert process.wait() == 0, process.output
+    process.expect("the run is over: enough")
+
+
+def acted(runtime: OnnxRuntime, observations: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Logits and the next state, straight from the program."""
+    outputs = runtime._session.run(None, {**runtime._feed, "observations": observations, "state": state})
+    return np.asarray(outputs[0]), np.asarray(outputs[1])
+
+
+def test_it_does_what_each_verdict_obliges_it_to(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+    learner, process = play(ONE_AT_A_TIME)
+    for verdict in ("busy", "busy", "rejected", "fenced"):
+        learner.verdicts.put(Acknowledgement(verdict=verdict, policy_version=0))
+    again = [learner.next() for _ in range(3)]  # busy: the same once more
+    assert [rollout.identity.sequence for rollout in again] == [0, 0, 0]
+    assert all(np.array_equal(rollout.frames, again[0].frames) for rollout in again)
+    assert learner.next().identity.sequence == 1  # rejected: never again; and this one is fenced
+    joined = len(learner.joins)
+    until(lambda: len(learner.joins) > joined)
+    assert learner.next().identity.sequence == 2  # the same life of the learner, so it goes on counting
+    learner.verdicts.put(Acknowledgement(verdict="quarantined", reason="not finite"))
+    assert process.wait() == 1
+    process.expect("takes nothing more of this actor: not finite")
+
+
+def test_it_plays_with_the_newest_weights_and_joins_another_life_of_the_learner(
+    play: Callable[..., tuple[CloseLook, Running]],
+) -> None:
+    learner, process = play(ONE_AT_A_TIME)
+    learner.next()
+    learner.publish()
+    learner.await_rollout(lambda rollout: rollout.policy_version == 1)
+    learner.epoch += 1
+    learner.publish()
+    rollout = learner.await_rollout(lambda rollout: rollout.identity.learner_epoch == learner.epoch)
+    assert rollout.identity.sequence == 0
+    learner.verdicts.put(Acknowledgement(verdict="finished"))
+    assert process.wait() == 0, process.output
+
+
+def test_damaged_news_is_ignored_and_another_version_named(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+    learner, process = play(ONE_AT_A_TIME)
+    learner.next()
+    for damaged in (b"", b"nonsense", learner.snapshot()[:-1], learner.snapshot().replace(b"kind", b"find")):
+        learner.push(damaged)
+        time.sleep(0.05)  # so that each is the newest for a while
+    learner.publish()
+    learner.await_rollout(lambda rollout: rollout.policy_version == 1)
+    learner.push(b"DAED" + (99).to_bytes(2, "little") + learner.snapshot()[6:])
+    assert process.wait() == 1
+    process.expect(f"the other end speaks protocol version 99, this one {PROTOCOL_VERSION}")
+
+
+def test_it_waits_for_an_earlier_life_of_its_name_to_be_found_dead(
+    network: tuple[MemoryNetwork, str], begin: Callable[[str], Running]
+) -> None:
+    inside, address = network
+    learner = CloseLook(MemoryTransport(inside))
+    for _ in range(2):
+        learner.refusals.put(Refusal(code="name_taken", reason="wing-ts takes part already"))
+    actor = begin(address)
+    actor.expect("wing-ts takes part already; looking")
+    actor.expect("joined run 'r'")
+    learner.next()
+    actor.process.terminate()
+    assert actor.wait() == 0, actor.output
+    until(lambda: learner.present == {("wing-ts", learner.joins[0].incarnation): False})
+    learner.refusals.put(Refusal(code="full", reason="no room"))
+    refused = begin(address)
+    assert refused.wait() == 1
+    refused.expect("refused this actor: no room")
+
+
+def test_on_policy_it_sends_one_rollout_of_each_version(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+    learner, process = play(SPEC.model_copy(update={"training": TrainingSpec(algorithm="a2c")}))
+    for version in range(4):
+        rollout = learner.next()
+        assert rollout.policy_version == version
+        learner.publish()
+    learner.bid_farewell()
+    assert process.wait() == 0, process.output
+
+
+def test_what_it_cannot_play_it_refuses(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+    _, process = play(RunSpec(environment=EnvironmentSpec(id="CartPole-v1", action_repeat=2)))
+    assert process.wait() == 1
+    process.expect("it plays CartPole-v1 as it is")
+
+
+def test_a_learner_trains_on_what_it_sends(start: Start, begin: Callable[[str], Running], address: str) -> None:
+    node.program()
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+    learner.expect("actors join with")
+    bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
+    actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1])
+
+    def status() -> dict:
+        asked = start("status", "--connect", address, "--json")
+        return json.loads(asked.output) if asked.wait() in (0, 3) else {"actors": [], "episode_return_mean": None}
+
+    def env_steps() -> int:
+        return next((one["env_steps"] for one in status()["actors"] if one["actor"] == "wing-ts"), 0)
+
+    until(lambda: env_steps() > 0)
+    before = env_steps()
+    until(lambda: env_steps() > before + 10_000)
+    report = status()
+    (seen,) = report["actors"]
+    assert seen["alive"]
+    assert seen["environments"] == 6
+    assert seen["rollouts_accepted"] > 0
+    assert set(seen["rollouts_rejected"]) <= {"stale"}
+    assert report["episode_return_mean"] > 5  # its episodes were counted
+    actor.process.kill()
+    until(lambda: not status()["actors"][0]["alive"])
+    learner.process.terminate()
+    learner.wait()
+    bridge.process.terminate()
+    assert bridge.wait() == 0, bridge.output
