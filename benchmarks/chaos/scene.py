@@ -53,9 +53,9 @@ class Scene:
         """Starts `daedalus ARGUMENTS`."""
         return self.run([*COMMAND, *map(str, arguments)])
 
-    def run(self, command: Sequence[str]) -> Running:
-        """Starts any command."""
-        self._running.append(Running(list(command), self.folder))
+    def run(self, command: Sequence[str], directory: Path | None = None) -> Running:
+        """Starts any command, in the scene's folder unless told otherwise."""
+        self._running.append(Running(list(command), directory or self.folder))
         return self._running[-1]
 
     def router(self) -> Running:

@@ -1,0 +1,207 @@
+"""One learner and fleets of simulated actors: how the cost of a run grows with them.
+
+    python -m benchmarks.fleet --actors 1 10 100 1000 --plot docs/fleet.png
+
+Simulated actors are whole to the learner and its router, with sessions, presence and acknowledgements of their own,
+but play nothing: each sends one recorded rollout of CartPole, 16 rows of 16 environments, again and again. First all
+of them together send --rate rollouts a second, which the learner can take: what that costs, and how long answers and
+snapshots take, is the fleet's doing. Then all send as fast as they are answered.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.chaos.scene import ENDLESS, Scene, resident_mib, say, scene
+from benchmarks.running import machine, table
+
+_PER_PROCESS = 250
+_HEADER = (
+    "actors",
+    "rollouts/s",
+    "ack ms, p50 and p99",
+    "snapshot ms, p50 and p99",
+    "to the last actor",
+    "missed",
+    "CPU s a 1,000 rollouts: learner",
+    "router",
+    "MiB: learner",
+    "router",
+    "at most, rollouts/s",
+)
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--actors", type=int, nargs="+", default=[1, 10, 100, 1000])
+    options.add_argument("--rate", type=float, default=100.0, help="rollouts a second of all (default: %(default)g)")
+    options.add_argument("--seconds", type=float, default=20.0, help="of each measurement (default: %(default)g)")
+    options.add_argument("--plot", type=Path, help="draw the growth into this file")
+    parsed = options.parse_args()
+    rows = []
+    for count in parsed.actors:
+        with scene() as here:
+            rows.append(_measured(here, count, parsed.rate, parsed.seconds))
+        say(f"{count} actors: {rows[-1]}")
+    print(f"{machine()}; {parsed.rate:g} rollouts/s, {parsed.seconds:g} s each\n")
+    print(table(_HEADER, [_cells(row) for row in rows]))
+    if parsed.plot:
+        _plot(rows, parsed.plot)
+    return 0
+
+
+class Swarm:
+    """Simulated actors in as many processes as they need."""
+
+    def __init__(self, here: Scene, count: int, rate: float, seconds: float) -> None:
+        each = [len(part) for part in np.array_split(np.arange(count), -(-count // _PER_PROCESS))]
+        self._processes = []
+        for first, size in zip(np.cumsum([0, *each[:-1]]), each, strict=True):
+            words = [here.address, first, size, rate / count, seconds]
+            self._processes.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", "benchmarks.fleet.swarm", *map(str, words)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+            )
+
+    def await_ready(self) -> None:
+        """Waits until all have joined and there is a policy."""
+        for process in self._processes:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+
+    def go(self) -> None:
+        """Has them send."""
+        for process in self._processes:
+            assert process.stdin is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
+
+    def results(self) -> list[dict]:
+        """What came of it, once they are done."""
+        found = []
+        for process in self._processes:
+            assert process.stdout is not None
+            found.append(json.loads(process.stdout.readline()))
+            process.wait(60.0)
+        return found
+
+    def close(self) -> None:
+        """Ends them."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+
+def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str, float]:
+    """One fleet: at a given rate, then as fast as it goes."""
+    router = here.router()
+    notes = here.folder / "published"
+    settings = ("--set", "collection.envs_per_actor=16", "--set", "collection.rollout_length=16", *ENDLESS)
+    words = ["cartpole", "--connect", here.address, "--run-dir", here.folder / "fleet", "--actors", 4, *settings]
+    learner = here.run(
+        [sys.executable, "-m", "benchmarks.fleet.noting_learner", str(notes), *map(str, words)], Path.cwd()
+    )
+    learner.expect("actors join with")
+    pids = {"learner": learner.process.pid, "router": router.process.pid}
+    row: dict[str, float] = {"actors": count}
+    for pace in (rate, 1e6):
+        swarm = Swarm(here, count, pace, seconds)
+        try:
+            swarm.await_ready()
+            began, before = time.monotonic(), {name: _cpu_seconds(pid) for name, pid in pids.items()}
+            swarm.go()
+            results = swarm.results()
+            took = time.monotonic() - began
+        finally:
+            swarm.close()
+        accepted = sum(result["verdicts"].get("accepted", 0) for result in results)
+        if pace != rate:
+            row["most"] = accepted / took
+            continue
+        row["rate"] = accepted / seconds
+        for name, pid in pids.items():
+            row[f"{name}_cpu"] = 1000 * (_cpu_seconds(pid) - before[name]) / max(accepted, 1)
+            row[f"{name}_mib"] = resident_mib(pid)
+        latencies = [latency for result in results for latency in result["latencies"]]
+        row["ack_50"], row["ack_99"] = (1000 * np.quantile(latencies, (0.5, 0.99))).tolist()
+        row |= _snapshots(notes, [came for result in results for came in result["came"]], began, seconds)
+    return row
+
+
+def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: float, seconds: float) -> dict:
+    """How long snapshots took, of those that were published while all sent."""
+    published = {}
+    for line in notes.read_text().splitlines():
+        version, at = line.split()
+        if began < float(at) < began + seconds:
+            published[int(version)] = float(at)
+    delays: dict[int, list[float]] = {version: [] for version in published}
+    for actor in came:
+        for version, at in actor:
+            if version in delays:
+                delays[version].append(at - published[version])
+    every = [delay for each in delays.values() for delay in each]
+    last = [max(each) for each in delays.values() if each]
+    return {
+        "snapshot_50": 1000 * float(np.quantile(every, 0.5)),
+        "snapshot_99": 1000 * float(np.quantile(every, 0.99)),
+        "last_50": 1000 * float(np.median(last)),
+        "missed": 1 - len(every) / (len(delays) * len(came)),
+    }
+
+
+def _cpu_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _cells(row: dict[str, float]) -> tuple[str, ...]:
+    return (
+        f"{row['actors']:,.0f}",
+        f"{row['rate']:.0f}",
+        f"{row['ack_50']:.1f} and {row['ack_99']:.1f}",
+        f"{row['snapshot_50']:.1f} and {row['snapshot_99']:.1f}",
+        f"{row['last_50']:.1f}",
+        f"{row['missed']:.1%}",
+        f"{row['learner_cpu']:.2f}",
+        f"{row['router_cpu']:.2f}",
+        f"{row['learner_mib']:.0f}",
+        f"{row['router_mib']:.0f}",
+        f"{row['most']:,.0f}",
+    )
+
+
+def _plot(rows: Sequence[dict[str, float]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.5), layout="constrained")
+    counts = [row["actors"] for row in rows]
+    for axis, title, names in (
+        (axes[0], "milliseconds", ("ack_50", "ack_99", "snapshot_50", "snapshot_99")),
+        (axes[1], "CPU seconds a 1,000 rollouts", ("learner_cpu", "router_cpu")),
+        (axes[2], "MiB", ("learner_mib", "router_mib")),
+    ):
+        for name in names:
+            axis.plot(counts, [row[name] for row in rows], marker="o", label=name.replace("_", " "))
+        axis.set(xscale="log", xlabel="actors", title=title)
+        axis.legend()
+    axes[0].set(yscale="log")
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

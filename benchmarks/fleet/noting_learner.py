@@ -1,0 +1,21 @@
+"""A learner that notes when each snapshot went out: `python -m benchmarks.fleet.noting_learner FILE ARGUMENTS`.
+
+Lines of `policy_version seconds`, on the clock that all processes of this machine share.
+"""
+
+import sys
+import time
+
+from learner.__main__ import main
+from learner.reception import Reception
+
+if __name__ == "__main__":
+    notes = open(sys.argv.pop(1), "a", buffering=1)  # noqa: SIM115 - for as long as the process lives
+    publish = Reception.publish
+
+    def noted(self: Reception, policy_version: int, weights: dict) -> None:
+        notes.write(f"{policy_version} {time.monotonic()}\n")
+        publish(self, policy_version, weights)
+
+    Reception.publish = noted  # type: ignore[method-assign] - this process is for that
+    sys.exit(main())

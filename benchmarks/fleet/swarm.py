@@ -1,0 +1,174 @@
+"""Many simulated actors in one process: sessions of their own, no environments, one recorded rollout each.
+
+    python -m benchmarks.fleet.swarm ADDRESS FIRST COUNT RATE SECONDS
+
+They join as numbers FIRST to FIRST + COUNT - 1, say `ready`, wait for a line on standard input, and then send for
+SECONDS: each one at most RATE rollouts a second, and never more than one that is not answered. Prints what came of it
+as JSON.
+"""
+
+import json
+import secrets
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from actor.learner_link import LearnerLink
+from actor.uploader import Uploader
+from protocol import keys
+from protocol.codec import Limits, ProtocolError, decode, encode
+from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
+from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from protocol.zenoh_transport import connect
+
+SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+ENVIRONMENTS = 16
+_LIMITS = Limits()
+_WAIT_SECONDS = 120.0
+
+
+def recorded(rows: int) -> Rollout:
+    """A rollout of plausible numbers: what one holds does not matter here, how large it is does."""
+    random = np.random.default_rng(1)
+    shape = (rows, ENVIRONMENTS)
+    return Rollout(
+        identity=RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0),
+        policy_version=0,
+        frames=random.normal(0, 0.05, (rows + 1, ENVIRONMENTS, 4)).astype(np.float32),
+        initial_state=np.zeros((ENVIRONMENTS, 0), np.float32),
+        actions=random.integers(0, 2, shape).astype(np.uint8),
+        behaviour_log_probs=np.full(shape, -0.7, np.float32),
+        rewards=np.ones(shape, np.float32),
+        terminated=np.zeros(shape, np.bool_),
+        truncated=np.zeros(shape, np.bool_),
+        valid=np.ones(shape, np.bool_),
+        episode_returns=np.zeros(0, np.float32),
+        episode_lengths=np.zeros(0, np.int32),
+    )
+
+
+class Simulated:
+    """One actor, as far as the learner and the router can tell."""
+
+    def __init__(self, address: str, name: str) -> None:
+        self._transport = connect([address])
+        self._link = LearnerLink(self._transport, lambda text: None)
+        self._changed = threading.Condition()
+        self._uploader = Uploader(window=1)
+        self._sequence, self._version = 0, -1
+        self._sent_at = 0.0
+        self.latencies: list[float] = []
+        self.came: list[tuple[int, float]] = []  # policy versions, and when
+        incarnation = secrets.randbits(62)
+        join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
+        self._welcome = self._link.find(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
+        run = self._welcome.run
+        self._inbox = self._transport.follow(keys.snapshots(run), self._on_news)
+        self._transport.announce(keys.presence(run, name, incarnation))
+        self._key = keys.rollouts(run, name)
+        self._rollout = replace(
+            recorded(self._welcome.spec.collection.rollout_length),
+            identity=RolloutIdentity(
+                actor=name, incarnation=incarnation, sequence=0, learner_epoch=self._welcome.learner_epoch
+            ),
+        )
+
+    @property
+    def verdicts(self) -> Counter[str]:
+        """What became of its rollouts."""
+        return self._uploader.verdicts
+
+    def has_policy(self) -> bool:
+        """Whether the learner has one; asks for it."""
+        for message in self._link.newest(self._welcome.run):
+            if isinstance(message, Snapshot):
+                self._version = max(self._version, message.policy_version)
+        return self._version >= 0
+
+    def _on_news(self) -> None:
+        data = self._inbox.take()
+        try:
+            news = None if data is None else decode(data, _LIMITS)
+        except ProtocolError:
+            return
+        if isinstance(news, Snapshot):
+            self.came.append((news.policy_version, time.monotonic()))
+            self._version = news.policy_version
+
+    def play(self, rate: float, until: float) -> None:
+        """Sends, on a thread of its own."""
+        pause = 1 / rate
+        due = time.monotonic() + np.random.default_rng().uniform(0, pause)
+        while (now := time.monotonic()) < until:
+            with self._changed:
+                self._changed.wait(max(min(due, until) - now, 0.0)) if now < due else None
+                if time.monotonic() < due:
+                    continue
+                self._changed.wait_for(lambda: self._uploader.has_room or self._uploader.next_due() is not None, 1.0)
+                if self._uploader.has_room:
+                    identity = replace(self._rollout.identity, sequence=self._sequence)
+                    payload = encode(replace(self._rollout, identity=identity, policy_version=max(self._version, 0)))
+                    self._uploader.add(self._sequence, payload)
+                    self._sequence += 1
+                    self._sent_at = time.monotonic()
+                    due = max(due + pause, self._sent_at)
+                wanted = self._uploader.next_due()
+                self._changed.wait(max((wanted or 0.0) - time.monotonic(), 0.0)) if wanted else None
+                ready = self._uploader.due(time.monotonic())
+            for sequence, payload in ready:
+                self._transport.send(
+                    self._key,
+                    payload,
+                    timeout=30.0,
+                    on_answer=lambda data, sequence=sequence: self._on_answer(sequence, data),
+                )
+
+    def _on_answer(self, sequence: int, data: bytes | None) -> None:
+        message = None if data is None else decode(data, _LIMITS)
+        answer = message if isinstance(message, Acknowledgement) else None
+        now = time.monotonic()
+        with self._changed:
+            self._uploader.answered(sequence, answer, now)
+            if answer is not None and answer.verdict == "accepted":
+                self.latencies.append(now - self._sent_at)  # from the first attempt, busy answers included
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Leaves."""
+        self._transport.close()
+
+
+def main() -> None:
+    address, first, count, rate, seconds = sys.argv[1], *map(float, sys.argv[2:6])
+    actors = [Simulated(address, f"sim-{number}") for number in range(int(first), int(first + count))]
+    try:
+        while not actors[0].has_policy():
+            time.sleep(0.1)
+        for actor in actors[1:]:
+            actor._version = actors[0]._version
+        print("ready", flush=True)
+        sys.stdin.readline()
+        until = time.monotonic() + seconds
+        threads = [threading.Thread(target=actor.play, args=(rate, until), daemon=True) for actor in actors]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(seconds + 60.0)
+        verdicts: Counter[str] = sum((actor.verdicts for actor in actors), Counter())
+        result = {
+            "verdicts": verdicts,
+            "latencies": [latency for actor in actors for latency in actor.latencies],
+            "came": [actor.came for actor in actors],
+        }
+        print(json.dumps(result), flush=True)
+    finally:
+        for actor in actors:
+            actor.close()
+
+
+if __name__ == "__main__":
+    main()
