@@ -16,6 +16,7 @@ on this machine:
 by hand, on any machines:
   learner    own the weights, learn from what actors send
   actor      play for a learner; needs nothing but its address
+  router     stand between them, so that neither has to know the other's host
   status     show the fleet as the learner sees it
   bridge     let actors in that are written in other languages
   certs      make the certificates for actors on machines that others reach too
@@ -68,6 +69,12 @@ def _status(arguments: list[str]) -> int:
     return status(arguments)
 
 
+def _router(arguments: list[str]) -> int:
+    from launch.router import router
+
+    return router(arguments)
+
+
 def _plot(arguments: list[str]) -> int:
     from launch.plot import plot
 
@@ -83,6 +90,7 @@ def _certs(arguments: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
+    "router": _router,
     "status": _status,
     "plot": _plot,
     "certs": _certs,

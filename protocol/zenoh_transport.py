@@ -85,7 +85,7 @@ def _open(mode: str, listen_on: list[str], connect_to: list[str], credentials: C
         "mode": mode,
         "listen/endpoints": listen_on,
         "connect/endpoints": connect_to,
-        "connect/timeout_ms": 0,
+        "connect/timeout_ms": 0 if mode == "client" else -1,  # a router that is told of another goes on trying
         "connect/exit_on_failure": mode == "client",
         "connect/retry": {
             "period_init_ms": _RETRY_MILLISECONDS,

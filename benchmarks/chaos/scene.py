@@ -60,8 +60,7 @@ class Scene:
 
     def router(self) -> Running:
         """Starts a router of its own at the address."""
-        program = Path(__file__).parents[2] / "tests" / "router_process.py"
-        running = self.run([sys.executable, str(program), self.address])
+        running = self.start("router", "--listen", self.address)
         running.expect("listening")
         return running
 

@@ -5,8 +5,7 @@ import os
 import random
 import resource
 import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -215,19 +214,15 @@ def test_a_learner_leaves_in_good_order_beside_a_frozen_actor(
 
 
 @pytest.fixture
-def router(tmp_path: Path, address: str) -> Iterator[Callable[[], Running]]:
+def router(start: Start, address: str) -> Callable[[], Running]:
     """Starts a router of its own at the address."""
-    started: list[Running] = []
 
     def start_one() -> Running:
-        program = str(Path(__file__).parent.parent / "router_process.py")
-        started.append(Running([sys.executable, program, address], tmp_path))
-        started[-1].expect("listening")
-        return started[-1]
+        running = start("router", "--listen", address)
+        running.expect("listening")
+        return running
 
-    yield start_one
-    for each in started:
-        each.end()
+    return start_one
 
 
 def test_learner_and_actors_find_each_other_again_when_the_router_returns(
