@@ -19,6 +19,7 @@ by hand, on any machines:
   router     stand between them, so that neither has to know the other's host
   status     show the fleet as the learner sees it
   bridge     let actors in that are written in other languages
+  exporter   tell Prometheus what status tells
   certs      make the certificates for actors on machines that others reach too
 
 afterwards:
@@ -75,6 +76,12 @@ def _router(arguments: list[str]) -> int:
     return router(arguments)
 
 
+def _exporter(arguments: list[str]) -> int:
+    from launch.exporter import exporter
+
+    return exporter(arguments)
+
+
 def _plot(arguments: list[str]) -> int:
     from launch.plot import plot
 
@@ -92,6 +99,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "resume": _resume,
     "router": _router,
     "status": _status,
+    "exporter": _exporter,
     "plot": _plot,
     "certs": _certs,
 }

@@ -8,7 +8,7 @@ from protocol.codec import Limits, ProtocolError, decode
 from protocol.messages import StatusReport
 from protocol.security_options import SECURITY_ERRORS, add_tls, credentials_to_connect
 from protocol.spec import ActorStatus, RunStatus
-from protocol.transport import TransportError
+from protocol.transport import Transport, TransportError
 from protocol.zenoh_transport import connect
 
 HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
@@ -28,8 +28,8 @@ MB/h up: rollouts; down: snapshots, with an s where the link is slow and they ar
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the problems stand in the answer)"""
 
 
-def status(arguments: list[str]) -> int:
-    """Runs `daedalus status`."""
+def parser() -> argparse.ArgumentParser:
+    """Parses what `daedalus status` takes."""
     options = argparse.ArgumentParser(
         prog="daedalus status",
         description=_DESCRIPTION,
@@ -48,7 +48,19 @@ def status(arguments: list[str]) -> int:
     how.add_argument("--json", action="store_true", help="print each as one JSON object a line")
     how.add_argument("--quiet", action="store_true", help="print problems only")
     add_tls(options)
-    parsed = options.parse_args(arguments)
+    return options
+
+
+def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
+    """What the learners behind a transport tell, within 5 s. Raises TransportError or ProtocolError."""
+    answers = transport.ask(keys.status(run), timeout=5.0)
+    reports = [decode(answer, Limits()) for answer in answers]
+    return [report.status for report in reports if isinstance(report, StatusReport)]
+
+
+def status(arguments: list[str]) -> int:
+    """Runs `daedalus status`."""
+    parsed = parser().parse_args(arguments)
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
@@ -57,14 +69,12 @@ def status(arguments: list[str]) -> int:
     try:
         transport = connect(parsed.connect, credentials)
         try:
-            answers = transport.ask(keys.status(parsed.run), timeout=5.0)
+            statuses = ask(transport, parsed.run)
         finally:
             transport.close()
-        reports = [decode(answer, Limits()) for answer in answers]
     except (TransportError, ProtocolError) as error:
         print(f"daedalus status: {error}", file=sys.stderr)
         return NO_ANSWER
-    statuses = [report.status for report in reports if isinstance(report, StatusReport)]
     if not statuses:
         print("daedalus status: no learner answers there", file=sys.stderr)
         return NO_ANSWER

@@ -72,7 +72,9 @@ def test_an_address_in_use_is_told(start: Start, address: str, tmp_path: Path) -
     assert not (tmp_path / "two").exists()
 
 
-@pytest.mark.parametrize("command", ["train", "resume", "learner", "actor", "router", "status", "evaluate", "plot"])
+@pytest.mark.parametrize(
+    "command", ["train", "resume", "learner", "actor", "router", "status", "exporter", "evaluate", "plot"]
+)
 def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
     running = start(command, "--help")
     assert running.wait() == 0
