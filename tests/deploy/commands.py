@@ -1,0 +1,36 @@
+"""Command lines in files for other programs: whether ours would take them."""
+
+from collections.abc import Sequence
+
+import pytest
+
+from actor import options as actor_options
+from launch import exporter, router, status
+from learner import options as learner_options
+from learner.settings import SettingsError
+from protocol.addresses import AddressError, check_listening
+
+PARSERS = {
+    "actor": actor_options.parser,
+    "exporter": exporter.parser,
+    "learner": learner_options.learner_parser,
+    "router": router.parser,
+    "status": status.parser,
+}
+
+
+def check(words: Sequence[str]) -> str:
+    """Fails if `daedalus WORDS` would be refused; returns which command it is."""
+    command, *arguments = words
+    assert command in PARSERS, f"`daedalus {command}`: no such command, or none to deploy"
+    try:
+        parsed = PARSERS[command]().parse_args(arguments)
+        if command == "learner":
+            learner_options.resolve(parsed)
+        if command == "actor":
+            actor_options.config(parsed, None)
+        if command == "router":
+            check_listening([parsed.listen], tls=parsed.tls is not None, insecure=parsed.insecure)
+    except (SystemExit, SettingsError, AddressError, ValueError) as error:
+        pytest.fail(f"`daedalus {' '.join(words)}` is refused: {error}")
+    return command

@@ -1,0 +1,70 @@
+"""docker-compose.yml and the files that it mounts. `make test-compose` runs it."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+from commands import check
+
+ROOT = Path(__file__).parents[2]
+SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+
+
+def test_without_the_profile_it_is_router_learner_and_actors() -> None:
+    assert {name for name, service in SERVICES.items() if "profiles" not in service} == {"router", "learner", "actor"}
+    monitoring = {name for name, service in SERVICES.items() if service.get("profiles") == ["monitoring"]}
+    assert monitoring == {"exporter", "tensorboard", "prometheus", "grafana"}
+
+
+@pytest.mark.parametrize("name", ["learner", "actor", "exporter"])
+def test_services_run_commands_that_we_take(name: str) -> None:
+    assert check(SERVICES[name]["command"]) == name
+
+
+def test_the_health_check_is_a_command_that_we_take() -> None:
+    kind, program, *arguments = SERVICES["learner"]["healthcheck"]["test"]
+    assert (kind, program) == ("CMD", "daedalus")
+    assert check(arguments) == "status"
+
+
+def test_images_are_targets_of_the_dockerfile() -> None:
+    targets = set(re.findall(r"^FROM run AS (\w+)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE))
+    built = {service["image"]: service["build"]["target"] for service in SERVICES.values() if "build" in service}
+    assert built == {f"daedalus-{target}": target for target in targets}
+    ours = {service["image"] for service in SERVICES.values() if service["image"].startswith("daedalus")}
+    assert ours == set(built)
+
+
+def test_ports_are_opened_to_this_machine_only() -> None:
+    ports = [port for service in SERVICES.values() for port in service.get("ports", [])]
+    assert len(ports) == 4
+    assert all(port.startswith("127.0.0.1:") for port in ports)
+
+
+def test_what_is_mounted_is_there() -> None:
+    mounts = [mount for service in SERVICES.values() for mount in service.get("volumes", []) if mount.startswith("./")]
+    assert len(mounts) == 4
+    assert all((ROOT / mount.split(":")[0]).exists() for mount in mounts)
+
+
+def test_services_name_each_other() -> None:
+    text = (ROOT / "docker-compose.yml").read_text()
+    text += (ROOT / "deploy" / "prometheus" / "prometheus.yml").read_text()
+    text += (ROOT / "deploy" / "grafana" / "provisioning" / "datasources" / "prometheus.yml").read_text()
+    hosts = set(re.findall(r"(?:tcp/|http://|targets: \[\")([a-z]+):\d+", text))
+    assert hosts == {"router", "exporter", "prometheus"}
+    assert hosts <= SERVICES.keys()
+
+
+def test_the_router_is_of_the_version_that_we_speak() -> None:
+    assert f"eclipse-zenoh=={SERVICES['router']['image'].split(':')[1]}\n" in (ROOT / "constraints.txt").read_text()
+
+
+def test_the_router_takes_its_configuration() -> None:
+    configuration = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
+    assert configuration.get_json("mode") == '"router"'
+    assert configuration.get_json("listen/endpoints") == '["tcp/0.0.0.0:7447"]'
+    assert configuration.get_json("transport/link/tx/lease") == "2000"
