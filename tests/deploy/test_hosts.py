@@ -1,0 +1,45 @@
+"""deploy/slurm and deploy/systemd, and the commands in docs/deploy.md."""
+
+import configparser
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+from commands import check
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "deploy" / "slurm" / "daedalus.sbatch"
+UNIT = ROOT / "deploy" / "systemd" / "daedalus@.service"
+
+
+def commands(text: str) -> list[list[str]]:
+    """What is said to `daedalus`, in a script or in a page's code blocks."""
+    lines = (
+        re.sub(r"\s+#.*|\s*&$", "", line) for line in re.findall(r"(?<![`\w./-])daedalus (?=[a-z])([^\n`]*)", text)
+    )
+    return [shlex.split(line) for line in lines]
+
+
+def test_the_slurm_script_runs_commands_that_we_take() -> None:
+    ours = [line for line in SCRIPT.read_text().splitlines() if not line.startswith("#")]
+    text = "\n".join(ours).replace("$(hostname)", "node").replace("$port", "7447")
+    assert [check(words) for words in commands(text)] == ["router", "actor", "learner"]
+
+
+def test_the_slurm_script_is_bash() -> None:
+    subprocess.run(["bash", "-n", str(SCRIPT)], check=True)
+
+
+def test_the_units_examples_are_commands_that_we_take() -> None:
+    arguments = re.findall(r"^# +/etc/daedalus/\S+: +ARGUMENTS=(.*)$", UNIT.read_text(), re.MULTILINE)
+    assert [check(line.split()) for line in arguments] == ["learner", "actor"]
+
+
+def test_the_unit_takes_a_used_up_budget_for_success() -> None:
+    unit = configparser.ConfigParser(interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment]  # names of systemd's, as they are written
+    unit.read_string(UNIT.read_text())
+    assert unit["Service"]["ExecStart"] == "/opt/daedalus/bin/daedalus $ARGUMENTS"
+    assert unit["Service"]["SuccessExitStatus"] == "3"
+    assert unit["Service"]["Restart"] == "on-failure"
