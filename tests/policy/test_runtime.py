@@ -1,6 +1,8 @@
 """The two runtimes hold each other to the same actions; faults of programs and weights are PolicyErrors."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -376,3 +378,12 @@ def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) ->
         array.flags.writeable = False
     runtime.load(weights)
     assert runtime.act(one_policy.observations(2), NO_STATE, None)[0].shape == (2,)
+
+
+def test_onnxruntime_is_kept_from_telling_its_makers() -> None:
+    """Where it may, and cannot write down who we are, it says so."""
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    environment |= {"HOME": "/proc", "XDG_CACHE_HOME": "/proc"}
+    command = [sys.executable, "-c", "import policy.runtime"]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert "elemetry" not in result.stderr
