@@ -7,6 +7,8 @@ ARG BASE=python:3.11-slim
 
 # A virtual environment without pip: only what runs reaches the images.
 FROM ${BASE} AS build
+# What a build leaves behind is found by it: docker image prune --filter label=daedalus=build
+LABEL daedalus=build
 WORKDIR /source
 RUN python3 -m venv --without-pip /opt/daedalus
 COPY constraints.txt .
@@ -22,10 +24,11 @@ ENTRYPOINT ["daedalus"]
 
 
 FROM build AS build-actor
+# What actors play: also envpool, atari, video.
 ARG EXTRAS=box2d,monitoring
 COPY . .
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[${EXTRAS}]" \
-    && find /opt/daedalus -type d -name tests -prune -exec rm -r {} +
+    && find /opt/daedalus -type d '(' -name tests -o -name test ')' -prune -exec rm -r {} +
 
 FROM run AS actor
 COPY --from=build-actor /opt/daedalus /opt/daedalus
@@ -37,7 +40,8 @@ FROM build AS build-learner
 # torch first and by its exact version: a range would pull the CUDA build on some indexes.
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt torch==2.13.0
 COPY . .
-RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,monitoring]"
+RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,monitoring]" \
+    && find /opt/daedalus -type d '(' -name tests -o -name test ')' -prune -exec rm -r {} +
 
 FROM run AS learner
 COPY --from=build-learner /opt/daedalus /opt/daedalus

@@ -2,13 +2,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test check format examples clean
+.PHONY: train test test-compose examples check format clean
 
 train: .venv/ready
 	$(BIN)/daedalus train cartpole
 
 test: check
 	$(BIN)/pytest
+
+# Containers for real, where there is docker: a base image by debootstrap where none can be pulled.
+test-compose: .venv/ready
+	$(BIN)/pytest -v -s -rs tests/compose/scenario.py
 
 check: .venv/ready
 	$(BIN)/ruff check .

@@ -81,6 +81,8 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
         ("actor.evaluate", {"torch", "learner", "launch", "zenoh"}),
         ("learner.__main__", {"torch", "actor", "launch", "gymnasium"}),
         ("launch.train", {"torch", "actor", "gymnasium", "zenoh", "onnxruntime"}),
+        ("launch.router", {"torch", "actor", "gymnasium", "onnxruntime"}),
+        ("launch.exporter", {"torch", "actor", "gymnasium", "onnxruntime", "prometheus_client"}),
         ("protocol.codec", {"torch", "zenoh", "policy"}),
         ("bridge.__main__", {"torch", "actor", "learner", "launch", "numpy", "gymnasium"}),
     ],

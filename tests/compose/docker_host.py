@@ -1,0 +1,117 @@
+"""Docker on the machine of the test: a daemon, and a base image where none can be pulled."""
+
+import contextlib
+import os
+import shutil
+import ssl
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+BASE = "daedalus-test-base"  # what override.yml names
+_PYTHON = "python:3.11-slim"  # what the Dockerfile names
+_STAND_IN = "daedalus-test-debian"
+_STAND_IN_PACKAGES = "python3,python3-venv,python3-pip,ca-certificates"
+_LIMIT = 120.0  # seconds for a daemon to start
+
+
+class UnavailableError(Exception):
+    """The test cannot run here; the message says what is missing."""
+
+
+def run(*command: str | Path, check: bool = True, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Runs a command; its output is in the result, and in the error."""
+    result = subprocess.run(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    if check and result.returncode:
+        raise AssertionError(f"{' '.join(map(str, command))}: status {result.returncode}\n{result.stdout[-4000:]}")
+    return result
+
+
+def compose_command() -> list[str]:
+    """`docker compose`, or the older program of its own. Raises UnavailableError."""
+    if shutil.which("docker") is None:
+        raise UnavailableError("there is no docker on this machine")
+    for command in (["docker", "compose"], ["docker-compose"]):
+        if shutil.which(command[0]) and run(*command, "version", check=False).returncode == 0:
+            return command
+    raise UnavailableError("there is no docker compose on this machine")
+
+
+def _answers() -> bool:
+    return run("docker", "info", check=False).returncode == 0
+
+
+@contextlib.contextmanager
+def daemon() -> Iterator[None]:
+    """A docker daemon: the machine's, or one for the time of the test. Raises UnavailableError."""
+    if _answers():
+        yield
+        return
+    if shutil.which("dockerd") is None or os.geteuid() != 0:
+        raise UnavailableError("no docker daemon answers, and none can be started: that takes dockerd, and root")
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(["dockerd"], stdout=log, stderr=subprocess.STDOUT)
+        try:
+            deadline = time.monotonic() + _LIMIT
+            while not _answers():
+                if process.poll() is not None or time.monotonic() > deadline:
+                    log.seek(0)
+                    raise UnavailableError(f"dockerd does not start: {log.read()[-2000:]}")
+                time.sleep(0.5)
+            yield
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def make_base() -> None:
+    """Tags as BASE what the Dockerfile is to build on, knowing this machine's pip configuration and certificates.
+
+    The configuration belongs to the machine, so it is neither in the Dockerfile nor in an image that is kept.
+    """
+    origin = _PYTHON if run("docker", "pull", _PYTHON, check=False).returncode == 0 else _stand_in()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        steps = [f"FROM {origin}", "COPY pip.conf /etc/pip.conf"]
+        options, wheels = _pip_options()
+        (folder / "pip.conf").write_text("\n".join(["[global]", *options, ""]))
+        for index, directory in enumerate(wheels):
+            shutil.copytree(directory, folder / f"wheels-{index}")
+            steps.append(f"COPY wheels-{index} {directory}")
+        authorities = os.environ.get("SSL_CERT_FILE") or ssl.get_default_verify_paths().cafile
+        if authorities:
+            shutil.copy(authorities, folder / "authorities.crt")
+            steps.append("COPY authorities.crt /etc/ssl/certs/ca-certificates.crt")
+        (folder / "Dockerfile").write_text("\n".join([*steps, ""]))
+        run("docker", "build", "--tag", BASE, folder)
+
+
+def _pip_options() -> tuple[list[str], list[Path]]:
+    """This machine's pip configuration as lines of a file, and the folders of wheels that it names."""
+    told = run(sys.executable, "-m", "pip", "config", "list").stdout.splitlines()
+    settings = dict(line.split("=", 1) for line in told if "=" in line)
+    # `global.cert='...'`; what comes by the environment is `:env:.cert='...'`, and goes before.
+    options = {name.rpartition(".")[2]: value.strip("'") for name, value in sorted(settings.items(), reverse=True)}
+    wheels = [Path(word) for word in options.get("find-links", "").split() if Path(word).is_dir()]
+    return [f"{name} = {value}" for name, value in options.items()], wheels
+
+
+def _stand_in() -> str:
+    """Debian 12 with its Python 3.11, by debootstrap. Raises UnavailableError."""
+    if run("docker", "image", "inspect", _STAND_IN, check=False).returncode == 0:
+        return _STAND_IN
+    if shutil.which("debootstrap") is None or os.geteuid() != 0:
+        raise UnavailableError(f"{_PYTHON} cannot be pulled, nor a stand-in be made: that takes debootstrap, and root")
+    with tempfile.TemporaryDirectory() as folder:
+        run("debootstrap", "--variant=minbase", f"--include={_STAND_IN_PACKAGES}", "bookworm", folder)
+        for unneeded in ("var/cache/apt", "var/lib/apt/lists"):
+            shutil.rmtree(Path(folder) / unneeded)
+        with subprocess.Popen(["tar", "--create", "--directory", folder, "."], stdout=subprocess.PIPE) as archive:
+            subprocess.run(["docker", "import", "-", _STAND_IN], stdin=archive.stdout, capture_output=True, check=True)
+        assert archive.returncode == 0
+    return _STAND_IN
