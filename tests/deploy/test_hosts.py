@@ -43,3 +43,10 @@ def test_the_unit_takes_a_used_up_budget_for_success() -> None:
     assert unit["Service"]["ExecStart"] == "/opt/daedalus/bin/daedalus $ARGUMENTS"
     assert unit["Service"]["SuccessExitStatus"] == "3"
     assert unit["Service"]["Restart"] == "on-failure"
+
+
+def test_the_pages_commands_are_ones_that_we_take() -> None:
+    page = (ROOT / "docs" / "deploy.md").read_text()
+    blocks = "\n".join(re.findall(r"```\n(.*?)```", page, re.DOTALL))
+    asked = [check(words) for words in commands(blocks)]
+    assert {"exporter", "status"} <= set(asked)
