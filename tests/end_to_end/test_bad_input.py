@@ -73,7 +73,7 @@ def test_an_address_in_use_is_told(start: Start, address: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    "command", ["train", "resume", "learner", "actor", "router", "status", "exporter", "evaluate", "plot"]
+    "command", ["train", "resume", "learner", "actor", "router", "status", "exporter", "certs", "evaluate", "plot"]
 )
 def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
     running = start(command, "--help")

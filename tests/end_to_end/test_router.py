@@ -2,9 +2,11 @@
 
 import socket
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
-from processes import Running
+from certificates import make_certificates
+from processes import Running, until
 
 Start = Callable[..., Running]
 
@@ -36,3 +38,33 @@ def test_two_routers_carry_a_run_between_them_in_whatever_order_they_start(
     start("router", "--listen", address)
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
+
+
+def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, address: str, tmp_path: Path) -> None:
+    certificates = make_certificates(tmp_path / "certs")
+    tls = address.replace("tcp/", "tls/")
+    start("router", "--listen", tls, "--tls", certificates / "router").expect("listening")
+    asked = ("exporter", "--connect", tls, "--listen", "127.0.0.1:0", "--tls")
+    start(*asked, certificates / "operator").expect("http://")
+    assert start(*asked, make_certificates(tmp_path / "strange") / "operator").wait() == 1
+    learner = start("learner", "cartpole", "--connect", tls, "--tls", certificates / "learner", "--run-dir", "run")
+    actor = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    asking = ("status", "--connect", tls, "--quiet", "--tls", certificates / "operator")
+    until(lambda: start(*asking).wait() == 0)
+    assert learner.wait() == 0, learner.output
+    assert actor.wait() == 0, actor.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("router", "--listen", "tcp/0.0.0.0:0"), "could take part, unseen and unchecked"),
+        (("router", "--listen", "tls/127.0.0.1:0"), "needs certificates: --tls DIR"),
+        (("router", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
+        (("exporter", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
+    ],
+)
+def test_what_is_not_secure_is_bad_usage(start: Start, arguments: tuple[str, ...], message: str) -> None:
+    refused = start(*arguments)
+    assert refused.wait() == 2
+    refused.expect(message)
