@@ -34,10 +34,9 @@ def test_two_routers_carry_a_run_between_them_in_whatever_order_they_start(
 ) -> None:
     start("router", "--listen", other_address, "--connect", address).expect("listening")
     learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 30000)
-    actor = start("actor", "--connect", address)
+    start("actor", "--connect", address)
     start("router", "--listen", address)
     assert learner.wait() == 3, learner.output
-    assert actor.wait() == 0, actor.output
 
 
 def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, address: str, tmp_path: Path) -> None:
@@ -48,11 +47,10 @@ def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, a
     start(*asked, certificates / "operator").expect("http://")
     assert start(*asked, make_certificates(tmp_path / "strange") / "operator").wait() == 1
     learner = start("learner", "cartpole", "--connect", tls, "--tls", certificates / "learner", "--run-dir", "run")
-    actor = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
     asking = ("status", "--connect", tls, "--quiet", "--tls", certificates / "operator")
     until(lambda: start(*asking).wait() == 0)
     assert learner.wait() == 0, learner.output
-    assert actor.wait() == 0, actor.output
 
 
 @pytest.mark.parametrize(
