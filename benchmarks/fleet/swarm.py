@@ -23,7 +23,7 @@ from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode, encode
 from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
 from protocol.spec import ArraySpace, ChoiceSpace, Spaces
-from protocol.zenoh_transport import connect
+from protocol.zenoh_transport import connect_when_there
 
 SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 ENVIRONMENTS = 16
@@ -55,7 +55,9 @@ class Simulated:
     """One actor, as far as the learner and the router can tell."""
 
     def __init__(self, address: str, name: str) -> None:
-        self._transport = connect([address])
+        transport = connect_when_there([address], threading.Event(), lambda text: None, _WAIT_SECONDS)
+        assert transport is not None  # nobody tells it to stop
+        self._transport = transport
         self._link = LearnerLink(self._transport, lambda text: None)
         self._changed = threading.Condition()
         self._uploader = Uploader(window=1)
