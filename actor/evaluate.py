@@ -71,7 +71,7 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
             filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
     finally:
         progress.end()
-    return {**_result(policy, spec, evaluation), "seed": seed, "actions": _actions(arguments), **filmed}
+    return {**_result(policy, spec, evaluation), "seed": seed, "actions": _actions(policy, arguments), **filmed}
 
 
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
@@ -125,7 +125,9 @@ def _play(
             )
         runtime = OnnxRuntime(policy.program)
         runtime.load(policy.weights)
-        return play_episodes(runtime, environments, episodes, seed, sampled=arguments.sampled, progress=progress)
+        return play_episodes(
+            runtime, environments, episodes, seed, sampled=_actions(policy, arguments) == "sampled", progress=progress
+        )
     finally:
         environments.close()
 
@@ -140,8 +142,8 @@ def _frames_per_second(spec: EnvironmentSpec) -> float:
     return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
 
 
-def _actions(arguments: argparse.Namespace) -> str:
-    return "sampled" if arguments.sampled else "greedy"
+def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
+    return arguments.actions or policy.spec.evaluation.actions
 
 
 def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) -> dict[str, Any]:

@@ -9,13 +9,13 @@ from typing import get_args
 from protocol.spec import Backend
 
 DESCRIPTION = """\
-Plays episodes with the policy of a run and reports their returns: true rewards, greedy actions, episodes that
+Plays episodes with the policy of a run and reports their returns: true rewards, episodes that
 training never saw. Takes the run's best checkpoint if it has one, else its newest; or the one whose folder is named."""
 
 EXAMPLES = """\
 examples:
   daedalus evaluate runs/cartpole-impala-s1-20261121-101500
-  daedalus evaluate RUN_DIR --episodes 1000 --seed 7 --sampled
+  daedalus evaluate RUN_DIR --episodes 1000 --seed 7 --actions sampled
   daedalus evaluate RUN_DIR/checkpoints/0000000143
   daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
   daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
@@ -47,9 +47,9 @@ def parser() -> argparse.ArgumentParser:
         "--seed", type=int, metavar="S", help="of the environments (default: one that training never used)"
     )
     options.add_argument(
-        "--sampled",
-        action="store_true",
-        help="sample the actions, as training does, instead of the most probable",
+        "--actions",
+        choices=("greedy", "sampled"),
+        help="the most probable, or sampled as in training (default: evaluation.actions of the run)",
     )
     options.add_argument(
         "--backend",

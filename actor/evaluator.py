@@ -1,4 +1,4 @@
-"""The evaluator: an actor that plays the learner's newest policy greedily, on a schedule, and reports. Contributes
+"""The evaluator: an actor that plays the learner's newest policy for a score, on a schedule, and reports. Contributes
 nothing to the training data. No threads but the transport's.
 """
 
@@ -49,7 +49,8 @@ class Evaluator:
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes
-        self._say(f"run {welcome.run!r}: {episodes} greedy episodes of {spec.environment.id} every {interval:g} s")
+        actions = spec.evaluation.actions
+        self._say(f"run {welcome.run!r}: {episodes} {actions} episodes of {spec.environment.id} every {interval:g} s")
         environment = spec.environment.as_evaluated()
         environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
         try:
@@ -75,8 +76,9 @@ class Evaluator:
             return False
         runtime = OnnxRuntime(program[1])
         runtime.load(snapshot.weights)
+        how = welcome.spec.evaluation
         evaluation = play_episodes(
-            runtime, environments, welcome.spec.evaluation.episodes, seed, sampled=False, progress=self._continue
+            runtime, environments, how.episodes, seed, sampled=how.actions == "sampled", progress=self._continue
         )
         self._say(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
         self._link.report(

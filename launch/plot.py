@@ -14,7 +14,7 @@ examples:
   daedalus plot runs/cartpole-*-s1-* --output algorithms.png"""
 
 _PANELS = (
-    ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: greedy evaluations)"),
+    ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: evaluations)"),
     ("entropy", "entropy (nats)"),
     ("value_loss", "value loss"),
     ("policy_lag_mean", "policy lag (updates)"),

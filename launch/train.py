@@ -24,7 +24,7 @@ _EVALUATOR = "evaluator"
 
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
-reached or the budget is used up, then plays 100 greedy episodes (evaluation.final_episodes) with the best policy
+reached or the budget is used up, then plays 100 episodes (evaluation.final_episodes) with the best policy
 that was found, or with the last."""
 
 _TRAIN_EXAMPLES = """\
@@ -199,7 +199,7 @@ def _say(news: str | None) -> None:
 
 
 def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: threading.Event) -> bool:
-    """Plays the final greedy episodes in a process of their own; puts their result into summary.json."""
+    """Plays the final episodes in a process of their own; puts their result into summary.json."""
     began = time.monotonic()
     command = [sys.executable, "-P", "-m", "actor.evaluate", str(directory), "--json", "--exit-with-parent"]
     command += ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
@@ -236,7 +236,7 @@ def _report(directory: Path, spec: RunSpec) -> None:
     evaluation = summary["evaluation"]
     print(
         f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
-        f"over {evaluation['episodes']} greedy episodes of the "
+        f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['backend']}'s {evaluation['environment']}"
     )

@@ -172,10 +172,11 @@ class TrainingSpec(Specification):
 
 
 class EvaluationSpec(Specification):
-    """The evaluator that `daedalus train` keeps beside the actors: greedy episodes, which training never sees."""
+    """The evaluator that `daedalus train` keeps beside the actors: episodes that training never sees."""
 
     seconds: Annotated[float, Field(gt=0.0)] | None = None  # from one evaluation's start to the next's; unset: none
     episodes: Annotated[int, Field(ge=1, le=10_000)] = 10
+    actions: Literal["greedy", "sampled"] = "greedy"  # the most probable, or as in training
     final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100  # with the best policy, once training has ended
     final_backend: Backend | None = None  # unset: the one that was trained on
 

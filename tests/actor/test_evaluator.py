@@ -156,6 +156,23 @@ def test_it_asks_plays_greedily_and_reports(learner: ScriptedLearner, evaluator:
     assert report.lengths.tolist() == [3, 3]
 
 
+def test_it_samples_where_the_run_says_so(network: MemoryNetwork) -> None:
+    """The policy nearly always plays 0; greedily it always would."""
+    spec = run_spec()
+    sampling = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"actions": "sampled"})})
+    learner = ScriptedLearner(network, sampling)
+    evaluator = RunningEvaluator(network)
+    seen = set()
+    try:
+        for version in range(8):
+            learner.give(learner.snapshot(version))
+            report = learner.receive_report()
+            seen |= set(((report.returns * 10).round() % 10).tolist())
+    finally:
+        evaluator.end(learner)
+    assert seen - {0.0}
+
+
 def test_it_evaluates_again_with_the_policy_that_it_is_given_then(
     learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:

@@ -182,11 +182,14 @@ def test_names_of_best_checkpoints_can_be_read_back(tmp_path: Path) -> None:
 
 def test_sampled_actions_and_seeds(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
-    one, same, other = (evaluate(run, "--episodes", 5, "--seed", seed, "--sampled") for seed in (3, 3, 4))
+    one, same, other = (evaluate(run, "--episodes", 5, "--seed", seed, "--actions", "sampled") for seed in (3, 3, 4))
     assert one == same
     assert one["actions"] == "sampled"
     assert one["returns"] != other["returns"]
     assert one["returns"] != evaluate(run, "--episodes", 5, "--seed", 3)["returns"]
+    run = save(tmp_path / "sampling", CARTPOLE, 1, evaluation={"actions": "sampled"})
+    assert evaluate(run, "--episodes", 5)["actions"] == "sampled"
+    assert evaluate(run, "--episodes", 5, "--actions", "greedy")["actions"] == "greedy"
 
 
 # ------------------------------------------------------------------------------------------------ where it plays
