@@ -70,6 +70,8 @@ class Reception:
         self._run, self._spec, self._transport = run, spec, transport
         self._counters, self._status, self._epoch = counters, status, learner_epoch
         self._version = start_version  # rollouts of it are on-policy
+        self._published = start_version  # the newest that actors can have
+        self._unpublished = 0  # rollouts that were learned from since
         self._over = False
         self._buffer = _buffer(spec)
         self._intake = Intake(spec, learner_epoch, self.fleet)
@@ -177,6 +179,11 @@ class Reception:
         return taken
 
     @property
+    def published_version(self) -> int:
+        """The policy version that was published last."""
+        return self._published
+
+    @property
     def queue_bytes(self) -> int:
         """How much waits to be judged."""
         return self._requests.bytes
@@ -191,6 +198,18 @@ class Reception:
         self._program_hash = program_hash(model)
         self._desk.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
+    def publish_if_due(self, policy_version: int, weights: dict[str, np.ndarray], rollouts: int) -> None:
+        """Publishes a version that was made of so many rollouts, unless hardly an actor would play it.
+
+        An actor takes one snapshot a rollout. Of a small fleet each update is published; a large one has it in vain
+        before a quarter of it has had its turn, and pays for it: a thousand actors get a thousand copies.
+        """
+        self._unpublished += rollouts
+        with self.lock:
+            live = len(self.fleet.live)
+        if self._spec.synchronous or 4 * self._unpublished >= live:
+            self.publish(policy_version, weights)
+
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Encodes a snapshot once, for those who follow and for those who ask."""
         snapshot = encode(
@@ -202,6 +221,7 @@ class Reception:
             )
         )
         self._desk.offer_snapshot(snapshot)
+        self._published, self._unpublished = policy_version, 0
         self._push(snapshot)
         self._counters.snapshots_published += 1
         self.fleet.pushed_bytes += len(snapshot)
@@ -223,7 +243,7 @@ class Reception:
         if self._over:
             request.reply(encode(Acknowledgement(verdict="finished")))
         elif not self._requests.offer(request):
-            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._version)))
+            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published)))
             with self.lock:
                 actor = self.fleet.actors.get(keys.last_chunk(request.key))
                 if actor is not None:
@@ -291,7 +311,7 @@ class Reception:
                     self._store(verdict, len(request.payload))
                 else:
                     self._counters.rollouts_rejected[verdict.cause] += 1
-                answer = acknowledgement(verdict, self._version)
+                answer = acknowledgement(verdict, self._published)
             request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
 
     def _store(self, rollout: Rollout, size: int) -> None:

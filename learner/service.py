@@ -156,7 +156,7 @@ class LearnerService:
             return
         skipped = learner.updates_skipped
         learner.step(rollouts, progress)
-        self._reception.publish(learner.policy_version, learner.weights())
+        self._reception.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
         self._health.updated = self._health.attended = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
@@ -178,6 +178,8 @@ class LearnerService:
                 request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
                 continue
             version, env_steps = learner.policy_version, self._counters.env_steps
+            if version != self._reception.published_version:
+                self._reception.publish(version, learner.weights())
             self._evaluations.begin(message.evaluator, directory, version, env_steps)
             request.reply(self._reception.newest_snapshot())
 

@@ -138,7 +138,7 @@ class Acknowledgement:
 
     verdict: Literal["accepted", "busy", "rejected", "fenced", "quarantined", "finished"]
     reason: str = ""
-    policy_version: int = 0  # the newest
+    policy_version: int = 0  # the newest that was published
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

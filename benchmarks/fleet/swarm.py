@@ -15,12 +15,13 @@ import time
 from collections import Counter
 from dataclasses import replace
 
+import msgpack
 import numpy as np
 
 from actor.learner_link import LearnerLink
 from actor.uploader import Uploader
 from protocol import keys
-from protocol.codec import Limits, ProtocolError, decode, encode
+from protocol.codec import Limits, decode, encode
 from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
 from protocol.spec import ArraySpace, ChoiceSpace, Spaces
 from protocol.zenoh_transport import connect_when_there
@@ -93,13 +94,12 @@ class Simulated:
 
     def _on_news(self) -> None:
         data = self._inbox.take()
-        try:
-            news = None if data is None else decode(data, _LIMITS)
-        except ProtocolError:
-            return
-        if isinstance(news, Snapshot):
-            self.came.append((news.policy_version, time.monotonic()))
-            self._version = news.policy_version
+        if data is not None:
+            now = time.monotonic()
+            # Only its header is looked at: a thousand actors share these cores, which would each have their own.
+            content = msgpack.unpackb(data[12 : 12 + int.from_bytes(data[8:12], "little")])
+            self._version = content["fields"].get("policy_version", self._version)
+            self.came.append((self._version, now))
 
     def play(self, rate: float, until: float) -> None:
         """Sends, on a thread of its own."""

@@ -308,3 +308,61 @@ def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
         assert reception.fleet.actors["a"].busy == 2
     finally:
         reception.close("the test is over")
+
+
+# ------------------------------------------------------------------------------------- how often it publishes
+
+
+def with_fleet(network: MemoryNetwork, reception: Reception, count: int) -> MemoryTransport:
+    """So many actors that take part."""
+    actors = MemoryTransport(network)
+    for number in range(count):
+        join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+        actors.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        actors.announce(keys.presence("r", f"a{number}", 1))
+    return actors
+
+
+@pytest.mark.parametrize(
+    ("count", "published"),
+    [(1, [1, 2, 3, 4, 5, 6]), (4, [1, 2, 3, 4, 5, 6]), (8, [2, 4, 6]), (12, [3, 6]), (40, [])],
+)
+def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
+    network: MemoryNetwork, reception: Reception, count: int, published: list[int]
+) -> None:
+    actors = with_fleet(network, reception, count)
+    news: list[int] = []
+    inbox = actors.follow(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
+    for version in range(1, 7):
+        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    assert news == published
+    assert reception.published_version == (published or [0])[-1]
+
+
+def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> None:
+    reception = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
+    try:
+        with_fleet(network, reception, 40)
+        for version in (1, 2):
+            reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            assert reception.published_version == version
+    finally:
+        reception.close("the test is over")
+
+
+def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, reception: Reception) -> None:
+    """Of one that is not published an actor would ask for in vain."""
+    offer_policy(reception)
+    actors = with_fleet(network, reception, 40)
+    reception.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    rollout = make_rollout(identity("a0", 0), version=0)
+    (answer,) = actors.ask(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
+    acknowledgement = decode(answer, Limits())
+    assert isinstance(acknowledgement, Acknowledgement)
+    assert (acknowledgement.verdict, acknowledgement.policy_version) == ("accepted", 3)
+
+
+def version_of(data: bytes | None) -> int:
+    assert data is not None
+    message = decode(data, Limits())
+    return message.policy_version if isinstance(message, Snapshot) else -1
