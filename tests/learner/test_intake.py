@@ -302,6 +302,7 @@ def test_an_incarnation_that_never_joined_is_fenced(desk: Desk, incarnation: int
 
 
 def test_a_superseded_incarnation_is_fenced(desk: Desk) -> None:
+    desk.fleet.set_present("a", 1, False)
     desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = desk.receive(encode(good()))
     assert isinstance(verdict, Rejected)
@@ -375,6 +376,7 @@ def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(desk: Desk) -
     desk.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     assert verdicts(desk, encode(good(who=identity(sequence=5)))) == ["quarantined"]
     desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    desk.fleet.set_present("a", 2, True)
     assert desk.fleet.live == {"a", "b"}
     assert verdicts(desk, encode(good(who=identity(incarnation=2)))) == ["accepted"]
 
