@@ -5,9 +5,10 @@
 
 CORPUS is a folder that grows with every input that reaches something new; it begins with the golden messages of
 tests/protocol. What follows is libFuzzer's. What is read by nobody but us is read too: a rollout that decodes is held
-against a run's specification, as the learner's intake does.
+against a run's specification, as the learner's intake does; compact weights are unfolded, as an actor does.
 """
 
+import contextlib
 import importlib
 import shutil
 import sys
@@ -20,7 +21,8 @@ with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
     from learner.fleet import Fleet
     from learner.intake import Intake
     from protocol.codec import Limits, ProtocolError, decode
-    from protocol.messages import Join
+    from protocol.compact import bits_of
+    from protocol.messages import CompactSnapshot, Join
     from protocol.spec import ArraySpace, ChoiceSpace, RunSpec, Spaces
 
 _GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
@@ -46,9 +48,12 @@ _INTAKE = _intake()
 def one_input(data: bytes) -> None:
     """What libFuzzer calls."""
     try:
-        decode(data, _LIMITS)
+        message = decode(data, _LIMITS)
     except ProtocolError:
         return
+    if isinstance(message, CompactSnapshot):
+        with contextlib.suppress(ValueError):
+            bits_of(message.weights, None)
     _INTAKE.judge("wing-1", _INTAKE.read("wing-1", data), 81, 0.0)
 
 
@@ -58,7 +63,7 @@ if __name__ == "__main__":
         raise SystemExit(__doc__)
     Path(corpus[0]).mkdir(parents=True, exist_ok=True)
     newest = max(_GOLDEN.iterdir(), key=lambda folder: int(folder.name[1:]))
-    for message in newest.iterdir():
+    for message in newest.glob("*.bin"):
         shutil.copy(message, Path(corpus[0]) / message.name)
     atheris.Setup(sys.argv, one_input)
     atheris.Fuzz()

@@ -203,7 +203,7 @@ def fuzz(count: int) -> list[tuple[str, str]]:
 def _mutate(count: int, seed: int) -> tuple[Counter[str], float]:
     golden = Path(__file__).parents[2] / "tests" / "protocol" / "golden"
     newest = max(golden.iterdir(), key=lambda folder: int(folder.name[1:]))
-    messages = [path.read_bytes() for path in sorted(newest.iterdir())]
+    messages = [path.read_bytes() for path in sorted(newest.glob("*.bin"))]
     choose, outcomes, limits = random.Random(seed), Counter[str](), Limits(max_bytes=1 << 20)
     settled = 0.0
     for number in range(count):
