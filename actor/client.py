@@ -28,7 +28,7 @@ from actor.client_player import ClientPlayer
 from actor.learner_link import ActorError
 from actor.service import ActorConfig, ActorService, LinkChoice
 from protocol import keys
-from protocol.security_options import credentials_to_connect
+from protocol.command_line import credentials_to_connect
 from protocol.zenoh_transport import connect_when_there
 
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+from protocol.command_line import command_parser
 from protocol.spec import Backend
 
 DESCRIPTION = """\
@@ -29,12 +30,7 @@ _WIDTHS = range(16, 4097)
 
 def parser() -> argparse.ArgumentParser:
     """Parses what `daedalus evaluate` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus evaluate",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    options = command_parser("evaluate", DESCRIPTION, EXAMPLES)
     options.add_argument(
         "directory", type=Path, nargs="?", metavar="RUN_DIR", help="a run directory, or one of its checkpoints"
     )

@@ -8,8 +8,8 @@ import socket
 
 from actor.service import ActorConfig
 from protocol import keys
+from protocol.command_line import add_connect, add_tls, command_parser
 from protocol.credentials import Credentials
-from protocol.security_options import add_tls
 
 DESCRIPTION = """\
 Plays environments for a learner and streams what happens to it. Needs one address; the environment, the
@@ -25,19 +25,8 @@ examples:
 
 def parser() -> argparse.ArgumentParser:
     """Parses what `daedalus actor` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus actor",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options.add_argument(
-        "--connect",
-        required=True,
-        action="append",
-        metavar="tcp/HOST:PORT",
-        help="where the learner, or a router that knows it, listens",
-    )
+    options = command_parser("actor", DESCRIPTION, EXAMPLES)
+    add_connect(options, "where the learner, or a router that knows it, listens")
     options.add_argument(
         "--envs",
         type=int,

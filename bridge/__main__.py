@@ -1,18 +1,19 @@
 """`python -m bridge`: listens for clients in other languages. Exit status: 0 told to stop, 1 failed, 2 bad usage."""
 
-import argparse
 import socket
 import sys
 
 from bridge.service import Bridge
 from protocol.addresses import AddressError, check_listening
-from protocol.process import stop_on_signals
-from protocol.security_options import (
+from protocol.command_line import (
     SECURITY_ERRORS,
+    add_connect,
     add_insecure,
     add_tls,
+    command_parser,
     credentials_to_connect,
 )
+from protocol.process import stop_on_signals
 from protocol.zenoh_transport import connect
 
 LISTEN = "tcp/127.0.0.1:7448"
@@ -30,19 +31,8 @@ examples:
 
 def main() -> int:
     """Runs `daedalus bridge`."""
-    options = argparse.ArgumentParser(
-        prog="daedalus bridge",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options.add_argument(
-        "--connect",
-        required=True,
-        action="append",
-        metavar="tcp/HOST:PORT",
-        help="where the learner, or a router that knows it, listens",
-    )
+    options = command_parser("bridge", DESCRIPTION, EXAMPLES)
+    add_connect(options, "where the learner, or a router that knows it, listens")
     options.add_argument(
         "--listen", default=LISTEN, metavar="tcp/HOST:PORT", help="where clients connect (default: %(default)s)"
     )

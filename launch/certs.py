@@ -1,6 +1,5 @@
 """`daedalus certs`: a private CA, and certificates for routers, learners, actors and operators."""
 
-import argparse
 import datetime
 import json
 import os
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from protocol import keys
 from protocol.access import access_control, common_name
+from protocol.command_line import command_parser
 from protocol.credentials import CA, CERTIFICATE, KEY, NAMES, CredentialsError, read_names
 
 _CA_DAYS, _DAYS = 3650, 825
@@ -37,12 +37,7 @@ for the status. Learners and routers read whom they let in when they start: rest
 
 def certs(arguments: list[str]) -> int:
     """Runs `daedalus certs`."""
-    options = argparse.ArgumentParser(
-        prog="daedalus certs",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    options = command_parser("certs", _DESCRIPTION, _EXAMPLES)
     verbs = options.add_subparsers(dest="verb", required=True, metavar="VERB")
     init = verbs.add_parser("init", help="a new CA, and certificates for the learner, a router and one operator")
     init.add_argument("directory", type=Path, metavar="DIR")

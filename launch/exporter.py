@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from launch.status import ask
 from protocol.codec import ProtocolError
+from protocol.command_line import SECURITY_ERRORS, add_connect, add_tls, command_parser, credentials_to_connect
 from protocol.credentials import Credentials
 from protocol.process import stop_on_signals
-from protocol.security_options import SECURITY_ERRORS, add_tls, credentials_to_connect
 from protocol.transport import Transport, TransportError
 from protocol.zenoh_transport import connect_when_there
 
@@ -35,19 +35,8 @@ exit status: 0 it was told to stop, 1 it cannot listen there or is not let in, 2
 
 def parser() -> argparse.ArgumentParser:
     """Parses what `daedalus exporter` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus exporter",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options.add_argument(
-        "--connect",
-        required=True,
-        action="append",
-        metavar="tcp/HOST:PORT",
-        help="where the learner, or its router, listens",
-    )
+    options = command_parser("exporter", _DESCRIPTION, _EXAMPLES)
+    add_connect(options, "where the learner, or its router, listens")
     options.add_argument(
         "--listen",
         default=_LISTEN,

@@ -5,9 +5,9 @@ import sys
 
 from learner.options import LISTEN
 from protocol.addresses import check_connecting
+from protocol.command_line import SECURITY_ERRORS, add_insecure, add_tls, command_parser, credentials_to_listen
 from protocol.credentials import CredentialsError
 from protocol.process import stop_on_signals
-from protocol.security_options import SECURITY_ERRORS, add_insecure, add_tls, credentials_to_listen
 from protocol.transport import TransportError
 from protocol.zenoh_transport import listen
 
@@ -28,12 +28,7 @@ exit status: 0 it was told to stop, 1 it cannot listen there, 2 bad usage"""
 
 def parser() -> argparse.ArgumentParser:
     """Parses what `daedalus router` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus router",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    options = command_parser("router", _DESCRIPTION, _EXAMPLES)
     options.add_argument(
         "--listen",
         default=LISTEN,

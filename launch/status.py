@@ -5,8 +5,8 @@ import sys
 
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode
+from protocol.command_line import SECURITY_ERRORS, add_connect, add_tls, command_parser, credentials_to_connect
 from protocol.messages import StatusReport
-from protocol.security_options import SECURITY_ERRORS, add_tls, credentials_to_connect
 from protocol.spec import ActorStatus, RunStatus
 from protocol.transport import Transport, TransportError
 from protocol.zenoh_transport import connect
@@ -30,19 +30,8 @@ exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the prob
 
 def parser() -> argparse.ArgumentParser:
     """Parses what `daedalus status` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus status",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    options.add_argument(
-        "--connect",
-        required=True,
-        action="append",
-        metavar="tcp/HOST:PORT",
-        help="where the learner, or its router, listens",
-    )
+    options = command_parser("status", _DESCRIPTION, _EXAMPLES)
+    add_connect(options, "where the learner, or its router, listens")
     options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="only this run")
     how = options.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print each as one JSON object a line")

@@ -15,8 +15,8 @@ from launch.supervisor import FailedError, Supervised, start, stop, supervised_a
 from learner import run_directory
 from learner.options import add_settings, resolve
 from learner.settings import SettingsError
+from protocol.command_line import SECURITY_ERRORS, add_insecure, add_tls, command_parser, credentials_to_listen
 from protocol.process import process_started, stop_on_signals
-from protocol.security_options import SECURITY_ERRORS, add_insecure, add_tls, credentials_to_listen
 from protocol.spec import RunSpec
 
 _POLL_SECONDS = 0.05
@@ -51,7 +51,7 @@ examples:
 def train(arguments: list[str]) -> int:
     """Runs `daedalus train`."""
     started = process_started()
-    options = _parser("daedalus train", _TRAIN, _TRAIN_EXAMPLES)
+    options = command_parser("train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
     _add_where(options)
     parsed = options.parse_args(arguments)
@@ -68,7 +68,7 @@ def train(arguments: list[str]) -> int:
 def resume(arguments: list[str]) -> int:
     """Runs `daedalus resume`."""
     started = process_started()
-    options = _parser("daedalus resume", _RESUME, _RESUME_EXAMPLES)
+    options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
     options.add_argument("directory", type=Path, metavar="RUN_DIR", help="the run to continue")
     options.add_argument("--env-steps", type=int, metavar="N", help="a new budget (default: the one it had)")
     _add_where(options)
@@ -83,15 +83,6 @@ def resume(arguments: list[str]) -> int:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
     return _run(parsed.directory, spec, parsed, started, resume=True)
-
-
-def _parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
-    return argparse.ArgumentParser(
-        prog=name,
-        description=description,
-        epilog=examples,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
 
 
 def _add_where(options: argparse.ArgumentParser) -> None:

@@ -17,9 +17,9 @@ from learner.service import LearnerService, Outcome
 from learner.settings import SettingsError
 from policy.saved_policy import checkpoints
 from policy.sealed import DamagedError
+from protocol.command_line import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from protocol.credentials import CredentialsError
 from protocol.process import exit_with_parent, stop_on_signals
-from protocol.security_options import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from protocol.spec import RunSpec
 from protocol.transport import TransportError
 from protocol.zenoh_transport import connect_when_there, listen

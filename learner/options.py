@@ -5,7 +5,7 @@ from pathlib import Path
 
 from learner import run_directory
 from learner.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
-from protocol.security_options import add_insecure, add_tls
+from protocol.command_line import add_insecure, add_tls, command_parser
 from protocol.spec import RunSpec
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -98,12 +98,7 @@ def resolve_again(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
 
 def learner_parser() -> argparse.ArgumentParser:
     """Parses what `daedalus learner` takes."""
-    options = argparse.ArgumentParser(
-        prog="daedalus learner",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    options = command_parser("learner", DESCRIPTION, EXAMPLES)
     add_settings(options)
     where = options.add_mutually_exclusive_group()
     where.add_argument(

@@ -1,4 +1,4 @@
-"""The part of a command line that says who may be talked to: the same words for every command."""
+"""What the command lines of all commands share: how help reads, and the words for who may be talked to."""
 
 import argparse
 from pathlib import Path
@@ -7,6 +7,21 @@ from protocol.addresses import AddressError, check_connecting, check_listening
 from protocol.credentials import Credentials, CredentialsError, load
 
 SECURITY_ERRORS = (AddressError, CredentialsError)
+
+
+def command_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """Parses `daedalus NAME`; its help ends with examples, laid out as they are."""
+    return argparse.ArgumentParser(
+        prog=f"daedalus {name}",
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_connect(options: argparse._ActionsContainer, help: str) -> None:
+    """Adds --connect, which must be given and may be several times."""
+    options.add_argument("--connect", required=True, action="append", metavar="tcp/HOST:PORT", help=help)
 
 
 def add_tls(options: argparse._ActionsContainer) -> None:
