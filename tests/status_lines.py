@@ -1,0 +1,24 @@
+"""What a learner's status tells, line by line: `python tests/status_lines.py tcp/HOST:PORT` until it is killed.
+
+An empty line each time that no learner answers.
+"""
+
+import sys
+import threading
+
+from protocol import keys
+from protocol.codec import Limits, decode
+from protocol.messages import StatusReport
+from protocol.transport import TransportError
+from protocol.zenoh_transport import connect_when_there
+
+if __name__ == "__main__":
+    never = threading.Event()
+    transport = connect_when_there([sys.argv[1]], never, lambda text: None)
+    assert transport is not None
+    while not never.wait(0.2):
+        try:
+            reports = [decode(answer, Limits()) for answer in transport.ask(keys.status("*"), timeout=2.0)]
+        except TransportError:
+            reports = []
+        print(*(report.status.model_dump_json() for report in reports if isinstance(report, StatusReport)), flush=True)
