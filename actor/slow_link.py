@@ -1,9 +1,10 @@
 """Fetches snapshots over a link that does not carry every one whole: compact ones, part by part, as often as it bears.
 
-State and requests, no threads and no waiting: answers arrive on the transport's threads and are looked at by `take`.
+State and requests, no threads and no waiting: answers arrive on the transport's threads, which ask for the next parts
+at once. Were that left to `take`, each round trip would last as long as a rollout is played.
 """
 
-import queue
+import threading
 import time
 from collections.abc import Callable
 
@@ -28,13 +29,14 @@ class SlowLink:
         self._transport, self._on_news = transport, on_news
         self._key, self._actor = keys.snapshots(run), actor
         self._held: tuple[int, Bits] | None = None
-        self._answers: queue.SimpleQueue[tuple[int, bytes | None]] = queue.SimpleQueue()  # with the fetch they are of
+        self._lock = threading.Lock()  # guards all below
         self._fetch = 0  # numbers them: late answers to one that was given up count for nothing
         self._parts: dict[int, bytes] = {}  # that have come, of the fetch under way
         self._count = 0  # of its parts; 0 before it is known
         self._asked = 0
         self._version: int | None = None
         self._busy = False
+        self._brought: bytes | Message | None = None  # by the last fetch: a whole CompactSnapshot, or what came instead
         self._began = self._next_at = 0.0
 
     def want(self) -> None:
@@ -42,58 +44,70 @@ class SlowLink:
 
         It rests for as long as the last fetch took: rollouts and their answers want to pass too.
         """
-        if self._busy or time.monotonic() < self._next_at:
-            return
-        self._fetch += 1
-        self._busy, self._parts, self._count, self._version, self._asked = True, {}, 0, None, 1
-        self._began = time.monotonic()
-        self._ask(0)
+        with self._lock:
+            if self._busy or self._brought is not None or time.monotonic() < self._next_at:
+                return
+            self._fetch += 1
+            self._busy, self._parts, self._count, self._version, self._asked = True, {}, 0, None, 1
+            self._began = time.monotonic()
+        self._ask(self._fetch, 0, None)
 
     def take(self) -> Message | None:
         """A Snapshot, once all its parts have come; or what a learner says instead of a part; or nothing yet."""
-        while not self._answers.empty():
-            fetch, data = self._answers.get()
-            if fetch != self._fetch or not self._busy:
-                continue
-            try:
-                message = None if data is None else decode(data, _PART_LIMITS)
-            except ProtocolError:
-                message = None
-            if not isinstance(message, SnapshotPart):
-                self._end(_RETRY_SECONDS)
-                return message
-            self._store(message)
-        if not self._count or len(self._parts) < self._count:
-            return None
-        snapshot = self._assembled(b"".join(self._parts[part] for part in range(self._count)))
-        self._end(time.monotonic() - self._began if snapshot is not None else _RETRY_SECONDS)
+        with self._lock:
+            brought, self._brought = self._brought, None
+        if not isinstance(brought, bytes):
+            return brought
+        snapshot = self._assembled(brought)
+        if snapshot is None:
+            with self._lock:
+                self._next_at = time.monotonic() + _RETRY_SECONDS
         return snapshot
 
-    def _ask(self, part: int) -> None:
+    def _ask(self, fetch: int, part: int, version: int | None) -> None:
         held = None if self._held is None else self._held[0]
-        request = SnapshotRequest(actor=self._actor, held_version=held, policy_version=self._version, part=part)
-        fetch = self._fetch
-
-        def on_answer(answer: bytes | None) -> None:
-            self._answers.put((fetch, answer))
-            self._on_news()
-
+        request = SnapshotRequest(actor=self._actor, held_version=held, policy_version=version, part=part)
         try:
-            self._transport.send(self._key, encode(request), timeout=_ANSWER_SECONDS, on_answer=on_answer)
+            self._transport.send(
+                self._key,
+                encode(request),
+                timeout=_ANSWER_SECONDS,
+                on_answer=lambda answer: self._on_answer(fetch, answer),
+            )
         except TransportError:
-            on_answer(None)
+            self._on_answer(fetch, None)
 
-    def _store(self, message: SnapshotPart) -> None:
-        """Keeps a part, and asks for the next ones."""
+    def _on_answer(self, fetch: int, data: bytes | None) -> None:
+        with self._lock:
+            parts, version = self._due_after(fetch, data), self._version
+        for part in parts:
+            self._ask(fetch, part, version)
+        self._on_news()
+
+    def _due_after(self, fetch: int, data: bytes | None) -> range:
+        """Keeps what an answer brought; the parts to ask for now."""
+        none = range(0)
+        if fetch != self._fetch or not self._busy:
+            return none
+        try:
+            message = None if data is None else decode(data, _PART_LIMITS)
+        except ProtocolError:
+            message = None
+        if not isinstance(message, SnapshotPart):
+            self._end(message, rest=_RETRY_SECONDS)
+            return none
         if not self._count:
             self._count, self._version = message.parts, message.policy_version
         if (message.parts, message.policy_version) != (self._count, self._version) or self._count > _MOST_PARTS:
-            self._end(_RETRY_SECONDS)
-            return
+            self._end(None, rest=_RETRY_SECONDS)
+            return none
         self._parts[message.part] = message.data.tobytes()
-        while self._asked < min(self._count, len(self._parts) + _AT_ONCE):
-            self._ask(self._asked)
-            self._asked += 1
+        if len(self._parts) == self._count:
+            whole = b"".join(self._parts[part] for part in range(self._count))
+            self._end(whole, rest=time.monotonic() - self._began)
+            return none
+        first, self._asked = self._asked, min(self._count, len(self._parts) + _AT_ONCE)
+        return range(first, self._asked)
 
     def _assembled(self, encoded: bytes) -> Snapshot | None:
         """The snapshot that all the parts make; None if they make none."""
@@ -118,6 +132,6 @@ class SlowLink:
             weights=float32(bits),
         )
 
-    def _end(self, rest: float) -> None:
-        self._busy, self._count, self._parts = False, 0, {}
+    def _end(self, brought: bytes | Message | None, *, rest: float) -> None:
+        self._busy, self._count, self._parts, self._brought = False, 0, {}, brought
         self._next_at = time.monotonic() + rest

@@ -32,8 +32,8 @@ class Learner:
     def weights(self) -> dict[str, np.ndarray]:
         return {name: array * np.float32(1 + 1e-3 * self.version) for name, array in FIRST.items()}
 
-    def answer(self, count: int | None = None) -> list[SnapshotRequest]:
-        """Answers what was asked, and what is asked then."""
+    def answer(self, count: int | None = None, *, taking: bool = True) -> list[SnapshotRequest]:
+        """Answers what was asked, and what is asked then; an actor that plays meanwhile takes nothing."""
         asked = []
         while not self.requests.empty() and (count is None or len(asked) < count):
             request = self.requests.get()
@@ -43,7 +43,8 @@ class Learner:
             newest = Snapshot(learner_epoch=5, policy_version=self.version, program="p", weights=self.weights)
             request.reply(self.desk.answer(message, encode(newest)))
             del request
-            self.link.take_into(self.taken)
+            if taking:
+                self.link.take_into(self.taken)
         return asked
 
     link: "Link"
@@ -97,6 +98,17 @@ def test_a_few_parts_are_asked_for_at_once_and_no_more(ends: tuple[Learner, Link
     for _ in range(3):
         learner.answer(1)
         assert learner.requests.qsize() == slow_link._AT_ONCE
+
+
+def test_a_fetch_goes_on_while_the_actor_plays(ends: tuple[Learner, Link]) -> None:
+    learner, link = ends
+    link.want()
+    assert len(learner.answer(taking=False)) > slow_link._AT_ONCE
+    rested(link)
+    link.want()  # not before this one was taken: the next is a difference to it
+    assert learner.requests.empty()
+    assert isinstance(link.take(), Snapshot)
+    assert link.take() is None
 
 
 def test_the_link_rests_for_as_long_as_it_worked(ends: tuple[Learner, Link], monkeypatch: pytest.MonkeyPatch) -> None:

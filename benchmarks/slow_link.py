@@ -1,0 +1,220 @@
+"""Pong with one actor far away: what training loses over a slow link, and what compact snapshots buy there.
+
+    python -m benchmarks.slow_link --minutes 1
+
+1 Mbit/s up, 4 Mbit/s down, 100 ms each way, beside loopback: one after the other, each with a learner and an actor of
+its own. Over the slow link twice: as an actor does it that has measured its link, and as one that is told that the link
+is fast and has every snapshot pushed to it whole.
+"""
+
+import argparse
+import contextlib
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from actor.player import EnvironmentPlayer
+from actor.service import ActorConfig, ActorService, LinkChoice
+from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
+from benchmarks.running import machine, table
+from learner.settings import read_preset, run_spec
+from protocol import keys
+from protocol.codec import Limits, decode, encode
+from protocol.messages import Snapshot, SnapshotPart, SnapshotRequest
+from protocol.process import stop_on_signals
+from protocol.spec import RunStatus
+from protocol.transport import Transport
+from protocol.zenoh_transport import connect
+
+UP, DOWN, DELAY = 125e3, 500e3, 0.1  # bytes a second each way, and seconds
+_SETTINGS = ("environment.backend=ale", "collection.actors=1", "service.log_seconds=1")
+_CASES: dict[str, tuple[bool, LinkChoice]] = {
+    "loopback": (False, "auto"),
+    "slow link": (True, "auto"),
+    "slow link, --link lan": (True, "lan"),
+}
+
+_PLAYS = "plays with"
+_UPDATES = run_spec(read_preset("pong")).training.updates_per_batch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """One case's figures, of the time after its warm-up."""
+
+    env_steps: float  # a second
+    accepted: int
+    rejected: int
+    up: float  # bytes an hour, as the status tells them
+    down: float
+    carried_up: float  # bytes an hour, as the link carried them; 0 where there was none
+    carried_down: float
+    lag: float  # updates
+    versions: float  # that the actor played with, a minute
+    published: float  # a minute
+
+
+class TellingPlayer(EnvironmentPlayer):
+    """Says with which weights it plays."""
+
+    def load(self, snapshot: Snapshot) -> None:
+        """See Player."""
+        super().load(snapshot)
+        print(f"{_PLAYS} {snapshot.policy_version}", flush=True)
+
+
+def play(address: str, link: LinkChoice) -> int:
+    """The actor's process."""
+    transport, stop = connect([address]), stop_on_signals()
+    config = ActorConfig(name="far", incarnation=time.monotonic_ns(), link=link)
+    try:
+        ActorService(config, transport, stop, lambda text: print(text, flush=True), TellingPlayer()).run()
+    finally:
+        transport.close()
+    return 0
+
+
+@contextlib.contextmanager
+def link_to(here: Scene, slow: bool) -> Iterator[tuple[str, dict[str, int]]]:
+    """Where the actor connects to, and what the link carries meanwhile."""
+    if not slow:
+        yield here.address, {"up": 0, "down": 0}
+        return
+    from faults import SlowProxy  # the tests' own: benchmarks.chaos has them found
+
+    proxy = SlowProxy(here.address, up=UP, down=DOWN, delay=DELAY)
+    try:
+        yield proxy.address, proxy.carried
+    finally:
+        proxy.close()
+
+
+def measure(slow: bool, link: LinkChoice, warm_up: float, duration: float) -> tuple[Measured, list[tuple[str, str]]]:
+    """One case; and the sizes of snapshots, which the link has no part in, where it is loopback."""
+    with scene() as here:
+        settings = [word for setting in _SETTINGS for word in ("--set", setting)]
+        here.start("learner", "pong", "--listen", here.address, "--run-dir", "run", *settings, *ENDLESS)
+        here.wait("the learner", here.status)
+        with link_to(here, slow) as (address, carried):
+            actor = here.run([sys.executable, "-m", "benchmarks.slow_link", "--play", address, "--link", link])
+            here.wait_for_training("far")
+            time.sleep(warm_up)
+            first, carried_before, lines = _status(here), dict(carried), len(actor.lines)
+            began, told = time.monotonic(), []
+            while time.monotonic() < began + duration:
+                time.sleep(1.0)
+                told.append(_status(here))
+            seconds, played = time.monotonic() - began, actor.lines[lines:]
+            hourly = {way: 3600 * (carried[way] - carried_before[way]) / seconds for way in carried}
+            sizes = [] if slow else _sizes(here)  # while there is somebody to learn from
+        say("\n".join(f"  actor: {line}" for line in actor.lines if not line.startswith(_PLAYS)))
+    before, after = first.actors[0], told[-1].actors[0]
+    rejected = sum(after.rollouts_rejected.values()) - sum(before.rollouts_rejected.values())
+    return Measured(
+        env_steps=(after.env_steps - before.env_steps) / seconds,
+        accepted=after.rollouts_accepted - before.rollouts_accepted,
+        rejected=rejected,
+        up=statistics.fmean(status.actors[0].bytes_up_per_hour for status in told),
+        down=statistics.fmean(status.actors[0].bytes_down_per_hour for status in told),
+        carried_up=hourly["up"],
+        carried_down=hourly["down"],
+        lag=statistics.fmean(status.policy_lag_mean for status in told),
+        versions=60 * sum(line.startswith(_PLAYS) for line in played) / seconds,
+        published=60 * (told[-1].updates - first.updates) / _UPDATES / seconds,
+    ), sizes
+
+
+def _status(here: Scene) -> RunStatus:
+    while (status := here.status()) is None or not status.actors:
+        time.sleep(0.05)
+    return status
+
+
+def _sizes(here: Scene) -> list[tuple[str, str]]:
+    """Bytes of the newest snapshot, whole and compact, and of the differences to it of later ones."""
+    transport = connect([here.address])
+    try:
+        (answer,) = transport.ask(keys.snapshots("run"), timeout=30.0)
+        snapshot = decode(answer, Limits(max_bytes=len(answer)))
+        assert isinstance(snapshot, Snapshot)
+        held, compact = _fetched(transport, None)
+        rows = [
+            (f"float32, {sum(array.size for array in snapshot.weights.values()):,} weights", f"{len(answer):,}"),
+            ("bfloat16", f"{compact:,}"),
+        ]
+        for batches in (1, 4):
+            version, size = _fetched(transport, held)
+            while version < held + batches * _UPDATES:
+                version, size = _fetched(transport, held)
+            rows.append((f"differences over {version - held} updates", f"{size:,}"))
+    finally:
+        transport.close()
+    return rows
+
+
+def _fetched(transport: Transport, held: int | None) -> tuple[int, int]:
+    """The newest version and its bytes, as for an actor that holds another."""
+    size, part, version = 0, 0, None
+    while True:
+        request = SnapshotRequest(actor="sizes", held_version=held, policy_version=version, part=part)
+        (answer,) = transport.ask(keys.snapshots("run"), encode(request), timeout=30.0)
+        message = decode(answer, Limits())
+        assert isinstance(message, SnapshotPart)
+        size, part, version = size + message.data.size, part + 1, message.policy_version
+        if part == message.parts:
+            return version, size
+
+
+def _column(found: Measured, alone: Measured) -> tuple[str, ...]:
+    def megabytes(told: float, carried: float) -> str:
+        return f"{told / 1e6:,.0f}" + (f" ({carried / 1e6:,.0f})" if carried else "")
+
+    return (
+        f"{found.env_steps:,.0f} ({found.env_steps / alone.env_steps:.0%})",
+        f"{found.accepted:,}",
+        f"{found.rejected:,}",
+        f"{found.lag:.0f} ({found.lag / _UPDATES:.1f})",
+        f"{found.versions:.0f} of {found.published:.0f}",
+        megabytes(found.up, found.carried_up),
+        megabytes(found.down, found.carried_down),
+    )
+
+
+_ROWS = (
+    "env_steps/s (of loopback's)",
+    "rollouts accepted",
+    "rejected, as stale",
+    "policy lag, updates (batches)",
+    "policy versions a minute that the actor played with, of those published",
+    "MB an hour up, as `status` has it (as the link carried it)",
+    "MB an hour down",
+)
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--minutes", type=float, default=1.0, help="of each case (default: %(default)g)")
+    options.add_argument("--warm-up", type=float, default=20.0, metavar="SECONDS", help="before (default: %(default)g)")
+    options.add_argument("--play", metavar="ADDRESS", help=argparse.SUPPRESS)
+    options.add_argument("--link", choices=("auto", "lan"), default="auto", help=argparse.SUPPRESS)
+    parsed = options.parse_args()
+    if parsed.play:
+        return play(parsed.play, parsed.link)
+    found, sizes = {}, []
+    for name, (slow, link) in _CASES.items():
+        say(f"--- {name}")
+        found[name], more = measure(slow, link, parsed.warm_up, 60 * parsed.minutes)
+        sizes += more
+        say(f"  {found[name]}")
+    columns = [_column(each, found["loopback"]) for each in found.values()]
+    print(f"{machine()}; {parsed.minutes:g} minutes each\n")
+    print(table(("", *found), list(zip(_ROWS, *columns, strict=True))))
+    print()
+    print(table(("snapshot", "bytes"), sizes))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
