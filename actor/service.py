@@ -30,7 +30,7 @@ _FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be jus
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
 _SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # an answer took longer than this and so many bytes a second
-_SLOW_LINK_WINDOW = 4  # rollouts under way at least, where an answer takes long
+_SLOW_LINK_WINDOW = 4  # rollouts under way at most, where an answer takes long, unless the run asks for more
 
 LinkChoice = Literal["auto", "lan", "wan"]
 
@@ -125,7 +125,7 @@ class ActorService:
                 self._uploader = Uploader(window=welcome.spec.collection.window)
                 self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         if self._config.link == "wan" and not welcome.spec.synchronous:
-            self._spare_the_link()
+            self._feed.spare_the_link()
         self._say(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
         self._play(confirmed, spaces)
 
@@ -154,8 +154,12 @@ class ActorService:
                 sequence=self._sequence,
                 learner_epoch=welcome.learner_epoch,
             )
+            began = time.monotonic()
             payload = encode(player.collect(identity, self._wait, self._newest_snapshot))
             with self._changed:
+                if self._feed.spares_the_link:
+                    window = welcome.spec.collection.window
+                    self._uploader.fit_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
                 self._uploader.add(self._sequence, payload)
             self._send_due()
             self._sequence += 1
@@ -196,11 +200,7 @@ class ActorService:
             seconds = time.monotonic() - began
         if seconds > allowed:
             self._say(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
-            self._spare_the_link()
-
-    def _spare_the_link(self) -> None:
-        self._feed.spare_the_link()
-        self._uploader.window = max(self._uploader.window, _SLOW_LINK_WINDOW)
+            self._feed.spare_the_link()
 
     # --------------------------------------------------------------------------------------- snapshots
 

@@ -37,6 +37,11 @@ class SnapshotFeed:
         self._inboxes.clear()
         self._slow = SlowLink(self._transport, self._run, self._actor, self._on_news)
 
+    @property
+    def spares_the_link(self) -> bool:
+        """Whether snapshots are fetched."""
+        return self._slow is not None
+
     def read(self) -> None:
         """Takes in what has come. Raises OverError after a farewell, LearnerLostError if another learner speaks."""
         if self._slow is not None:

@@ -3,6 +3,7 @@
 The service owns the lock that guards it: answers arrive on the transport's threads.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -18,6 +19,7 @@ class _InFlight:
     payload: bytes
     attempts: int = 0
     send_at: float | None = 0.0  # None while an answer is awaited
+    sent_at: float = 0.0
 
 
 @dataclass(slots=True)
@@ -28,6 +30,7 @@ class Uploader:
     in_flight: dict[int, _InFlight] = field(default_factory=dict)
     verdicts: Counter[str] = field(default_factory=Counter)
     newest_version: int = 0  # that any answer told of
+    fastest_answer: float = math.inf  # seconds: what the link alone takes, the others waited at the learner as well
     must_replace: bool = False  # the last answer was a rejection: collect another in its place
     over: str = ""  # "fenced", "quarantined" or "finished" once the learner said so
     reason: str = ""  # that it gave
@@ -36,6 +39,11 @@ class Uploader:
     def has_room(self) -> bool:
         """Whether one more may be played, and then sent."""
         return len(self.in_flight) < self.window
+
+    def fit_window(self, play_seconds: float, least: int, most: int) -> None:
+        """Has as many under way as are played while the link works: more would only grow old at the learner."""
+        needed = self.fastest_answer / max(play_seconds, 1e-9)
+        self.window = most if needed > most - 1 else max(least, 1 + math.ceil(needed))
 
     def add(self, sequence: int, payload: bytes) -> None:
         """Takes in a rollout; it is due at once."""
@@ -52,7 +60,7 @@ class Uploader:
         ready = []
         for sequence, rollout in self.in_flight.items():
             if rollout.send_at is not None and rollout.send_at <= now:
-                rollout.send_at = None
+                rollout.send_at, rollout.sent_at = None, now
                 ready.append((sequence, rollout.payload))
         return ready
 
@@ -72,6 +80,7 @@ class Uploader:
         if answer is not None:
             self.newest_version = max(self.newest_version, answer.policy_version)
             self.verdicts[answer.verdict] += 1
+            self.fastest_answer = min(self.fastest_answer, now - rollout.sent_at)
         if answer is None or answer.verdict == "busy":
             first = _LOST_SECONDS if answer is None else _BUSY_SECONDS
             rollout.send_at = now + min(first * 2**rollout.attempts, _MAX_WAIT_SECONDS)

@@ -6,9 +6,7 @@ An empty line each time that no learner answers.
 import sys
 import threading
 
-from protocol import keys
-from protocol.codec import Limits, decode
-from protocol.messages import StatusReport
+from launch.status import ask
 from protocol.transport import TransportError
 from protocol.zenoh_transport import connect_when_there
 
@@ -18,7 +16,7 @@ if __name__ == "__main__":
     assert transport is not None
     while not never.wait(0.2):
         try:
-            reports = [decode(answer, Limits()) for answer in transport.ask(keys.status("*"), timeout=2.0)]
+            statuses = ask(transport)
         except TransportError:
-            reports = []
-        print(*(report.status.model_dump_json() for report in reports if isinstance(report, StatusReport)), flush=True)
+            statuses = []
+        print(*(status.model_dump_json() for status in statuses), flush=True)

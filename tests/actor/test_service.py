@@ -11,13 +11,25 @@ from processes import LIMIT, until
 
 from actor import learner_link, service
 from actor.learner_link import ActorError
-from actor.service import ActorConfig, ActorService
+from actor.service import ActorConfig, ActorService, LinkChoice
+from learner.compact_desk import CompactDesk
 from policy.network import ActorCritic
 from policy.program import export_program
 from policy.runtime import program_hash
 from protocol import keys
 from protocol.codec import Limits, decode, encode
-from protocol.messages import Acknowledgement, Farewell, Join, Message, Program, Refusal, Rollout, Snapshot, Welcome
+from protocol.messages import (
+    Acknowledgement,
+    Farewell,
+    Join,
+    Message,
+    Program,
+    Refusal,
+    Rollout,
+    Snapshot,
+    SnapshotRequest,
+    Welcome,
+)
 from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
 from protocol.transport import MemoryNetwork, MemoryTransport, Request, TransportError
 
@@ -55,7 +67,7 @@ class ScriptedLearner:
         self.refusal: Refusal | None = None
         self.transport.announce(keys.learner("r"))
         self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
-        self.transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot))
+        self.transport.serve(keys.snapshots("r"), self._newest)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.serve(keys.join("r"), self._join)
 
@@ -65,6 +77,14 @@ class ScriptedLearner:
         self.joins.put(message)
         answer: Message = Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)
         request.reply(encode(self.refusal or answer))
+
+    def _newest(self, request: Request) -> None:
+        if not request.size:
+            request.reply(self.snapshot)
+            return
+        message = decode(request.payload, Limits())
+        assert isinstance(message, SnapshotRequest)
+        request.reply(CompactDesk(self.epoch).answer(message, self.snapshot))
 
     def _program(self, request: Request) -> None:
         model = self.policy.model
@@ -91,12 +111,12 @@ def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
 
 
 class RunningActor:
-    def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
+    def __init__(self, network: MemoryNetwork, timeout: float | None = None, link: LinkChoice = "auto") -> None:
         self.stop = threading.Event()
         self.said: list[str] = []
         self.error: Exception | None = None
         self.transport = MemoryTransport(network)
-        config = ActorConfig(name="a", incarnation=7, timeout=timeout)
+        config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
         self._service = ActorService(config, self.transport, self.stop, self.said.append)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -145,6 +165,17 @@ def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNe
     assert learner.rollouts.empty()  # two are unanswered: no third, however long this test thinks
     acknowledge(first[1], "accepted")
     assert learner.receive()[0].identity.sequence == 2
+
+
+def test_over_a_slow_link_more_are_under_way_before_the_first_answer(network: MemoryNetwork) -> None:
+    actor = RunningActor(network, link="wan")
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    received = [learner.receive()[0] for _ in range(service._SLOW_LINK_WINDOW)]
+    assert [rollout.policy_version for rollout in received] == [3] * len(received)
+    assert learner.rollouts.empty()
+    actor.stop.set()
+    actor.join()
 
 
 def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:

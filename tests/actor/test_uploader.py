@@ -1,5 +1,9 @@
 """Which rollouts are sent when, and what each answer changes."""
 
+import math
+
+import pytest
+
 from actor.uploader import Uploader
 from protocol.messages import Acknowledgement
 
@@ -82,3 +86,29 @@ def test_a_quarantine_is_kept_with_its_reason() -> None:
     uploader.add(0, b"a")
     uploader.answered(0, Acknowledgement(verdict="quarantined", reason="why"), 0.0)
     assert (uploader.over, uploader.reason, uploader.in_flight) == ("quarantined", "why", {})
+
+
+def test_as_many_are_under_way_as_are_played_while_the_fastest_answer_comes() -> None:
+    uploader = Uploader(window=1)
+    uploader.fit_window(1.0, 1, 4)
+    assert uploader.window == 4  # no answer yet: it may take long
+    for sequence, seconds in enumerate((9.0, 0.4, 5.0)):
+        uploader.add(sequence, b"")
+        uploader.due(now=100.0)
+        uploader.answered(sequence, answer("accepted"), 100.0 + seconds)
+    assert uploader.fastest_answer == pytest.approx(0.4)
+    windows = []
+    for play_seconds in (10.0, 0.3, 0.15, 0.1, 0.0):
+        uploader.fit_window(play_seconds, 1, 4)
+        windows.append(uploader.window)
+    assert windows == [2, 3, 4, 4, 4]
+    uploader.fit_window(10.0, 3, 4)
+    assert uploader.window == 3
+
+
+def test_no_answer_tells_nothing_of_the_link() -> None:
+    uploader = Uploader(window=1)
+    uploader.add(0, b"")
+    uploader.due(now=100.0)
+    uploader.answered(0, None, 100.1)
+    assert uploader.fastest_answer == math.inf

@@ -123,7 +123,7 @@ def test_actors_whose_address_is_cut_are_missed_and_come_back(network: Network) 
 def test_all_find_each_other_again_when_the_host_of_their_router_was_cut_off(network: Network) -> None:
     middle, central = network.host("router"), network.host("learner")
     players = [network.host(name) for name in ("arm", "box", "car")]
-    router = middle.run(sys.executable, TESTS / "router_process.py", address_of(middle))
+    router = middle.start("router", "--listen", address_of(middle), "--insecure")
     learner = Watched(central, "--connect", address_of(middle), ask=address_of(middle))
     actors = [play(host, address_of(middle)) for host in players]
     learner.trains_on("arm", "box", "car")
