@@ -1,6 +1,6 @@
 """Pong with one actor far away: what training loses over a slow link, and what compact snapshots buy there.
 
-    python -m benchmarks.slow_link --minutes 1
+    python -m benchmarks.slow_link --rounds 2
 
 1 Mbit/s up, 4 Mbit/s down, 100 ms each way, beside loopback: one after the other, each with a learner and an actor of
 its own. Over the slow link twice: as an actor does it that has measured its link, and as one that is told that the link
@@ -13,7 +13,7 @@ import statistics
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from actor.player import EnvironmentPlayer
 from actor.service import ActorConfig, ActorService, LinkChoice
@@ -29,7 +29,8 @@ from protocol.transport import Transport
 from protocol.zenoh_transport import connect
 
 UP, DOWN, DELAY = 125e3, 500e3, 0.1  # bytes a second each way, and seconds
-_SETTINGS = ("environment.backend=ale", "collection.actors=1", "service.log_seconds=1")
+# The preset's window of 1 is for loopback only: nothing is played there while the learner takes a rollout in.
+_SETTINGS = ("environment.backend=ale", "collection.actors=1", "collection.window=2", "service.log_seconds=1")
 _CASES: dict[str, tuple[bool, LinkChoice]] = {
     "loopback": (False, "auto"),
     "slow link": (True, "auto"),
@@ -45,8 +46,8 @@ class Measured:
     """One case's figures, of the time after its warm-up."""
 
     env_steps: float  # a second
-    accepted: int
-    rejected: int
+    accepted: float
+    rejected: float
     up: float  # bytes an hour, as the status tells them
     down: float
     carried_up: float  # bytes an hour, as the link carried them; 0 where there was none
@@ -167,14 +168,19 @@ def _fetched(transport: Transport, held: int | None) -> tuple[int, int]:
             return version, size
 
 
+def _mean(rounds: list[Measured]) -> Measured:
+    names = [field.name for field in fields(Measured)]
+    return Measured(**{name: statistics.fmean(getattr(each, name) for each in rounds) for name in names})
+
+
 def _column(found: Measured, alone: Measured) -> tuple[str, ...]:
     def megabytes(told: float, carried: float) -> str:
         return f"{told / 1e6:,.0f}" + (f" ({carried / 1e6:,.0f})" if carried else "")
 
     return (
         f"{found.env_steps:,.0f} ({found.env_steps / alone.env_steps:.0%})",
-        f"{found.accepted:,}",
-        f"{found.rejected:,}",
+        f"{found.accepted:,.0f}",
+        f"{found.rejected:,.0f}",
         f"{found.lag:.0f} ({found.lag / _UPDATES:.1f})",
         f"{found.versions:.0f} of {found.published:.0f}",
         megabytes(found.up, found.carried_up),
@@ -195,6 +201,7 @@ _ROWS = (
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--rounds", type=int, default=1, help="of all cases in turn (default: %(default)s)")
     options.add_argument("--minutes", type=float, default=1.0, help="of each case (default: %(default)g)")
     options.add_argument("--warm-up", type=float, default=20.0, metavar="SECONDS", help="before (default: %(default)g)")
     options.add_argument("--play", metavar="ADDRESS", help=argparse.SUPPRESS)
@@ -202,15 +209,19 @@ def main() -> int:
     parsed = options.parse_args()
     if parsed.play:
         return play(parsed.play, parsed.link)
-    found, sizes = {}, []
-    for name, (slow, link) in _CASES.items():
-        say(f"--- {name}")
-        found[name], more = measure(slow, link, parsed.warm_up, 60 * parsed.minutes)
-        sizes += more
-        say(f"  {found[name]}")
-    columns = [_column(each, found["loopback"]) for each in found.values()]
-    print(f"{machine()}; {parsed.minutes:g} minutes each\n")
-    print(table(("", *found), list(zip(_ROWS, *columns, strict=True))))
+    found: dict[str, list[Measured]] = {name: [] for name in _CASES}
+    sizes = []
+    for _ in range(parsed.rounds):
+        for name, (slow, link) in _CASES.items():
+            say(f"--- {name}")
+            figures, more = measure(slow, link, parsed.warm_up, 60 * parsed.minutes)
+            found[name].append(figures)
+            sizes = more or sizes
+            say(f"  {figures}")
+    means = {name: _mean(rounds) for name, rounds in found.items()}
+    columns = [_column(each, means["loopback"]) for each in means.values()]
+    print(f"{machine()}; means of {parsed.rounds} x {parsed.minutes:g} minutes\n")
+    print(table(("", *means), list(zip(_ROWS, *columns, strict=True))))
     print()
     print(table(("snapshot", "bytes"), sizes))
     return 0
