@@ -71,7 +71,7 @@ class Network:
     def __init__(self, directory: Path) -> None:
         """Processes run in `directory`. Raises NoHostsError where this machine makes no hosts."""
         self._directory = directory
-        self._mark = f"daedalus-{secrets.token_hex(4)}"
+        self.mark = f"daedalus-{secrets.token_hex(4)}"  # the names of its namespaces begin with it
         self._spaces: list[str] = []
         self._running: list[Running] = []
         self._addresses = 0
@@ -144,7 +144,7 @@ class Network:
         self.command(far, "ip", "link", "set", far_device, "up")
 
     def _named(self, space: str) -> str:
-        return f"{self._mark}-{space}"
+        return f"{self.mark}-{space}"
 
 
 def _run(*words: str) -> None:
