@@ -139,6 +139,7 @@ class ActorService:
     def _play(self, welcome: Welcome, spaces: Spaces) -> None:
         player = self._player
         player.begin(self._runtime(welcome, spaces), welcome.spec, welcome.seed)
+        self._feed.follow()  # not before the link was measured: what is pushed meanwhile would clog a slow one
         snapshot = self._await_snapshot(newer_than=-1)
         loaded = -1
         while True:
@@ -181,6 +182,7 @@ class ActorService:
             program = self._link.program(welcome.run)
             if program is not None:
                 break
+            self._feed.follow()  # nothing is pushed yet: the first snapshot tells that the program is there too
             heard_at = self._heard_at
             self._wait(lambda heard_at=heard_at: self._heard_at > heard_at, pause)
             self._feed.read()

@@ -24,11 +24,14 @@ class SnapshotFeed:
         self.newest: Snapshot | None = None  # of this learner epoch
 
     def attend(self, welcome: Welcome) -> None:
-        """Begins anew with a learner, and follows what it pushes."""
+        """Begins anew with a learner."""
         self._run, self._learner_epoch, self.newest = welcome.run, welcome.learner_epoch, None
         self._slow = None
-        if welcome.run not in self._inboxes:
-            self._inboxes[welcome.run] = self._transport.follow(keys.snapshots(welcome.run), self._on_news)
+
+    def follow(self) -> None:
+        """Has every snapshot pushed from now on, unless the link is spared."""
+        if self._slow is None and self._run not in self._inboxes:
+            self._inboxes[self._run] = self._transport.follow(keys.snapshots(self._run), self._on_news)
 
     def spare_the_link(self) -> None:
         """From now on nothing is pushed: compact snapshots are fetched."""
@@ -47,7 +50,8 @@ class SnapshotFeed:
         if self._slow is not None:
             news = self._slow.take()
         else:
-            data = self._inboxes[self._run].take()
+            inbox = self._inboxes.get(self._run)
+            data = None if inbox is None else inbox.take()
             news = None if data is None else self._link.decode(data)
         if news is not None:
             self._take(news)

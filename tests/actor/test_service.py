@@ -178,6 +178,22 @@ def test_over_a_slow_link_more_are_under_way_before_the_first_answer(network: Me
     actor.join()
 
 
+def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    followed: list[object] = []
+    monkeypatch.setattr(MemoryTransport, "follow", lambda *arguments: followed.append(arguments))
+    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    actor = RunningActor(network)
+    assert learner.receive()[0].policy_version == 3
+    assert any("a slow link" in text for text in actor.said)
+    assert followed == []
+    actor.stop.set()
+    actor.join()
+
+
 def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(3)
