@@ -179,8 +179,8 @@ def _column(found: Measured, alone: Measured) -> tuple[str, ...]:
 
     return (
         f"{found.env_steps:,.0f} ({found.env_steps / alone.env_steps:.0%})",
-        f"{found.accepted:,.0f}",
-        f"{found.rejected:,.0f}",
+        f"{found.accepted:,g}",
+        f"{found.rejected:,g}",
         f"{found.lag:.0f} ({found.lag / _UPDATES:.1f})",
         f"{found.versions:.0f} of {found.published:.0f}",
         megabytes(found.up, found.carried_up),
