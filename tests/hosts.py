@@ -55,10 +55,6 @@ class Host:
             bucket = ("tbf", "rate", rate, "burst", "4kb", "latency", "400ms")
             self._network.command(place, "tc", "qdisc", "add", "dev", device, "root", *bucket)
 
-    def also_at(self) -> str:
-        """One more address that it is reached at."""
-        return self._network.address(self.name)
-
     def reaches(self, address: str) -> bool:
         """Whether it has a way to an address at all."""
         words = self._network.words(self.name, "ip", "route", "get", address)
@@ -74,7 +70,7 @@ class Network:
         self.mark = f"daedalus-{secrets.token_hex(4)}"  # the names of its namespaces begin with it
         self._spaces: list[str] = []
         self._running: list[Running] = []
-        self._addresses = 0
+        self._hosts = 0
         if shutil.which("ip") is None or shutil.which("tc") is None:
             raise NoHostsError("there are no ip and tc here: install iproute2")
         try:
@@ -90,7 +86,10 @@ class Network:
         self._space(name)
         self._cable(name, "eth0", _SWITCH, name)
         self.command(_SWITCH, "ip", "link", "set", name, "master", "bridge")
-        return Host(self, name, self.address(name))
+        self._hosts += 1
+        address = f"10.77.0.{self._hosts}"
+        self.command(name, "ip", "address", "add", f"{address}/24", "dev", "eth0")
+        return Host(self, name, address)
 
     def host_behind_nat(self, name: str) -> Host:
         """One that reaches all others by a gateway, which hides it: nobody has a way to it."""
@@ -104,13 +103,6 @@ class Network:
         masquerade = ("iptables", "-t", "nat", "-A", "POSTROUTING", "-o", "eth0", "-j", "MASQUERADE")
         self.command(gateway.name, *masquerade)
         return Host(self, name, "192.168.77.2")
-
-    def address(self, name: str) -> str:
-        """Gives a host on the switch an address that no other has."""
-        self._addresses += 1
-        address = f"10.77.0.{self._addresses}"
-        self.command(name, "ip", "address", "add", f"{address}/24", "dev", "eth0")
-        return address
 
     def run(self, space: str, *command: object) -> Running:
         """Starts a command in a namespace."""
