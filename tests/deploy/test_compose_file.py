@@ -1,6 +1,7 @@
 """docker-compose.yml and the files that it mounts. `make test-compose` runs it."""
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,13 @@ from commands import check
 
 ROOT = Path(__file__).parents[2]
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
+
+
+def test_images_are_built_of_every_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = {package.partition(".")[0] for package in project["tool"]["setuptools"]["packages"]}
+    kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert packages | {"pyproject.toml", "constraints.txt", "README.md"} == kept
 
 
 def test_without_the_profile_it_is_router_learner_and_actors() -> None:
