@@ -27,6 +27,7 @@ from protocol.transport import AddressInUseError, Inbox, RefusedError, Request, 
 _LEASE_MILLISECONDS = 2000  # a peer that is silent for as long is gone
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts to connect at the start
 _PROBE_SECONDS = 2.0  # for a look from outside
+_MOST_SESSIONS = 20_000  # with one router; Zenoh's own default, 1,000, keeps the rest of a fleet out without a word
 _LEAVING_SECONDS = 2.0  # for Zenoh to let go of callbacks when a session is closed
 _RETRY_MILLISECONDS = 100  # how soon a client tries again after its router vanished; doubles up to ten times this
 
@@ -97,6 +98,7 @@ def _open(mode: str, listen_on: list[str], connect_to: list[str], credentials: C
         "scouting/delay": 0,
         "transport/link/tx/lease": _LEASE_MILLISECONDS,
         "transport/shared_memory/enabled": False,
+        "transport/unicast/max_sessions": _MOST_SESSIONS,
         **(credentials.settings(listens=bool(listen_on)) if credentials else {}),
     }
 
