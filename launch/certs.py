@@ -144,6 +144,7 @@ def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
         "listen": {"endpoints": ["tls/0.0.0.0:7447"]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
+            "unicast": {"max_sessions": 20_000},
             "link": {
                 "tx": {"lease": 2000},
                 "tls": {

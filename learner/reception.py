@@ -202,12 +202,14 @@ class Reception:
         """Publishes a version that was made of so many rollouts, unless hardly an actor would play it.
 
         An actor takes one snapshot a rollout. Of a small fleet each update is published; a large one has it in vain
-        before a quarter of it has had its turn, and pays for it: a thousand actors get a thousand copies.
+        before a quarter of it has had its turn, and pays for it: a thousand actors get a thousand copies. What is
+        played must stay well within the policy lag that is learned from, though.
         """
         self._unpublished += rollouts
         with self.lock:
             live = len(self.fleet.live)
-        if self._spec.synchronous or 4 * self._unpublished >= live:
+        ages = 4 * (policy_version - self._published) >= self._spec.training.policy_lag_bound
+        if self._spec.synchronous or ages or 4 * self._unpublished >= live:
             self.publish(policy_version, weights)
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:

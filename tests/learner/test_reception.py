@@ -339,6 +339,17 @@ def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
     assert reception.published_version == (published or [0])[-1]
 
 
+def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
+    network: MemoryNetwork, reception: Reception
+) -> None:
+    with_fleet(network, reception, 400)
+    published = set()
+    for version in range(1, 41):  # of 32 batches at most
+        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        published.add(reception.published_version)
+    assert published == {0, 8, 16, 24, 32, 40}
+
+
 def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> None:
     reception = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
     try:
