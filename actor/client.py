@@ -26,6 +26,7 @@ import gymnasium
 
 from actor.client_player import ClientPlayer
 from actor.learner_link import ActorError
+from actor.options import certificate_hint
 from actor.service import ActorConfig, ActorService, LinkChoice
 from protocol import keys
 from protocol.command_line import credentials_to_connect
@@ -70,6 +71,7 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
+            hint=certificate_hint(credentials),
         )
         self._stop = threading.Event()
         self._player = ClientPlayer(observation_space, action_space)

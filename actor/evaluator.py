@@ -29,7 +29,7 @@ class Evaluator:
         self._config = config
         self._stop = stop
         self._say = say
-        self._link = LearnerLink(transport, say)
+        self._link = LearnerLink(transport, say, config.hint)
 
     def run(self) -> None:
         """Evaluates until stopped or until the run is over.

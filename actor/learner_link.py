@@ -51,9 +51,11 @@ class OverError(Exception):
 class LearnerLink:
     """Questions over a transport, their answers decoded."""
 
-    def __init__(self, transport: Transport, say: Callable[[str], None]) -> None:
+    def __init__(self, transport: Transport, say: Callable[[str], None], hint: str = "") -> None:
+        """`hint`: what else may be the matter, said where no learner answers."""
         self._transport = transport
         self._say = say
+        self._hint = hint
 
     def find(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
         """Asks to join until a learner of `run` (`*`: of any) answers.
@@ -65,7 +67,7 @@ class LearnerLink:
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         taken_until = time.monotonic() + _TAKEN_SECONDS
         while True:
-            wanted = "a learner"
+            wanted = f"a learner{self._hint}"
             try:
                 welcome = self.join(run, join)
             except NameTakenError:
@@ -77,7 +79,7 @@ class LearnerLink:
                 return welcome
             if deadline is not None and time.monotonic() > deadline:
                 raise ActorError(
-                    f"no learner answered within {timeout:g} s: is it running, and is the address its own?"
+                    f"no learner answered within {timeout:g} s: is it running, and is the address its own?{self._hint}"
                 )
             if not told and pause >= _MAX_RETRY_SECONDS:
                 self._say(f"waiting for {wanted}")

@@ -93,7 +93,18 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         runtime=arguments.runtime,
         wrap=arguments.wrap,
         link=arguments.link,
+        hint=certificate_hint(credentials),
         timeout=arguments.timeout,
+    )
+
+
+def certificate_hint(credentials: Credentials | None) -> str:
+    """What an actor with a certificate is told that no learner answers: who is not let in is not told so."""
+    if credentials is None:
+        return ""
+    return (
+        f"; is there one, does it (or its router) know the actor {credentials.name!r}? "
+        "It reads whom it lets in when it starts (daedalus certs issue)"
     )
 
 

@@ -45,6 +45,7 @@ class ActorConfig:
     environments: int | None = None  # unset: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
     wrap: str | None = None  # module:function, applied to each environment
+    hint: str = ""  # what may be the matter where no learner answers
     link: LinkChoice = "auto"  # wan: snapshots are fetched small and as often as it bears; auto: measured
     timeout: float | None = None  # seconds to look for a learner; unset: for ever
 
@@ -65,7 +66,7 @@ class ActorService:
         self._transport = transport
         self._stop = stop
         self._say = say
-        self._link = LearnerLink(transport, say)
+        self._link = LearnerLink(transport, say, config.hint)
         self._changed = threading.Condition()  # guards what the transport's threads touch: the next three
         self._uploader = Uploader(window=1)
         self._learner_left = False

@@ -154,7 +154,7 @@ def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
                     "listen_private_key": str(folder / KEY),
                     "close_link_on_expiration": True,
                 },
-            }
+            },
         },
         "access_control": access_control(**names),
     }

@@ -7,6 +7,8 @@ import pytest
 from certificates import make_certificates
 from processes import Running, until
 
+from launch.certs import certs
+
 Start = Callable[..., Running]
 
 
@@ -25,9 +27,6 @@ def test_a_run_over_tls_is_solved_by_actors_that_it_knows(start: Start, tls: str
     arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
     arm.expect(r"joined run 'run' as 'arm\.\d+'")
     start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("joined run")
-    asking = ("status", "--connect", tls, "--quiet", "--tls")
-    assert start(*asking, certificates / "actor-arm").wait() == 2
-    until(lambda: start(*asking, certificates / "operator").wait() == 0)
     assert learner.wait() == 0, learner.output
     assert arm.wait() == 0, arm.output
 
@@ -39,6 +38,22 @@ def test_train_lets_in_actors_of_other_machines_over_tls(start: Start, tls: str,
     train.expect("return .* actors 1")
     start("actor", "--connect", tls, "--tls", certificates / "actor-arm").expect("joined run")
     train.expect("actors 2")
+    asking = ("status", "--connect", tls, "--quiet", "--tls")
+    assert start(*asking, certificates / "actor-arm").wait() == 2
+    until(lambda: start(*asking, certificates / "operator").wait() == 0)
+
+
+def test_an_actor_that_is_not_on_the_list_is_told_what_may_be_the_matter(
+    start: Start, tls: str, certificates: Path
+) -> None:
+    """Its certificate is good; the learner started before it was issued."""
+    start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run").expect(
+        "actors join with"
+    )
+    assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
+    late = start("actor", "--connect", tls, "--tls", certificates / "actor-late", "--timeout", 3)
+    assert late.wait() == 1
+    late.expect("no learner answered .* does it .or its router. know the actor 'late'.* when it starts")
 
 
 def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certificates: Path, tmp_path: Path) -> None:
