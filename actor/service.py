@@ -30,6 +30,7 @@ _FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be jus
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
 _SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # an answer took longer than this and so many bytes a second
+_IN_VAIN = 20  # rollouts in a row that were rejected: it is worth a word
 _SLOW_LINK_WINDOW = 4  # rollouts under way at most, where an answer takes long, unless the run asks for more
 
 LinkChoice = Literal["auto", "lan", "wan"]
@@ -78,6 +79,7 @@ class ActorService:
         self._run = ""  # the one that it takes part in
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout to this learner epoch
+        self._told_in_vain = False
 
     def run(self) -> None:
         """Plays until stopped or until the learner says that the run is over.
@@ -145,6 +147,7 @@ class ActorService:
         loaded = -1
         while True:
             self._wait(lambda: self._uploader.has_room)  # before playing: what is played now is of the newest policy
+            self._tell_if_in_vain()
             if not welcome.spec.synchronous:
                 snapshot = self._newest_snapshot()
             if snapshot.policy_version != loaded:
@@ -204,6 +207,15 @@ class ActorService:
         if seconds > allowed:
             self._say(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
             self._feed.spare_the_link()
+
+    def _tell_if_in_vain(self) -> None:
+        """Says once that nothing is taken; an actor that sends what is unfit is quarantined long before."""
+        if self._uploader.refused_in_a_row >= _IN_VAIN and not self._told_in_vain:
+            self._told_in_vain = True
+            self._say(
+                f"the learner rejected the last {_IN_VAIN} rollouts ({self._uploader.reason}): the way there is "
+                "too slow for it; start it with a higher --set training.max_policy_lag=..., or this actor nearer to it"
+            )
 
     # --------------------------------------------------------------------------------------- snapshots
 

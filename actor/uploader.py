@@ -32,8 +32,9 @@ class Uploader:
     newest_version: int = 0  # that any answer told of
     fastest_answer: float = math.inf  # seconds: what the link alone takes, the others waited at the learner as well
     must_replace: bool = False  # the last answer was a rejection: collect another in its place
+    refused_in_a_row: int = 0  # of the last answers for good, how many were rejections
     over: str = ""  # "fenced", "quarantined" or "finished" once the learner said so
-    reason: str = ""  # that it gave
+    reason: str = ""  # that its last rejection gave, or its last word
 
     @property
     def has_room(self) -> bool:
@@ -88,5 +89,7 @@ class Uploader:
             return
         del self.in_flight[sequence]
         self.must_replace = answer.verdict == "rejected"
+        self.refused_in_a_row = self.refused_in_a_row + 1 if self.must_replace else 0
+        self.reason = answer.reason
         if answer.verdict in ("fenced", "quarantined", "finished"):
-            self.over, self.reason = answer.verdict, answer.reason
+            self.over = answer.verdict

@@ -388,6 +388,25 @@ def test_in_quarantine_it_ends_with_the_reason(network: MemoryNetwork) -> None:
     assert "takes nothing more of this actor: 3 unfit rollouts in a row" in str(actor.error)
 
 
+def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
+    network: MemoryNetwork, actor: RunningActor
+) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    for count in range(60):
+        _, request = learner.receive()
+        if count < 15:
+            acknowledge(request, "rejected" if count else "accepted")
+        else:
+            request.reply(encode(Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")))
+        if count < 15:
+            assert not any("rejected" in line for line in actor.said)
+    told = [line for line in actor.said if "rejected the last" in line]
+    assert len(told) == 1
+    assert "policy lag 31, at most 30 is allowed" in told[0]
+    assert "max_policy_lag" in told[0]
+
+
 def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to_be_heard(
     network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,3 +112,12 @@ def test_no_answer_tells_nothing_of_the_link() -> None:
     uploader.due(now=100.0)
     uploader.answered(0, None, 100.1)
     assert uploader.fastest_answer == math.inf
+
+
+def test_rejections_in_a_row_are_counted_with_the_last_ones_reason() -> None:
+    uploader = Uploader(window=8)
+    refused = Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")
+    for sequence, last in enumerate((refused, answer("accepted"), refused, answer("busy"), refused)):
+        uploader.add(sequence, b"a")
+        uploader.answered(sequence, last, 0.0)
+    assert (uploader.refused_in_a_row, uploader.reason) == (2, "policy lag 31, at most 30 is allowed")
