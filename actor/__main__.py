@@ -9,9 +9,9 @@ from actor.learner_link import ActorError
 from actor.service import ActorService
 from policy.runtime import PolicyError
 from protocol.command_line import SECURITY_ERRORS, credentials_to_connect
+from protocol.connecting import connect_when_there
 from protocol.process import exit_with_parent, stop_on_signals
 from protocol.transport import TransportError
-from protocol.zenoh_transport import connect_when_there
 
 
 def main() -> int:

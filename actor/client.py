@@ -30,7 +30,7 @@ from actor.options import certificate_hint
 from actor.service import ActorConfig, ActorService, LinkChoice
 from protocol import keys
 from protocol.command_line import credentials_to_connect
-from protocol.zenoh_transport import connect_when_there
+from protocol.connecting import connect_when_there
 
 
 class Client:

@@ -71,7 +71,7 @@ class LearnerLink:
             try:
                 welcome = self.join(run, join)
             except NameTakenError:
-                if time.monotonic() > taken_until:
+                if time.monotonic() > (taken_until if deadline is None else min(taken_until, deadline)):
                     raise
                 welcome = None
                 wanted = "the other actor of this name to leave"

@@ -9,9 +9,10 @@ import sys
 from pathlib import Path
 
 from protocol import keys
-from protocol.access import access_control, common_name
+from protocol.access import common_name
 from protocol.command_line import command_parser
-from protocol.credentials import CA, CERTIFICATE, KEY, NAMES, CredentialsError, read_names
+from protocol.credentials import NAMES, Credentials, CredentialsError, read_names
+from protocol.zenoh_settings import as_file, session_settings
 
 _CA_DAYS, _DAYS = 3650, 825
 _LISTENERS = ("learner", "router")
@@ -139,25 +140,8 @@ def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
     for role in _LISTENERS:
         _replace(directory / role / NAMES, json.dumps(names, indent=2) + "\n")
     folder = (directory / "router").resolve()
-    zenohd = {
-        "mode": "router",
-        "listen": {"endpoints": ["tls/0.0.0.0:7447"]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "unicast": {"max_sessions": 20_000},
-            "link": {
-                "tx": {"lease": 2000},
-                "tls": {
-                    "root_ca_certificate": str(folder / CA),
-                    "enable_mtls": True,
-                    "listen_certificate": str(folder / CERTIFICATE),
-                    "listen_private_key": str(folder / KEY),
-                    "close_link_on_expiration": True,
-                },
-            },
-        },
-        "access_control": access_control(**names),
-    }
+    security = Credentials(folder, "router", "").settings(listens=True)
+    zenohd = as_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security))
     _replace(folder / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
 
 

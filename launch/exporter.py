@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from launch.status import ask
 from protocol.codec import ProtocolError
 from protocol.command_line import SECURITY_ERRORS, add_connect, add_tls, command_parser, credentials_to_connect
+from protocol.connecting import connect_when_there
 from protocol.credentials import Credentials
 from protocol.process import stop_on_signals
 from protocol.transport import Transport, TransportError
-from protocol.zenoh_transport import connect_when_there
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric

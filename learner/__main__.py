@@ -4,6 +4,7 @@ Exit status: 0 the target was reached or the asked-for steps were done, 3 the bu
 1 failed or stopped early, 2 bad usage.
 """
 
+import argparse
 import sys
 import time
 from pathlib import Path
@@ -18,11 +19,12 @@ from learner.settings import SettingsError
 from policy.saved_policy import checkpoints
 from policy.sealed import DamagedError
 from protocol.command_line import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
+from protocol.connecting import connect_when_there
 from protocol.credentials import CredentialsError
 from protocol.process import exit_with_parent, stop_on_signals
 from protocol.spec import RunSpec
 from protocol.transport import TransportError
-from protocol.zenoh_transport import connect_when_there, listen
+from protocol.zenoh_transport import listen
 
 if TYPE_CHECKING:
     from learner.checkpoint import Checkpoint
@@ -39,15 +41,7 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        if arguments.prepared:
-            directory, spec, begun = arguments.prepared, run_directory.read_config(arguments.prepared), True
-        elif arguments.resume:
-            spec, directory, begun = resolve_again(arguments)
-        else:
-            spec, directory = resolve(arguments)
-            begun = False
-        if not begun:
-            run_directory.check_free(directory)
+        spec, directory, begun = _what(arguments)
         addresses = arguments.listen or [LISTEN]
         if arguments.connect:
             credentials = credentials_to_connect(arguments.connect, arguments.tls, "learner")
@@ -92,6 +86,20 @@ def main() -> int:
         return FAILED
     finally:
         transport.close()
+
+
+def _what(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
+    """The run to learn, where it goes, and whether it was begun before. Raises SettingsError."""
+    if arguments.prepared:
+        return run_directory.read_config(arguments.prepared), arguments.prepared, True
+    if arguments.resume:
+        spec, directory, begun = resolve_again(arguments)
+    else:
+        spec, directory = resolve(arguments)
+        begun = False
+    if not begun:
+        run_directory.check_free(directory)
+    return spec, directory, begun
 
 
 def _newest_checkpoint(directory: Path, progress: Progress) -> "Checkpoint | None":

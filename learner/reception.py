@@ -21,21 +21,17 @@ from learner.counters import RunCounters
 from learner.fleet import Fleet
 from learner.front_desk import FrontDesk
 from learner.intake import Intake, Rejected, acknowledgement
+from learner.publisher import Publisher
 from learner.request_queue import RequestQueue
 from learner.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, Taken
-from learner.slow_links import SlowLinks
-from policy.runtime import program_hash
 from protocol import keys
 from protocol.codec import Limits, ProtocolError, decode, encode
 from protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
-    Program,
     Refusal,
     Rollout,
-    Snapshot,
     StatusReport,
 )
 from protocol.spec import RunSpec, RunStatus, Spaces
@@ -70,19 +66,18 @@ class Reception:
         self._run, self._spec, self._transport = run, spec, transport
         self._counters, self._status, self._epoch = counters, status, learner_epoch
         self._version = start_version  # rollouts of it are on-policy
-        self._published = start_version  # the newest that actors can have
-        self._unpublished = 0  # rollouts that were learned from since
         self._over = False
         self._buffer = _buffer(spec)
         self._intake = Intake(spec, learner_epoch, self.fleet)
         self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         self._requests = _queue(spec)
-        self._slow_links = SlowLinks(learner_epoch, self._desk.snapshot, self._on_small_answer)
+        self._publisher = Publisher(
+            run, spec, learner_epoch, start_version, transport, self._desk, self.fleet, self._on_small_answer
+        )
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
         self._ended = threading.Event()
         self._heard_at = time.monotonic()
         self._watching = threading.Thread(target=self._watch_silence, name="watchdog", daemon=True)
-        self._program_hash = ""
         self._evaluations: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
 
     def open(self) -> None:
@@ -94,10 +89,10 @@ class Reception:
                 "or name this one otherwise (the last part of --run-dir)"
             )
         self._judging.start()
-        self._slow_links.open()
+        self._publisher.open()
         transport.watch(keys.presence(run, "*", "*"), self._on_presence)
         self._serve(keys.rollouts(run, "*"), self._on_rollout)
-        self._serve(keys.snapshots(run), self._on_snapshot)
+        self._serve(keys.snapshots(run), self._publisher.answer)
         self._serve(keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key))))
         self._serve(keys.status(run), self._on_status)
         self._serve(keys.evaluations(run, "*"), self._on_evaluation)
@@ -120,11 +115,8 @@ class Reception:
                 return
             self._over = True
             self.lock.notify_all()
-        farewell = encode(Farewell(learner_epoch=self._epoch, reason=reason))
-        self._desk.close(farewell)
-        self._push(farewell)
+        self._publisher.close(reason)
         self._requests.close()
-        self._slow_links.close()
         for request, _ in self.take_evaluations():
             request.reply(encode(Refusal(code="finished", reason=reason)))
         self._ended.set()
@@ -181,7 +173,7 @@ class Reception:
     @property
     def published_version(self) -> int:
         """The policy version that was published last."""
-        return self._published
+        return self._publisher.version
 
     @property
     def queue_bytes(self) -> int:
@@ -195,42 +187,19 @@ class Reception:
     def offer_program(self, model: bytes, state_size: int) -> None:
         """Has the policy program ready for those who ask; rollouts come with `state_size` numbers of memory."""
         self._intake.state_size = state_size
-        self._program_hash = program_hash(model)
-        self._desk.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
+        self._publisher.offer_program(model)
 
     def publish_if_due(self, policy_version: int, weights: dict[str, np.ndarray], rollouts: int) -> None:
-        """Publishes a version that was made of so many rollouts, unless hardly an actor would play it.
-
-        An actor takes one snapshot a rollout. Of a small fleet each update is published; a large one has it in vain
-        before a quarter of it has had its turn, and pays for it: a thousand actors get a thousand copies. What is
-        played must stay well within the policy lag that is learned from, though.
-        """
-        self._unpublished += rollouts
+        """Publishes a version that was made of so many rollouts, unless hardly an actor would play it."""
         with self.lock:
             live = len(self.fleet.live)
-        ages = 4 * (policy_version - self._published) >= self._spec.training.policy_lag_bound
-        if self._spec.synchronous or ages or 4 * self._unpublished >= live:
+        if self._publisher.is_due(policy_version, rollouts, live):
             self.publish(policy_version, weights)
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
-        """Encodes a snapshot once, for those who follow and for those who ask."""
-        snapshot = encode(
-            Snapshot(
-                learner_epoch=self._epoch,
-                policy_version=policy_version,
-                program=self._program_hash,
-                weights=weights,
-            )
-        )
-        self._desk.offer_snapshot(snapshot)
-        self._published, self._unpublished = policy_version, 0
-        self._push(snapshot)
+        """Publishes a snapshot."""
+        self._publisher.publish(policy_version, weights)
         self._counters.snapshots_published += 1
-        self.fleet.pushed_bytes += len(snapshot)
-
-    def _push(self, news: bytes) -> None:
-        with contextlib.suppress(TransportError):  # in a session that is being replaced: who needs it asks for it
-            self._transport.publish(keys.snapshots(self._run), news)
 
     # ----------------------------------------------------------------------------- the transport's threads
 
@@ -245,17 +214,11 @@ class Reception:
         if self._over:
             request.reply(encode(Acknowledgement(verdict="finished")))
         elif not self._requests.offer(request):
-            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published)))
+            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._publisher.version)))
             with self.lock:
                 actor = self.fleet.actors.get(keys.last_chunk(request.key))
                 if actor is not None:
                     actor.busy += 1
-
-    def _on_snapshot(self, request: Request) -> None:
-        if request.size:
-            self._slow_links.offer(request)
-        else:
-            request.reply(self._desk.snapshot())
 
     def _on_evaluation(self, request: Request) -> None:
         sender = keys.last_chunk(request.key)
@@ -268,7 +231,7 @@ class Reception:
             request.reply(encode(Refusal(code="malformed", reason="evaluators ask and report under their own name")))
             return
         with self.lock:
-            refused = self._over or not self._program_hash or len(self._evaluations) >= _WAITING_EVALUATIONS
+            refused = self._over or not self._publisher.program_hash or len(self._evaluations) >= _WAITING_EVALUATIONS
             if not refused:
                 self._evaluations.append((request, message))
         if refused:
@@ -313,7 +276,7 @@ class Reception:
                     self._store(verdict, len(request.payload))
                 else:
                     self._counters.rollouts_rejected[verdict.cause] += 1
-                answer = acknowledgement(verdict, self._published)
+                answer = acknowledgement(verdict, self._publisher.version)
             request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
 
     def _store(self, rollout: Rollout, size: int) -> None:

@@ -11,6 +11,7 @@ from protocol.transport import Request
 
 _REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)
 _WAITING_BYTES, _WAITING = 256 << 10, 4096
+_LEAVING_SECONDS = 0.5  # for an answer under way; its reader may be frozen, and others wait to leave as well
 
 
 class SlowLinks:
@@ -36,7 +37,7 @@ class SlowLinks:
         """Answers what waits, and no more."""
         self._requests.close()
         if self._thread.is_alive():
-            self._thread.join(timeout=4.0)
+            self._thread.join(timeout=_LEAVING_SECONDS)
 
     def _work(self) -> None:
         while (request := self._requests.take()) is not None:

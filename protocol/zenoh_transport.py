@@ -1,7 +1,6 @@
 """The Transport over Zenoh: the only file that imports it.
 
 A session either embeds a full router that listens (the learner, by default) or is a client of one.
-Multicast and gossip are off, endpoints are explicit, nothing is sent over shared memory.
 
 What Zenoh needs to be held to (measured, see docs/results.md):
   - BLOCK is not flow control: a peer that stalls is disconnected with all it had. So rollouts are
@@ -9,27 +8,22 @@ What Zenoh needs to be held to (measured, see docs/results.md):
   - A process that ends with a callback declared and its session open hangs for ever: `close` belongs
     in a `finally`.
   - One that ends while Zenoh's threads still hold callbacks aborts now and then: `close` waits until they do not.
-  - A router waits half a second for peers it could scout before it opens, unless told not to.
 """
 
 import contextlib
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import zenoh
 
 from protocol.credentials import Credentials, why_unreachable
 from protocol.transport import AddressInUseError, Inbox, RefusedError, Request, Transport, TransportError
+from protocol.zenoh_settings import session_settings
 
-_LEASE_MILLISECONDS = 2000  # a peer that is silent for as long is gone
-_FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts to connect at the start
 _PROBE_SECONDS = 2.0  # for a look from outside
-_MOST_SESSIONS = 20_000  # with one router; Zenoh's own default, 1,000, keeps the rest of a fleet out without a word
 _LEAVING_SECONDS = 2.0  # for Zenoh to let go of callbacks when a session is closed
-_RETRY_MILLISECONDS = 100  # how soon a client tries again after its router vanished; doubles up to ten times this
 
 
 def listen(endpoints: list[str], connect: list[str] | None = None, credentials: Credentials | None = None) -> Transport:
@@ -49,58 +43,15 @@ def connect(endpoints: list[str], credentials: Credentials | None = None) -> Tra
     return _open("client", [], endpoints, credentials)
 
 
-def connect_when_there(
-    endpoints: list[str],
-    stop: threading.Event,
-    say: Callable[[str], None],
-    timeout: float | None = None,
-    credentials: Credentials | None = None,
-) -> Transport | None:
-    """Tries to `connect` until something answers, and says once that it waits; None if told to stop first.
-
-    Raises TransportError after `timeout` seconds, RefusedError at once.
-    """
-    deadline = None if timeout is None else time.monotonic() + timeout
-    pause, told = _FIRST_PAUSE_SECONDS, False
-    while True:
-        try:
-            return connect(endpoints, credentials)
-        except RefusedError:
-            raise
-        except TransportError as error:
-            if deadline is not None and time.monotonic() > deadline:
-                raise TransportError(
-                    f"{error} (for {timeout:g} s): is the learner running, and is the address its own?"
-                ) from None
-            if not told and pause >= _MAX_PAUSE_SECONDS / 2:
-                say(f"{error}; waiting for it")
-                told = True
-        if stop.wait(pause):
-            return None
-        pause = min(2 * pause, _MAX_PAUSE_SECONDS)
-
-
-def _open(mode: str, listen_on: list[str], connect_to: list[str], credentials: Credentials | None) -> "ZenohTransport":
+def _open(
+    mode: Literal["router", "client"],
+    listen_on: list[str],
+    connect_to: list[str],
+    credentials: Credentials | None,
+) -> "ZenohTransport":
     config = zenoh.Config()
-    settings = {
-        "mode": mode,
-        "listen/endpoints": listen_on,
-        "connect/endpoints": connect_to,
-        "connect/timeout_ms": 0 if mode == "client" else -1,  # a router that is told of another goes on trying
-        "connect/exit_on_failure": mode == "client",
-        "connect/retry": {
-            "period_init_ms": _RETRY_MILLISECONDS,
-            "period_max_ms": 10 * _RETRY_MILLISECONDS,
-            "period_increase_factor": 2,
-        },
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "transport/link/tx/lease": _LEASE_MILLISECONDS,
-        "transport/shared_memory/enabled": False,
-        "transport/unicast/max_sessions": _MOST_SESSIONS,
-        **(credentials.settings(listens=bool(listen_on)) if credentials else {}),
-    }
+    security = credentials.settings(listens=bool(listen_on)) if credentials else {}
+    settings = session_settings(mode, listen_on, connect_to, security)
 
     def open_session() -> zenoh.Session:
         try:

@@ -7,8 +7,8 @@ import sys
 import threading
 
 from launch.status import ask
+from protocol.connecting import connect_when_there
 from protocol.transport import TransportError
-from protocol.zenoh_transport import connect_when_there
 
 if __name__ == "__main__":
     never = threading.Event()

@@ -8,10 +8,10 @@ from typing import Any, cast
 
 from actor.service import ActorConfig, ActorService
 from protocol.codec import Limits, decode
+from protocol.connecting import connect_when_there
 from protocol.messages import Acknowledgement, Rollout
 from protocol.process import stop_on_signals
 from protocol.transport import Transport
-from protocol.zenoh_transport import connect_when_there
 
 
 class JournalTransport:

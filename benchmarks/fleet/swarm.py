@@ -22,9 +22,9 @@ from actor.learner_link import LearnerLink
 from actor.uploader import Uploader
 from protocol import keys
 from protocol.codec import Limits, decode, encode
+from protocol.connecting import connect_when_there
 from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
 from protocol.spec import ArraySpace, ChoiceSpace, Spaces
-from protocol.zenoh_transport import connect_when_there
 
 SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 ENVIRONMENTS = 16

@@ -4,6 +4,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -59,27 +60,33 @@ def take(player: ClientPlayer, newest: Snapshot) -> Rollout:
     return player.collect(IDENTITY, lambda ready, seconds: ready(), lambda: newest)
 
 
-def drive(player: ClientPlayer, environment: gymnasium.Env, steps: int) -> None:
-    """As a user would: in the environment's own loop. It goes on where the last call ended."""
+@dataclass
+class Robot:
+    """An environment, and what it shows now."""
+
+    environment: gymnasium.Env
+    observation: np.ndarray
+
+
+def drive(player: ClientPlayer, robot: Robot, steps: int) -> None:
+    """As a user would: in a loop of its own. It goes on where the last call ended."""
     for _ in range(steps):
-        observation = environment.observation  # type: ignore[attr-defined]
-        observation, reward, terminated, truncated, _ = environment.step(player.act(observation))
+        observation, reward, terminated, truncated, _ = robot.environment.step(player.act(robot.observation))
         player.reward(float(reward) / 2)
         player.reward(float(reward) / 2)
         if terminated or truncated:
             player.end_episode(observation, terminated=terminated)
-            observation, _ = environment.reset()
-        environment.observation = observation  # type: ignore[attr-defined]
+            observation, _ = robot.environment.reset()
+        robot.observation = observation
 
 
-def begun(played: Played) -> tuple[ClientPlayer, gymnasium.Env]:
+def begun(played: Played) -> tuple[ClientPlayer, Robot]:
     environment = gymnasium.make(played.spec.environment.id).unwrapped
     player = ClientPlayer(environment.observation_space, environment.action_space)
     assert player.prepare(played.spec) == (played.spaces, 1)
     player.begin(played.runtime(), played.spec, 3)
     player.load(played.snapshot(0))
-    environment.observation, _ = environment.reset(seed=1)  # type: ignore[attr-defined]
-    return player, environment
+    return player, Robot(environment, environment.reset(seed=1)[0])
 
 
 @pytest.mark.parametrize(
@@ -157,8 +164,7 @@ def test_mistakes_are_told_and_change_nothing() -> None:
         player.reward(1.0)
     with pytest.raises(ValueError, match="without any action"):
         player.end_episode(None, terminated=True)
-    observation = own.observation  # type: ignore[attr-defined]
-    player.act(observation)
+    player.act(own.observation)
     with pytest.raises(ValueError, match="must be finite"):
         player.reward(float("nan"))
     with pytest.raises(ValueError, match="give its last observation"):

@@ -38,7 +38,7 @@ def test_the_units_examples_are_commands_that_we_take() -> None:
 
 def test_the_unit_takes_a_used_up_budget_for_success() -> None:
     unit = configparser.ConfigParser(interpolation=None)
-    unit.optionxform = str  # type: ignore[assignment]  # names of systemd's, as they are written
+    unit.optionxform = str  # type: ignore[assignment] - so the library says it
     unit.read_string(UNIT.read_text())
     assert unit["Service"]["ExecStart"] == "/opt/daedalus/bin/daedalus $ARGUMENTS"
     assert unit["Service"]["SuccessExitStatus"] == "3"
