@@ -2,13 +2,22 @@
 
     python benchmarks/learner_speed.py
     python benchmarks/learner_speed.py --networks nature article --threads 1 --seconds 10 --profile
+    python benchmarks/learner_speed.py --networks nature --actors 2
 
-The fastest of several updates counts: what else runs on the machine only ever makes one slower.
+The fastest of several updates counts: what else runs on the machine only ever makes one slower. With --actors, as many
+processes that play Pong beside it, at the same priority: then all updates count, against the mean of those alone times
+what is the learner's by right: of C cores, with N actors and T threads, T or C T / (T + N), whichever is less.
 """
 
 import argparse
+import contextlib
+import os
+import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import torch
 from running import machine, table
@@ -59,6 +68,10 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
 
 def fastest(update: Callable[[], None], seconds: float) -> float:
     """Seconds of the fastest update within so many seconds, three at least."""
+    return min(_durations(update, seconds))
+
+
+def _durations(update: Callable[[], None], seconds: float) -> list[float]:
     update()
     durations: list[float] = []
     ends = time.perf_counter() + seconds
@@ -66,7 +79,33 @@ def fastest(update: Callable[[], None], seconds: float) -> float:
         began = time.perf_counter()
         update()
         durations.append(time.perf_counter() - began)
-    return min(durations)
+    return durations
+
+
+@contextlib.contextmanager
+def busy_actors(count: int) -> Iterator[None]:
+    """So many processes play beside it."""
+    command = [sys.executable, str(Path(__file__).parent / "busy_actor.py")]
+    actors: list[subprocess.Popen[bytes]] = []
+    try:
+        for _ in range(count):
+            actors.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        for actor in actors:
+            if actor.stdout is None or actor.stdout.readline() != b"busy\n":
+                raise SystemExit("an actor could not play: see what it said above")
+        yield
+    finally:
+        for actor in actors:
+            actor.communicate()  # ends its standard input
+
+
+def beside(update: Callable[[], None], threads: int, actors: int, seconds: float) -> tuple[float, float]:
+    """Seconds of the mean update beside busy actors; and of what a fair share of the cores would make of it."""
+    alone = statistics.mean(_durations(update, seconds))
+    with busy_actors(actors):
+        shared = statistics.mean(_durations(update, seconds))
+    cores = os.cpu_count() or 1
+    return shared, alone * threads / min(threads, cores * threads / (threads + actors))
 
 
 def profile(update: Callable[[], None]) -> str:
@@ -84,21 +123,29 @@ def main() -> None:
     options.add_argument("--precisions", nargs="+", choices=("float32", "bfloat16"), default=["float32", "bfloat16"])
     options.add_argument("--seconds", type=float, default=3.0, help="for each figure")
     options.add_argument("--profile", action="store_true", help="say where the time goes")
+    options.add_argument("--actors", type=int, default=0, metavar="N", help="measure it beside N busy actors as well")
     parsed = options.parse_args()
     keep_freed_memory()
-    rows = []
+    header = ("network", "rows x environments", "threads", "precision", "samples/s")
+    if parsed.actors:
+        header += (f"beside {parsed.actors} actors", "its fair share", "of that")
+    rows: list[tuple[object, ...]] = []
     for name in parsed.networks:
         policy, space, length, environments = NETWORKS[name]
         for threads in parsed.threads:
             torch.set_num_threads(threads)
             for precision in parsed.precisions:
                 update = updater(policy, space, length, environments, precision == "bfloat16")
-                rate = length * environments / fastest(update, parsed.seconds)
+                samples = length * environments
+                rate = samples / fastest(update, parsed.seconds)
                 rows.append((name, f"{length} x {environments}", threads, precision, f"{rate:,.0f}"))
+                if parsed.actors:
+                    shared, fair = beside(update, threads, parsed.actors, parsed.seconds)
+                    rows[-1] += (f"{samples / shared:,.0f}", f"{samples / fair:,.0f}", f"{fair / shared:.2f}")
                 if parsed.profile:
                     print(rows[-1], profile(update), sep="\n")
     print(machine())
-    print(table(("network", "rows x environments", "threads", "precision", "samples/s"), rows))
+    print(table(header, rows))
 
 
 if __name__ == "__main__":

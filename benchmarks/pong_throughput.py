@@ -1,8 +1,10 @@
-"""Agent steps a second on Pong at full learning: beside stable-baselines3's A2C, and beside what computing alone takes.
+"""Agent steps a second on Pong at full learning: beside its peers, and beside what computing alone takes.
 
     python benchmarks/pong_throughput.py --rounds 3
+    python benchmarks/pong_throughput.py --sample-factory PLACE/bin/python       (peer_appo.py says how to make PLACE)
 
-84 x 84 grey, skip 4, stack 4, Nature CNN, 256 rows an update and one pass over them, for both. The limit is of this
+Peers are stable-baselines3's A2C and, if asked for, Sample Factory's APPO; the ratio is that to the better of them.
+84 x 84 grey, skip 4, stack 4, Nature CNN, 256 rows an update and one pass over them, for all. The limit is of this
 machine's cores, were there nothing to do but step the environments, run the policy and update: each measured alone, on
 one core. All take turns, round by round; ratios are those of each round.
 """
@@ -63,10 +65,9 @@ def ours(backend: str, env_steps: int) -> float:
     return (points[-1][1] - warm[1]) / (points[-1][0] - warm[0])
 
 
-def peer(env_steps: int) -> float:
-    """env_steps/s of stable-baselines3's A2C."""
-    script = os.path.join(os.path.dirname(__file__), "peer_a2c.py")
-    command = [sys.executable, script, "--pong", "--env-steps", str(env_steps)]
+def peer(python: str, script: str, *options: str) -> float:
+    """env_steps/s of another trainer."""
+    command = [python, str(Path(__file__).parent / script), *options]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
 
 
@@ -114,31 +115,27 @@ def main() -> None:
     options.add_argument("--peer-env-steps", type=int, default=20_000)
     options.add_argument("--backend", choices=("envpool", "ale"), default="envpool")
     options.add_argument("--seconds", type=float, default=5.0, help="for each part of the limit")
+    options.add_argument("--sample-factory", metavar="PYTHON", help="the interpreter that has it: see peer_appo.py")
     parsed = options.parse_args()
     keep_freed_memory()
+    steps = ("--env-steps", str(parsed.peer_env_steps))
+    peers = {"stable-baselines3 A2C": [sys.executable, "peer_a2c.py", "--pong", *steps]}
+    if parsed.sample_factory:
+        peers["Sample Factory APPO"] = [parsed.sample_factory, "peer_appo.py", *steps]
     rows, ratios, shares = [], [], []
     for index in range(parsed.rounds):
         most, parts = limit(parsed.backend, parsed.seconds)
-        rate, other = ours(parsed.backend, parsed.env_steps), peer(parsed.peer_env_steps)
-        ratios.append(rate / other)
+        rate, others = ours(parsed.backend, parsed.env_steps), [peer(*command) for command in peers.values()]
+        ratios.append(rate / max(others))
         shares.append(rate / most)
+        rates = [f"{each:,.0f}" for each in (rate, *others)]
         spent = " + ".join(f"{part:.0f}" for part in parts.values())
-        rows.append(
-            (
-                index + 1,
-                f"{rate:,.0f}",
-                f"{other:,.0f}",
-                f"{ratios[-1]:.1f}",
-                spent,
-                f"{most:,.0f}",
-                f"{shares[-1]:.0%}",
-            )
-        )
+        rows.append((index + 1, *rates, f"{ratios[-1]:.1f}", spent, f"{most:,.0f}", f"{shares[-1]:.0%}"))
     print(machine())
-    header = ("round", "env_steps/s", "stable-baselines3 A2C", "ratio")
+    header = ("round", "env_steps/s", *peers, "ratio to the better")
     header += ("environment + forward + update, us", "limit, env_steps/s", "share")
     print(table(header, rows))
-    print(f"median {statistics.median(ratios):.1f} x the peer, {statistics.median(shares):.0%} of the limit")
+    print(f"median {statistics.median(ratios):.1f} x the better peer, {statistics.median(shares):.0%} of the limit")
 
 
 if __name__ == "__main__":

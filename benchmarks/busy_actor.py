@@ -1,0 +1,42 @@
+"""An actor without a learner: collects rollouts of Pong and encodes them, one thread, until its standard input ends.
+
+Says "busy" once it is. Part of learner_speed.py.
+"""
+
+import threading
+
+from actor.collector import Collector
+from actor.environments import make_environments
+from learner.settings import read_preset, run_spec
+from policy.network import ActorCritic
+from policy.program import export_program
+from policy.runtime import OnnxRuntime
+from protocol.codec import encode
+from protocol.messages import RolloutIdentity
+from protocol.process import exit_with_parent
+
+
+def main() -> None:
+    over = threading.Event()
+    exit_with_parent(over)
+    spec = run_spec(read_preset("pong"))
+    environments = make_environments(
+        spec.environment.model_copy(update={"backend": "ale"}), spec.collection.envs_per_actor
+    )
+    try:
+        network = ActorCritic(spec.policy, environments.spaces)
+        runtime = OnnxRuntime(export_program(network, environments.spaces.observation))
+        runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
+        collector = Collector(environments, runtime, spec.environment, rollout_length=16, seed=1)
+        sequence = 0
+        print("busy", flush=True)
+        while not over.is_set():
+            identity = RolloutIdentity(actor="busy", incarnation=1, sequence=sequence, learner_epoch=1)
+            encode(collector.collect(identity, policy_version=0))
+            sequence += 1
+    finally:
+        environments.close()
+
+
+if __name__ == "__main__":
+    main()
