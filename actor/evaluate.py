@@ -18,8 +18,9 @@ from actor.environments import UnplayableError, make_environments
 from actor.evaluate_options import check, parser
 from actor.evaluation import Evaluation, environments_for, play_episodes
 from actor.video import Video, VideoError
+from policy.best_checkpoints import is_best
 from policy.runtime import OnnxRuntime, PolicyError
-from policy.saved_policy import NoPolicyError, SavedPolicy, find_policy, is_best, pretrained
+from policy.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from policy.sealed import DamagedError
 from protocol.process import exit_with_parent, stop_on_signals
 from protocol.spec import EnvironmentSpec

@@ -1,16 +1,15 @@
 """`daedalus train` and `daedalus resume`: a learner and actors on this machine, watched to their end."""
 
 import argparse
-import json
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+from launch.run_off import PlayFailedError, play, run_off
 from launch.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from learner import run_directory
 from learner.options import add_settings, resolve
@@ -25,7 +24,8 @@ _EVALUATOR = "evaluator"
 _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
 reached or the budget is used up, then plays 100 episodes (evaluation.final_episodes) with the best policy
-that was found, or with the last."""
+that was found, or with the last. Where the run was evaluated on a schedule (evaluation.seconds), the best is
+chosen among the three that scored highest and the last, by as many fresh episodes of each."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -190,25 +190,18 @@ def _say(news: str | None) -> None:
 
 
 def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: threading.Event) -> bool:
-    """Plays the final episodes in a process of their own; puts their result into summary.json."""
+    """Chooses the best checkpoint and plays the final episodes with it; puts the results into summary.json."""
     began = time.monotonic()
-    command = [sys.executable, "-P", "-m", "actor.evaluate", str(directory), "--json", "--exit-with-parent"]
-    command += ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output)
-        while process.poll() is None and not stopping.wait(_POLL_SECONDS):
-            pass
-        stop([process])
-        if process.returncode != 0:
-            return False
-        output.seek(0)
-        evaluation = json.load(output)
-    for each_episode in ("returns", "lengths"):
-        del evaluation[each_episode]
+    options = ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
+    try:
+        chosen = run_off(directory, spec, options, stopping, lambda text: print(text, flush=True))
+        (evaluation,) = play([[str(directory), *options]], stopping)
+    except PlayFailedError:
+        return False
     summary = run_directory.read_json(directory / run_directory.SUMMARY)
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
-    summary["evaluation"] = {**evaluation, "seconds": time.monotonic() - began}
+    summary["evaluation"] = {**evaluation, "run_off": chosen, "seconds": time.monotonic() - began}
     run_directory.write_json(directory / run_directory.SUMMARY, summary)
     return True
 

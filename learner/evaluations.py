@@ -1,15 +1,13 @@
 """What evaluators play and how it went: the policy of each is kept as a checkpoint until it is reported on, the best
-for good. State and renames on disk; no threads, no wire.
+for good. State; no threads, no wire.
 """
 
-import os
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from policy.saved_policy import best_checkpoint, best_name, best_score
+from policy.best_checkpoints import keep_if_best
 from protocol.messages import Acknowledgement, EvaluationReport
 
 _MOST_PLAYING = 16
@@ -19,7 +17,6 @@ _MOST_PLAYING = 16
 class Evaluations:
     """The evaluations of one run and one life of its learner."""
 
-    run_directory: Path
     learner_epoch: int
     playing: dict[str, tuple[Path, int, int]] = field(default_factory=dict)  # by evaluator: where, version, env_steps
     newest: dict[str, float] = field(default_factory=dict)  # as columns of learner/metrics.py, until taken
@@ -58,28 +55,13 @@ class Evaluations:
             "evaluation_env_steps": env_steps,
         }
         text = f"evaluation at {env_steps:,} env_steps: {mean:.1f} +- {std:.1f} over {len(report.returns)} episodes"
-        if self._is_best(mean):
-            text += self._keep_best(directory, mean, version)
+        try:
+            text += ", the best so far" if keep_if_best(directory, mean, version) else ""
+        except OSError as error:
+            text += f"; among the best so far, but it could not be kept ({error.strerror})"
         return Acknowledgement(verdict="accepted"), text
 
     def take_newest(self) -> dict[str, float]:
         """The newest evaluation as metrics; empty if there was none since the last call."""
         newest, self.newest = self.newest, {}
         return newest
-
-    def _is_best(self, mean: float) -> bool:
-        best = best_checkpoint(self.run_directory)
-        return best is None or round(mean, 1) > best_score(best)  # which its name holds rounded so
-
-    def _keep_best(self, directory: Path, mean: float, version: int) -> str:
-        """Gives the checkpoint its score for a name; what was the best before goes once the new one is there."""
-        target = directory.with_name(best_name(mean, version))
-        former = best_checkpoint(self.run_directory)
-        try:
-            shutil.copytree(directory, target.with_name(f".{target.name}"), copy_function=os.link)
-            os.replace(target.with_name(f".{target.name}"), target)
-        except OSError as error:
-            return f"; the best so far, but it could not be kept ({error.strerror})"
-        if former is not None and former != target:
-            shutil.rmtree(former, ignore_errors=True)
-        return ", the best so far"

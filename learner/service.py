@@ -64,7 +64,7 @@ class LearnerService:
         self._counters = RunCounters(spec.training.target_episodes)
         if restored is not None:
             self._counters.restore(restored.counters)
-        self._evaluations = Evaluations(directory, self._epoch)
+        self._evaluations = Evaluations(self._epoch)
         self._meter = RateMeter(self._counters, started)
         self._health = Health(started=started, updated=started, attended=started)
         self._reception = Reception(

@@ -2,12 +2,10 @@
 
 A checkpoint (learner/checkpoint.py) is a sealed directory; this file knows the entries of it that acting
 needs, so that an evaluator reads them without torch and without the learner's code. It knows too by what names
-they lie: a run's by policy version, its best by score as well, those that ship with the package by their own.
+they lie: a run's by policy version, those that ship with the package by their own. The best: best_checkpoints.py.
 """
 
 import difflib
-import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +14,12 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from policy.best_checkpoints import best_checkpoints
 from policy.sealed import DamagedError, SealedDirectory, write_sealed
 from protocol.spec import RunSpec, Spaces
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
 PRETRAINED = Path(__file__).parent / "pretrained"
-
-_BEST = re.compile(r"best_(-?\d+\.\d)_(\d{10,})", re.ASCII)
 
 
 class NoPolicyError(Exception):
@@ -49,40 +46,6 @@ def checkpoints(run_directory: Path) -> list[Path]:
     return sorted((entry for entry in folder.iterdir() if entry.name.isdigit()), reverse=True)
 
 
-def best_name(score: float, policy_version: int) -> str:
-    """What a checkpoint is called that evaluations found to be the best: best_812.3_0000012345.
-
-    Raises ValueError if the score is not finite.
-    """
-    if not math.isfinite(score):
-        raise ValueError(f"a score must be finite, not {score}")
-    return f"best_{score:.1f}_{policy_version:010d}"
-
-
-def is_best(directory: Path) -> bool:
-    """Whether a checkpoint bears a `best_name`."""
-    return _BEST.fullmatch(directory.name) is not None
-
-
-def best_score(directory: Path) -> float:
-    """The score in a `best_name`, rounded as it stands there. Raises ValueError if the name is another."""
-    return _score_and_version(directory)[0]
-
-
-def best_checkpoint(run_directory: Path) -> Path | None:
-    """The checkpoint of a run with the highest score, of equals the newest; None if none was scored."""
-    folder = run_directory / "checkpoints"
-    scored = [entry for entry in folder.iterdir() if is_best(entry)] if folder.is_dir() else []
-    return max(scored, key=_score_and_version, default=None)
-
-
-def _score_and_version(directory: Path) -> tuple[float, int]:
-    match = _BEST.fullmatch(directory.name)
-    if match is None:
-        raise ValueError(f"{directory} is not named like a best checkpoint")
-    return float(match[1]), int(match[2])
-
-
 def find_policy(directory: Path, warn: Callable[[str], None], newest: bool = False) -> SavedPolicy:
     """The policy of a checkpoint; of a run directory its best, or its newest if none is or `newest` is asked for.
 
@@ -90,8 +53,7 @@ def find_policy(directory: Path, warn: Callable[[str], None], newest: bool = Fal
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
-    best = None if newest else best_checkpoint(directory)
-    candidates = [*([best] if best else []), *checkpoints(directory)]
+    candidates = [*([] if newest else best_checkpoints(directory)), *checkpoints(directory)]
     if not candidates:
         raise DamagedError(f"{directory} has no checkpoints: is it a run directory?")
     for candidate in candidates:

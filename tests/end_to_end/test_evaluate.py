@@ -16,60 +16,20 @@ import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
 from processes import Running, processes_mentioning
+from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 import actor.evaluate
 import launch.train
 import policy.saved_policy
 from actor.environments import make_environments
 from actor.evaluate import main
-from learner.checkpoint import save_checkpoint
-from learner.learner import Learner
 from learner.run_directory import create, read_json, write_json
+from policy.best_checkpoints import best_checkpoints, best_score
 from policy.runtime import OnnxRuntime
-from policy.saved_policy import best_checkpoint, best_name, checkpoints, read_policy
-from protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec, Spaces
+from policy.saved_policy import checkpoints, read_policy
+from protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec
 
 Start = Callable[..., Running]
-COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=4)
-CARTPOLE = EnvironmentSpec(id="CartPole-v1")
-RACING = EnvironmentSpec(
-    id="CarRacing-v3",
-    max_episode_steps=10,
-    action_table=((0.0, 1.0, 0.0), (1.0, 0.5, 0.0)),
-    action_repeat=4,
-    crop=(0, 12, 6, 6),
-    grey=True,
-    resize=(21, 21),
-    frame_stack=4,
-)
-
-
-def save(run: Path, environment: EnvironmentSpec, *versions: int, spaces: Spaces | None = None, **spec: Any) -> Path:
-    """A run with these checkpoints, all of the same untrained policy but with a taste for all actions."""
-    made = make_environments(environment, 1)
-    made.close()
-    run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
-    learner = Learner(run_spec.training, run_spec.policy, spaces or made.spaces)
-    random = np.random.default_rng(5)
-    weights = {name: random.standard_normal(array.shape, np.float32) for name, array in learner.weights().items()}
-    for version in versions:
-        save_checkpoint(
-            run,
-            spec=run_spec,
-            spaces=spaces or made.spaces,
-            policy_version=version,
-            program=learner.program(),
-            parameters=weights,
-            state=learner.state(),
-            counters={},
-            keep=9,
-        )
-    return run
-
-
-def keep_best(run: Path, score: float, version: int) -> Path:
-    directory = run / "checkpoints" / f"{version:010d}"
-    return directory.rename(directory.with_name(best_name(score, version)))
 
 
 @pytest.fixture
@@ -146,8 +106,8 @@ def test_the_best_checkpoint_is_played_or_the_newest_where_that_is_asked_for(
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 5, 6, 7, 8, 9)
     assert evaluate(run, "--episodes", 1)["policy_version"] == 9
-    for version, score in ((5, 9.5), (6, 12.25), (7, -20.5)):
-        keep_best(run, score, version)
+    for version, found in ((5, 9.5), (6, 12.25), (7, -20.5)):
+        score(run, found, version)
     best = evaluate(run, "--episodes", 1)
     assert (best["policy_version"], best["best_checkpoint"]) == (6, True)
     assert best["checkpoint"].endswith("best_12.2_0000000006")
@@ -159,25 +119,12 @@ def test_the_best_checkpoint_is_played_or_the_newest_where_that_is_asked_for(
 
 def test_a_damaged_best_is_named_and_the_newest_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = save(tmp_path / "run", COUNTING, 1, 2)
-    (keep_best(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
+    (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
     assert main([str(run), "--episodes", "1"]) == 0
     captured = capsys.readouterr()
     assert "passed over" in captured.err
     assert "best_3.0_0000000001" in captured.err
     assert "gymnasium's counting_environment:Counting-v0, policy version 2: return 3." in captured.out
-
-
-def test_names_of_best_checkpoints_can_be_read_back(tmp_path: Path) -> None:
-    assert best_name(812.34, 12345) == "best_812.3_0000012345"
-    assert best_name(-20.5, 7) == "best_-20.5_0000000007"
-    with pytest.raises(ValueError, match="finite"):
-        best_name(float("nan"), 1)
-    assert best_checkpoint(tmp_path) is None
-    for name in ("best_-20.5_0000000007", "best_9.0_0000000003", "best_9.0_0000000004", "best_99_1", ".best_50.0_1"):
-        (tmp_path / "checkpoints" / name).mkdir(parents=True)
-    best = best_checkpoint(tmp_path)
-    assert best is not None
-    assert best.name == "best_9.0_0000000004"
 
 
 def test_sampled_actions_and_seeds(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
@@ -279,7 +226,7 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
     assert "'cartpole': none ships" in refused(1, "--pretrained", "cartpole")
     create(tmp_path / "run", RunSpec(environment=CARTPOLE))
     run = save(tmp_path / "run", CARTPOLE, 4, 5)
-    keep_best(run, 77.0, 4)
+    score(run, 77.0, 4)
     (run / "metrics.csv").write_text("row\n" + "".join(f"{row}\n" for row in range(4000)))
     write_json(run / "summary.json", {"env_steps": 1234, "evaluation": None})
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent.parent))
@@ -313,17 +260,42 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
 ) -> None:
     settings = {"final_episodes": 3, "final_backend": "envpool"}
     run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation=settings)
-    keep_best(run, 77.0, 4)
-    spec = read_policy(run / "checkpoints" / "0000000005").spec
+    score(run, 77.0, 4)
+    (run / "checkpoints" / "0000000005").rename(tmp_path / "no newer one")
+    spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
     assert launch.train._evaluate(run, spec, None, threading.Event())
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
     assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
+    assert evaluation["run_off"] == []
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
     launch.train._report(run, spec)
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in capsys.readouterr().out
+
+
+def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = tmp_path / "run"
+    for version in (1, 2, 3):
+        save(run, CARTPOLE, version, weights_seed=version, evaluation={"final_episodes": 20})
+    worst, *_, best = sorted((1, 2, 3), key=lambda version: _played(evaluate, run, version))
+    score(run, 499.0, worst)
+    write_json(run / "summary.json", {})
+    spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
+    newest = max(version for version in (1, 2, 3) if version != worst)
+    assert launch.train._evaluate(run, spec, None, threading.Event())
+    evaluation = read_json(run / "summary.json")["evaluation"]
+    assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
+    scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["run_off"]]
+    assert [version for version, _ in scores] == [newest, worst]
+    assert evaluate(run, "--episodes", 1)["policy_version"] == newest
+    assert not (run / "checkpoints" / f"best_499.0_{worst:010d}").exists()
+    assert [best_score(each) for each in best_checkpoints(run)] == [round(each, 1) for _, each in scores]
+
+
+def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:
+    return evaluate(run / "checkpoints" / f"{version:010d}", "--episodes", 20)["return_mean"]
 
 
 def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) -> None:

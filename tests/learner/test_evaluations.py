@@ -12,7 +12,8 @@ from building import EPOCH, SPACES, run_spec
 from learner.checkpoint import load_checkpoint, load_newest, save_checkpoint
 from learner.evaluations import Evaluations
 from learner.metrics import COLUMNS
-from policy.saved_policy import best_checkpoint, checkpoints, read_policy
+from policy.best_checkpoints import best_checkpoints, best_score
+from policy.saved_policy import checkpoints, read_policy
 from protocol.messages import Acknowledgement, EvaluationReport
 
 
@@ -21,7 +22,7 @@ class Run:
 
     def __init__(self, directory: Path, epoch: int = EPOCH) -> None:
         self.directory = directory
-        self.evaluations = Evaluations(directory, epoch)
+        self.evaluations = Evaluations(epoch)
 
     def save(self, version: int, keep: int = 2) -> Path:
         return save_checkpoint(
@@ -78,8 +79,7 @@ def run(tmp_path: Path) -> Run:
 def test_the_first_is_the_best_and_kept_under_its_score(run: Run) -> None:
     assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.3 +- 1.2 over 3 episodes, the best so far"
     assert run.names == ["0000000007", "best_2.3_0000000007"]
-    best = best_checkpoint(run.directory)
-    assert best is not None
+    best = best_checkpoints(run.directory)[0]
     assert read_policy(best).policy_version == 7
     assert load_checkpoint(best).policy.weights["w"].tolist() == [7.0] * 3
 
@@ -87,7 +87,8 @@ def test_the_first_is_the_best_and_kept_under_its_score(run: Run) -> None:
 def test_a_better_one_takes_its_place_and_a_worse_one_does_not(run: Run) -> None:
     texts = [run.play(version, score) for version, score in ((1, 5.0), (2, 4.0), (3, 9.0), (4, -1.0))]
     assert [text.endswith("the best so far") for text in texts] == [True, False, True, False]
-    assert run.names == ["0000000003", "0000000004", "best_9.0_0000000003"]
+    assert [best_score(each) for each in best_checkpoints(run.directory)] == [9.0, 5.0, 4.0]
+    assert best_checkpoints(run.directory)[0].name == "best_9.0_0000000003"
 
 
 def test_scores_below_0_are_compared_as_numbers(run: Run) -> None:
@@ -101,8 +102,7 @@ def test_the_best_outlives_the_checkpoint_that_it_was(run: Run) -> None:
     for version in (2, 3, 4):
         run.save(version)
     assert run.names == ["0000000003", "0000000004", "best_5.0_0000000001"]
-    best = best_checkpoint(run.directory)
-    assert best is not None
+    best = best_checkpoints(run.directory)[0]
     assert load_checkpoint(best).policy.weights["w"].tolist() == [1.0] * 3
 
 
@@ -147,8 +147,7 @@ def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, m
     monkeypatch.undo()
     assert answer.verdict == "accepted"
     assert text.endswith("the best so far, but it could not be kept (No space left on device)")
-    best = best_checkpoint(run.directory)
-    assert best is not None
+    best = best_checkpoints(run.directory)[0]
     assert best.name == "best_5.0_0000000001"
     run.save(3)
     assert not [name for name in run.names if name.startswith(".")]  # what was half done is cleared away
@@ -197,7 +196,7 @@ def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str,
     assert answer.verdict == verdict
     assert reason in answer.reason
     assert text == ""
-    assert best_checkpoint(run.directory) is None
+    assert best_checkpoints(run.directory) == []
     assert run.evaluations.take_newest() == {}
 
 
@@ -256,7 +255,7 @@ def test_returns_too_large_to_add_up_as_float32_are_averaged(run: Run) -> None:
 
 
 def test_evaluators_that_never_report_hold_a_bounded_number_of_checkpoints(tmp_path: Path) -> None:
-    evaluations = Evaluations(tmp_path, learner_epoch=1)
+    evaluations = Evaluations(learner_epoch=1)
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
     assert evaluations.kept == {tmp_path / str(number) for number in range(84, 100)}

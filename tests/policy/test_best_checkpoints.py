@@ -1,0 +1,66 @@
+"""policy/best_checkpoints.py: which are kept, under which names."""
+
+from pathlib import Path
+
+import pytest
+
+from policy.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, score_anew
+
+
+def checkpoint(run: Path, version: int) -> Path:
+    directory = run / "checkpoints" / f"{version:010d}"
+    directory.mkdir(parents=True)
+    (directory / "content").write_text(str(version))
+    return directory
+
+
+def scored(run: Path) -> list[tuple[float, str]]:
+    return [(best_score(each), (each / "content").read_text()) for each in best_checkpoints(run)]
+
+
+def test_names_can_be_read_back(tmp_path: Path) -> None:
+    assert best_name(812.34, 12345) == "best_812.3_0000012345"
+    assert best_name(-20.5, 7) == "best_-20.5_0000000007"
+    with pytest.raises(ValueError, match="finite"):
+        best_name(float("nan"), 1)
+    assert best_checkpoints(tmp_path) == []
+    for name in ("best_-20.5_0000000007", "best_9.0_0000000003", "best_9.0_0000000004", "best_99_1", ".best_50.0_1"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    found = [each.name for each in best_checkpoints(tmp_path)]
+    assert found == ["best_9.0_0000000004", "best_9.0_0000000003", "best_-20.5_0000000007"]
+
+
+def test_the_three_that_scored_highest_are_kept(tmp_path: Path) -> None:
+    best = [
+        keep_if_best(checkpoint(tmp_path, version), score, version)
+        for version, score in ((1, 5.0), (2, 9.0), (3, 1.0), (4, 7.0), (5, 0.5), (6, 10.0), (7, 9.0))
+    ]
+    assert best == [True, True, False, False, False, True, False]
+    assert scored(tmp_path) == [(10.0, "6"), (9.0, "7"), (9.0, "2")]
+
+
+def test_one_version_is_kept_once(tmp_path: Path) -> None:
+    directory = checkpoint(tmp_path, 1)
+    assert keep_if_best(directory, 5.0, 1)
+    assert not keep_if_best(directory, 6.0, 1)
+    assert scored(tmp_path) == [(5.0, "1")]
+
+
+def test_another_score_is_another_name(tmp_path: Path) -> None:
+    first, second = checkpoint(tmp_path, 1), checkpoint(tmp_path, 2)
+    keep_if_best(first, 90.0, 1)
+    (kept,) = best_checkpoints(tmp_path)
+    assert score_anew(kept, 50.0, 1).name == "best_50.0_0000000001"
+    assert score_anew(second, 60.0, 2).name == "best_60.0_0000000002"
+    assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
+    assert second.exists()
+    (best, _) = best_checkpoints(tmp_path)
+    assert score_anew(best, 60.0, 2) == best
+    assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
+
+
+def test_what_a_crash_left_half_done_is_in_nobodys_way(tmp_path: Path) -> None:
+    directory = checkpoint(tmp_path, 1)
+    (directory.parent / ".best_5.0_0000000001" / "something").mkdir(parents=True)
+    assert keep_if_best(directory, 5.0, 1)
+    assert scored(tmp_path) == [(5.0, "1")]

@@ -1,0 +1,61 @@
+"""Run directories with checkpoints in them, as a learner would have saved them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from actor.environments import make_environments
+from learner.checkpoint import save_checkpoint
+from learner.learner import Learner
+from policy.best_checkpoints import best_name
+from protocol.spec import EnvironmentSpec, RunSpec, Spaces
+
+COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=4)
+CARTPOLE = EnvironmentSpec(id="CartPole-v1")
+RACING = EnvironmentSpec(
+    id="CarRacing-v3",
+    max_episode_steps=10,
+    action_table=((0.0, 1.0, 0.0), (1.0, 0.5, 0.0)),
+    action_repeat=4,
+    crop=(0, 12, 6, 6),
+    grey=True,
+    resize=(21, 21),
+    frame_stack=4,
+)
+
+
+def save(
+    run: Path,
+    environment: EnvironmentSpec,
+    *versions: int,
+    spaces: Spaces | None = None,
+    weights_seed: int = 5,
+    **spec: Any,
+) -> Path:
+    """A run with these checkpoints, all of the same untrained policy but with a taste for all actions."""
+    made = make_environments(environment, 1)
+    made.close()
+    run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
+    learner = Learner(run_spec.training, run_spec.policy, spaces or made.spaces)
+    random = np.random.default_rng(weights_seed)
+    weights = {name: random.standard_normal(array.shape, np.float32) for name, array in learner.weights().items()}
+    for version in versions:
+        save_checkpoint(
+            run,
+            spec=run_spec,
+            spaces=spaces or made.spaces,
+            policy_version=version,
+            program=learner.program(),
+            parameters=weights,
+            state=learner.state(),
+            counters={},
+            keep=9,
+        )
+    return run
+
+
+def score(run: Path, score: float, version: int) -> Path:
+    """As if an evaluation had found this."""
+    directory = run / "checkpoints" / f"{version:010d}"
+    return directory.rename(directory.with_name(best_name(score, version)))
