@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from processes import LIMIT, until
 
-from actor import learner_link, service
+from actor import conversation, learner_link, service
 from actor.learner_link import ActorError
 from actor.service import ActorConfig, ActorService, LinkChoice
 from learner.compact_desk import CompactDesk
@@ -410,7 +410,7 @@ def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
 def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to_be_heard(
     network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service, "_SILENCE_SECONDS", 0.1)
+    monkeypatch.setattr(conversation, "_SILENCE_SECONDS", 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     held = [learner.receive(), learner.receive()]  # never answered
