@@ -22,6 +22,7 @@ from learner.optimizers import Adam, FlatParameters, Optimizer, RmsProp
 from learner.precision import autocast
 from learner.returns import Targets, actor_critic_targets, vtrace_targets
 from learner.samples import Sample, minibatches
+from learner.settings import SettingsError
 from policy.distributions import categorical_log_probs
 from policy.network import ActorCritic
 from policy.program import export_program
@@ -59,6 +60,12 @@ class Learner:
     """
 
     def __init__(self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces) -> None:
+        """Raises SettingsError if the device is not there, NetworkError if the policy is not for such spaces."""
+        if spec.device == "cuda" and not torch.cuda.is_available():
+            raise SettingsError(
+                "training.device is cuda, but torch sees none here: install a torch built for CUDA and the driver, "
+                "or set training.device=cpu"
+            )
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
         self._spec = spec

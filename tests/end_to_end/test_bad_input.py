@@ -54,6 +54,14 @@ def test_an_unknown_environment_ends_training_with_near_matches(start: Start) ->
     running.expect("unknown environment 'CartPoll-v1': did you mean CartPole-v1")
 
 
+def test_a_device_that_is_not_there_is_told_in_one_line(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # wherever this runs
+    running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
+    assert running.wait() == 1
+    running.expect("daedalus learner: training.device is cuda, but torch sees none here: install")
+    assert "Traceback" not in running.output
+
+
 def test_a_run_directory_that_exists_is_refused_and_left_alone(start: Start, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").write_text("kept")

@@ -1,0 +1,100 @@
+"""The learner on an accelerator does what it does on a processor. Skipped where there is none."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
+
+from learner.checkpoint import load_checkpoint, save_checkpoint
+from learner.learner import Learner
+from policy.runtime import OnnxRuntime
+from protocol.messages import Rollout
+from protocol.spec import ArraySpace, PolicySpec, Spaces, TrainingSpec
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device here")
+
+IMAGES = Spaces(observation=ArraySpace(shape=(42, 42), dtype="uint8", frames=4), action=SPACES.action)
+KINDS: dict[str, tuple[PolicySpec, Spaces]] = {
+    "mlp": (PolicySpec(hidden=(8,)), SPACES),
+    "gru": (PolicySpec(hidden=(8,), memory="gru", memory_units=5), SPACES),
+    "small": (PolicySpec(encoder="small"), IMAGES),
+    "article, gru": (PolicySpec(encoder="article", memory="gru", memory_units=5), IMAGES),
+}
+
+
+def learner(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> Learner:
+    settings = {"device": device, "precision": "float32", "learning_rate": 1e-3, **training}
+    return Learner(TrainingSpec.model_validate(settings), policy, spaces)
+
+
+def rollouts(seed: int, spaces: Spaces, state_size: int) -> list[Rollout]:
+    space = spaces.observation
+    made = [make_rollout(seed=100 * seed + number, state_size=state_size) for number in range(2)]
+    if space.dtype != "uint8":
+        return made
+    random = np.random.default_rng(seed)
+    shape = (space.frames + ROWS, ENVIRONMENTS, *space.shape)
+    return [replace(rollout, frames=random.integers(0, 256, shape, np.uint8)) for rollout in made]
+
+
+def taught(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> Learner:
+    one = learner(device, policy, spaces, **training)  # which seeds what batches are shuffled by
+    for step in range(3):
+        one.step(rollouts(step, spaces, one.state_size), progress=0.0)
+    return one
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
+def test_updates_are_those_of_the_processor(algorithm: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    policy, spaces = KINDS[kind]
+    start = {name: array.copy() for name, array in learner("cpu", policy, spaces).weights().items()}
+    there, here = (taught(device, policy, spaces, algorithm=algorithm) for device in ("cuda", "cpu"))
+    for name, expected in here.weights().items():
+        moved = np.abs(expected - start[name]).max()
+        np.testing.assert_allclose(there.weights()[name], expected, atol=0.05 * moved + 1e-6, err_msg=name)
+    assert there.take_metrics() == pytest.approx(here.take_metrics(), rel=0.02, abs=1e-3)
+    assert there.take_action_counts() == here.take_action_counts()
+
+
+def test_its_program_and_its_checkpoints_go_anywhere(tmp_path: Path) -> None:
+    policy, spaces = KINDS["small"]
+    there = learner("cuda", policy, spaces)
+    there.step(rollouts(1, spaces, 0), progress=0.0)
+    runtime = OnnxRuntime(there.program())
+    runtime.load({name: array.copy() for name, array in there.weights().items()})
+    observations = np.random.default_rng(1).integers(0, 256, (5, *spaces.observation.stacked_shape), np.uint8)
+    actions, _, _ = runtime.act(observations, np.zeros((5, 0), np.float32), None)
+    assert actions.shape == (5,)
+    directory = save_checkpoint(
+        tmp_path,
+        spec=run_spec(),
+        spaces=spaces,
+        policy_version=there.policy_version,
+        program=there.program(),
+        parameters=there.weights(),
+        state=there.state(),
+        counters={},
+        keep=1,
+    )
+    checkpoint = load_checkpoint(directory)
+    here = learner("cpu", policy, spaces)
+    here.restore(checkpoint.policy.policy_version, checkpoint.policy.weights, checkpoint.state)
+    for name, expected in there.weights().items():
+        np.testing.assert_array_equal(here.weights()[name], expected)
+
+
+def test_mixed_precision_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, spaces = KINDS["small"]
+    there = learner("cuda", policy, spaces, algorithm="appo", precision="bfloat16")
+    start = {name: array.copy() for name, array in there.weights().items()}
+    there.step(rollouts(1, spaces, 0), progress=0.0)
+    assert there.updates_skipped == 0
+    for name, array in there.weights().items():
+        assert np.isfinite(array).all()
+        assert not np.array_equal(array, start[name]), name
