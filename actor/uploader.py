@@ -12,6 +12,7 @@ from protocol.messages import Acknowledgement
 _BUSY_SECONDS = 0.005  # first wait after a busy answer; doubles
 _LOST_SECONDS = 0.1  # wait after no answer at all
 _MAX_WAIT_SECONDS = 0.5
+_WEARY, _MAX_WEARY_SECONDS = 14, 4.0  # busy so many times in a row, 4 s in all, it asks less often: many do
 
 
 @dataclass(slots=True)
@@ -83,9 +84,8 @@ class Uploader:
             self.verdicts[answer.verdict] += 1
             self.fastest_answer = min(self.fastest_answer, now - rollout.sent_at)
         if answer is None or answer.verdict == "busy":
-            first = _LOST_SECONDS if answer is None else _BUSY_SECONDS
-            rollout.send_at = now + min(first * 2**rollout.attempts, _MAX_WAIT_SECONDS)
-            rollout.attempts = min(rollout.attempts + 1, 10)
+            rollout.send_at = now + _pause(rollout.attempts, lost=answer is None)
+            rollout.attempts = min(rollout.attempts + 1, 20)
             return
         del self.in_flight[sequence]
         self.must_replace = answer.verdict == "rejected"
@@ -93,3 +93,9 @@ class Uploader:
         self.reason = answer.reason
         if answer.verdict in ("fenced", "quarantined", "finished"):
             self.over = answer.verdict
+
+
+def _pause(attempts: int, *, lost: bool) -> float:
+    """Seconds until a rollout is sent again that was not taken so many times before."""
+    first, longest = (_LOST_SECONDS, _MAX_WAIT_SECONDS) if lost else (_BUSY_SECONDS, _MAX_WEARY_SECONDS)
+    return min(first * 2**attempts, _MAX_WAIT_SECONDS * 2 ** max(attempts - _WEARY, 0), longest)

@@ -37,7 +37,7 @@ def test_busy_and_silence_send_again_later_each_time_later() -> None:
         uploader = Uploader(window=1)
         uploader.add(0, b"a")
         waits = []
-        for _ in range(12):
+        for _ in range(14):
             uploader.due(1000.0)
             uploader.answered(0, last, 100.0)
             due = uploader.next_due()
@@ -47,6 +47,22 @@ def test_busy_and_silence_send_again_later_each_time_later() -> None:
         assert 0 < waits[0] < waits[-1] <= 0.5
         assert uploader.due(100.0) == []
         assert uploader.due(101.0) == [(0, b"a")]
+
+
+@pytest.mark.parametrize(("last", "longest"), [(answer("busy"), 4.0), (None, 0.5)])
+def test_busy_for_long_is_asked_less_often_and_what_was_lost_is_not(
+    last: Acknowledgement | None, longest: float
+) -> None:
+    uploader = Uploader(window=1)
+    uploader.add(0, b"a")
+    waited, waits = 0.0, []
+    for _ in range(40):
+        uploader.due(1000.0)
+        uploader.answered(0, last, 0.0)
+        waits.append(uploader.next_due() or 0.0)
+        assert waits[-1] <= waited + 0.1  # hardly ever longer than it has waited already
+        waited += waits[-1]
+    assert waits[-1] == longest
 
 
 def test_after_a_lost_connection_all_are_sent_again() -> None:
