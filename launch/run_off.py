@@ -37,15 +37,15 @@ def run_off(
 
     `options` are what `daedalus evaluate` takes. Raises PlayFailedError.
     """
-    players = candidates(directory, say)
-    if len(players) < 2:
+    finalists = candidates(directory, say)
+    if len(finalists) < 2:
         return []
     backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
-    say(f"{len(players)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}")
+    say(f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}")
     with_it = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *with_it] for each in players], stopping)
+    results = play([[str(each.directory), *with_it] for each in finalists], stopping)
     scores = []
-    for candidate, result in zip(players, results, strict=True):
+    for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
         before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
         say(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
@@ -80,7 +80,7 @@ def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str,
         stop(processes)
         failed = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
         if failed:
-            for error in filter(None, failed):
+            for error in filter(None, [] if stopping.is_set() else failed):
                 error.seek(0)
                 sys.stderr.write(error.read().decode(errors="replace"))
             raise PlayFailedError
