@@ -6,7 +6,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from actor.client import Client
+    from daedalus.actor.client import Client
 
 __all__ = ["Client"]
 
@@ -14,7 +14,7 @@ __all__ = ["Client"]
 def __getattr__(name: str) -> Any:
     """Loads Client when it is asked for: nothing else here needs the network."""
     if name == "Client":
-        from actor.client import Client
+        from daedalus.actor.client import Client
 
         return Client
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

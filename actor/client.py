@@ -24,13 +24,12 @@ from typing import Any
 
 import gymnasium
 
-from actor.client_player import ClientPlayer
-from actor.learner_link import ActorError
-from actor.options import certificate_hint
-from actor.service import ActorConfig, ActorService, LinkChoice
-from protocol import keys
-from protocol.command_line import credentials_to_connect
-from protocol.connecting import connect_when_there
+from daedalus.actor.collecting.client_player import ClientPlayer
+from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
+from daedalus.protocol import keys
+from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.security import authorization_hint, credentials_to_connect
 
 
 class Client:
@@ -71,7 +70,7 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
-            hint=certificate_hint(credentials),
+            hint=authorization_hint(credentials),
         )
         self._stop = threading.Event()
         self._player = ClientPlayer(observation_space, action_space)

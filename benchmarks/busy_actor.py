@@ -5,15 +5,15 @@ Says "busy" once it is. Part of learner_speed.py.
 
 import threading
 
-from actor.collector import Collector
-from actor.environments import make_environments
-from learner.settings import read_preset, run_spec
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime
-from protocol.codec import encode
-from protocol.messages import RolloutIdentity
-from protocol.process import exit_with_parent
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.environments.make import make_environments
+from daedalus.cli.processes import exit_with_parent
+from daedalus.learner.run.settings import read_preset, run_spec
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import RolloutIdentity
 
 
 def main() -> None:

@@ -9,8 +9,8 @@ import time
 import numpy as np
 from running import machine, table
 
-from actor.environments import make_environments
-from learner.settings import read_preset, run_spec
+from daedalus.actor.environments.make import make_environments
+from daedalus.learner.run.settings import read_preset, run_spec
 
 CASES = (
     ("car_racing", "sketch"),

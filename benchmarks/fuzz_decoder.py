@@ -18,12 +18,12 @@ from typing import Any
 atheris: Any = importlib.import_module("atheris")  # an extra of its own, which makes its names when it is loaded
 
 with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
-    from learner.fleet import Fleet
-    from learner.intake import Intake
-    from protocol.codec import Limits, ProtocolError, decode
-    from protocol.compact import bits_of
-    from protocol.messages import CompactSnapshot, Join
-    from protocol.spec import ArraySpace, ChoiceSpace, RunSpec, Spaces
+    from daedalus.learner.serving.fleet import Fleet
+    from daedalus.learner.serving.intake import Intake
+    from daedalus.protocol.codec import Limits, ProtocolError, decode
+    from daedalus.protocol.compact import bits_of
+    from daedalus.protocol.messages import CompactSnapshot, Join
+    from daedalus.protocol.spec import ArraySpace, ChoiceSpace, RunSpec, Spaces
 
 _GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
 _LIMITS = Limits(max_bytes=1 << 20)

@@ -22,10 +22,10 @@ from pathlib import Path
 import torch
 from running import machine, table
 
-from learner.allocator import keep_freed_memory
-from learner.optimizers import Adam, FlatParameters
-from policy.network import ActorCritic
-from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
+from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.learner.training.optimizers import Adam, FlatParameters
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
 
 # Name: policy, observations, rows, environments.
 NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {

@@ -25,13 +25,13 @@ import torch
 from learner_speed import NETWORKS, fastest, updater
 from running import COMMAND, machine, table
 
-from actor.environments import make_environments
-from learner.allocator import keep_freed_memory
-from learner.settings import read_preset, run_spec
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime
-from protocol.spec import ChoiceSpace, Spaces
+from daedalus.actor.environments.make import make_environments
+from daedalus.learner.run.settings import read_preset, run_spec
+from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import ChoiceSpace, Spaces
 
 ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
 SETTINGS = {

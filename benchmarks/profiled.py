@@ -18,7 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from protocol import codec, zenoh_transport
+from daedalus.protocol import codec
+from daedalus.transport import zenoh_transport
 
 SPENT: dict[str, float] = defaultdict(float)
 ACTIVE = threading.local()

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-COMMAND = [sys.executable, "-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
+COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 
 
 def train(*arguments: object) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import shutil
 import sys
 from pathlib import Path
 
-from learner.run_directory import CONFIG, METRICS, SUMMARY, read_json
-from learner.settings import SettingsError
-from policy.saved_policy import PRETRAINED, export_policy, find_policy
-from policy.sealed import DamagedError
+from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, read_json
+from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.saved_policy import PRETRAINED, export_policy, find_policy
+from daedalus.policy.saving.sealed import DamagedError
 
 _MOST_ROWS = 1000  # of the learning curve
 

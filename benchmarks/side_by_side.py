@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from actor.environments import VectorEnvironment, make_environments
-from learner.settings import read_preset, run_spec
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.make import VectorEnvironment, make_environments
+from daedalus.learner.run.settings import read_preset, run_spec
+from daedalus.protocol.spec import EnvironmentSpec
 
 _ENLARGED = 3
 

@@ -15,18 +15,18 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
-from actor.player import EnvironmentPlayer
-from actor.service import ActorConfig, ActorService, LinkChoice
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
-from learner.settings import read_preset, run_spec
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.messages import Snapshot, SnapshotPart, SnapshotRequest
-from protocol.process import stop_on_signals
-from protocol.spec import RunStatus
-from protocol.transport import Transport
-from protocol.zenoh_transport import connect
+from daedalus.actor.collecting.player import EnvironmentPlayer
+from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
+from daedalus.cli.processes import stop_on_signals
+from daedalus.learner.run.settings import read_preset, run_spec
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import Snapshot, SnapshotPart, SnapshotRequest
+from daedalus.protocol.spec import RunStatus
+from daedalus.transport.interface import Transport
+from daedalus.transport.zenoh_transport import connect
 
 UP, DOWN, DELAY = 125e3, 500e3, 0.1  # bytes a second each way, and seconds
 # The preset's window of 1 is for loopback only: nothing is played there while the learner takes a rollout in.

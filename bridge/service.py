@@ -5,8 +5,8 @@ import socket
 import threading
 from collections.abc import Callable
 
-from bridge.client import Client
-from protocol.transport import Transport
+from daedalus.bridge.connection import Client
+from daedalus.transport.interface import Transport
 
 _MOST_CLIENTS = 64  # at once
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop

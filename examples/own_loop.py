@@ -10,7 +10,7 @@ import argparse
 
 import gymnasium
 
-from actor import Client
+from daedalus.actor import Client
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """The life of a learner: let actors in, learn from what they send, publish, save, leave. The main thread.
 
-The other threads are the reception's (learner/reception.py) and the recorder's (learner/recorder.py). Torch is
-imported only when actors can already join: it takes a second, in which they make their environments.
+The other threads are the actor server's and the recorder's. Torch is imported only when actors can already join: it
+takes a second, in which they make their environments.
 """
 
 import secrets
@@ -11,23 +11,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from learner.counters import RunCounters
-from learner.evaluations import Evaluations
-from learner.fleet import Fleet
-from learner.metrics import Details
-from learner.progress import Progress
-from learner.reception import Reception
-from learner.recorder import Recorder
-from learner.report import Health, RateMeter, metrics_row, run_status, summary
-from learner.run_directory import SUMMARY, write_json
-from protocol.codec import encode
-from protocol.messages import EvaluationReport, Refusal
-from protocol.spec import RunSpec, RunStatus
-from protocol.transport import Transport
+from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.recorder import Recorder
+from daedalus.learner.reporting.report import Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.run_directory import SUMMARY, write_json
+from daedalus.learner.serving.actor_server import Reception
+from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import EvaluationReport, Refusal
+from daedalus.protocol.spec import RunSpec, RunStatus
+from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
-    from learner.checkpoint import Checkpoint
-    from learner.learner import Learner
+    from daedalus.learner.training.checkpoint import Checkpoint
+    from daedalus.learner.training.learner import Learner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ class LearnerService:
         """
         try:
             self._reception.open()
-            from learner.learner import Learner
+            from daedalus.learner.training.learner import Learner
 
             spaces = self._reception.await_spaces(self._stop, self._progress.say)
             if spaces is None:
@@ -231,7 +231,7 @@ class LearnerService:
 
     def _save(self, learner: "Learner", program: bytes) -> Path | None:
         """Saves a checkpoint and says where; a disk that refuses costs a warning."""
-        from learner.checkpoint import save_checkpoint
+        from daedalus.learner.training.checkpoint import save_checkpoint
 
         spaces = self._reception.fleet.spaces
         assert spaces is not None

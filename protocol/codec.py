@@ -29,8 +29,8 @@ import numpy as np
 import zstandard
 from pydantic import ValidationError
 
-from protocol import schema
-from protocol.messages import CompactSnapshot, Message, Program, Rollout
+from daedalus.protocol import schema
+from daedalus.protocol.messages import CompactSnapshot, Message, Program, Rollout
 
 PROTOCOL_VERSION = 4
 

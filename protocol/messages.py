@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from protocol.spec import RunSpec, RunStatus, Spaces
+from daedalus.protocol.spec import RunSpec, RunStatus, Spaces
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,10 +3,10 @@
 import datetime
 from pathlib import Path
 
-from launch.certificate_authority import CertificateAuthority
-from launch.certs import certs
-from protocol.access import common_name
-from protocol.credentials import Credentials
+from daedalus.cli.certificate_authority import CertificateAuthority
+from daedalus.cli.commands.certs import certs
+from daedalus.transport.access_control import common_name
+from daedalus.transport.credentials import Credentials
 
 
 def make_certificates(directory: Path) -> Path:

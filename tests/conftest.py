@@ -15,7 +15,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     running: list[Running] = []
 
     def start_one(*arguments: object, directory: Path = tmp_path) -> Running:
-        words = [sys.executable, "-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
+        words = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
         running.append(Running(words + [str(argument) for argument in arguments], directory))
         return running[-1]
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from actor.learner_link import LearnerLink
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
-from protocol.spec import ArraySpace, ChoiceSpace, Spaces
-from protocol.zenoh_transport import connect
+from daedalus.actor.session.learner_link import LearnerLink
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.transport.zenoh_transport import connect
 
 CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 ANSWER_SECONDS = 60.0

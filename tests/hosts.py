@@ -11,7 +11,7 @@ from pathlib import Path
 
 from processes import Running
 
-DAEDALUS = [sys.executable, "-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
+DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 _SWITCH = "switch"
 
 

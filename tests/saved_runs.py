@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from actor.environments import make_environments
-from learner.checkpoint import save_checkpoint
-from learner.learner import Learner
-from policy.best_checkpoints import best_name
-from protocol.spec import EnvironmentSpec, RunSpec, Spaces
+from daedalus.actor.environments.make import make_environments
+from daedalus.learner.training.checkpoint import save_checkpoint
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.saving.best_checkpoints import best_name
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec, Spaces
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=4)
 CARTPOLE = EnvironmentSpec(id="CartPole-v1")

@@ -6,9 +6,9 @@ An empty line each time that no learner answers.
 import sys
 import threading
 
-from launch.status import ask
-from protocol.connecting import connect_when_there
-from protocol.transport import TransportError
+from daedalus.cli.commands.status import ask
+from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.interface import TransportError
 
 if __name__ == "__main__":
     never = threading.Event()

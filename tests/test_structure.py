@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "policy", "actor", "learner", "launch", "bridge")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "bridge", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
+    "transport": {"protocol", "transport"},
     "policy": {"protocol", "policy"},
-    "actor": {"protocol", "policy", "actor"},
-    "learner": {"protocol", "policy", "learner"},
-    "launch": {"protocol", "learner", "launch"},
-    "bridge": {"protocol", "bridge"},
+    "algorithms": {"protocol", "policy", "algorithms"},
+    "actor": {"protocol", "transport", "policy", "actor"},
+    "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
+    "bridge": {"protocol", "transport", "bridge"},
+    "cli": set(PACKAGES),
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
 
@@ -39,8 +41,16 @@ def imported(tree: ast.Module) -> set[str]:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_import_along_the_arrows_only(package: str) -> None:
     for path, tree in sources(package):
-        ours = {name.split(".")[0] for name in imported(tree)} & set(PACKAGES)
+        ours = {name.split(".")[1] for name in imported(tree) if name.startswith("daedalus.")}
         assert ours <= ALLOWED[package], path
+
+
+def test_no_file_imports_a_package_by_its_folder() -> None:
+    """A package imported by its folder's name would exist twice, and anything else may bear that name."""
+    for folder in (*PACKAGES, "tests", "benchmarks", "examples"):
+        for path, tree in sources(folder):
+            top_level = {name.split(".")[0] for name in imported(tree)}
+            assert not top_level & {*PACKAGES, "launch"}, path
 
 
 def test_zenoh_is_imported_in_one_file() -> None:
@@ -77,17 +87,17 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("actor.__main__", {"torch", "learner", "launch"}),
-        ("actor.evaluate", {"torch", "learner", "launch", "zenoh"}),
-        ("learner.__main__", {"torch", "actor", "launch", "gymnasium"}),
-        ("launch.train", {"torch", "actor", "gymnasium", "zenoh", "onnxruntime"}),
-        ("launch.router", {"torch", "actor", "gymnasium", "onnxruntime"}),
-        ("launch.exporter", {"torch", "actor", "gymnasium", "onnxruntime", "prometheus_client"}),
-        ("protocol.codec", {"torch", "zenoh", "policy"}),
-        ("bridge.__main__", {"torch", "actor", "learner", "launch", "numpy", "gymnasium"}),
+        ("cli.commands.actor", {"torch", "daedalus.learner", "daedalus.algorithms"}),
+        ("cli.commands.evaluate", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
+        ("cli.commands.learner", {"torch", "daedalus.actor", "gymnasium"}),
+        ("cli.commands.train", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime"}),
+        ("cli.commands.router", {"torch", "daedalus.actor", "gymnasium", "onnxruntime"}),
+        ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
+        ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
+        ("bridge.service", {"torch", "daedalus.actor", "daedalus.learner", "numpy", "gymnasium"}),
     ],
 )
 def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
-    program = f"import sys, {module}; print('\\n'.join(sys.modules))"
+    program = f"import sys, daedalus.{module}; print('\\n'.join(sys.modules))"
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert not absent & set(output.splitlines())

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Callable
 from typing import Any, cast
 
-from actor.service import ActorConfig, ActorService
-from protocol.codec import Limits, decode
-from protocol.connecting import connect_when_there
-from protocol.messages import Acknowledgement, Rollout
-from protocol.process import stop_on_signals
-from protocol.transport import Transport
+from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.cli.processes import stop_on_signals
+from daedalus.protocol.codec import Limits, decode
+from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.interface import Transport
 
 
 class JournalTransport:

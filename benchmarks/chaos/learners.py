@@ -13,10 +13,10 @@ import numpy as np
 from processes import processes_mentioning
 
 from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
-from learner.checkpoint import load_newest, save_checkpoint
-from learner.learner import Learner
-from policy.sealed import DamagedError
-from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
+from daedalus.learner.training.checkpoint import load_newest, save_checkpoint
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
 
 
 def kills(count: int) -> list[tuple[str, str]]:

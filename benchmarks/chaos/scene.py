@@ -16,12 +16,12 @@ import numpy as np
 from processes import Running, processes_mentioning
 
 from benchmarks.running import COMMAND
-from protocol import keys
-from protocol.codec import Limits, ProtocolError, decode
-from protocol.messages import StatusReport
-from protocol.spec import ActorStatus, RunStatus
-from protocol.transport import Transport, TransportError
-from protocol.zenoh_transport import connect
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.zenoh_transport import connect
 
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 LIMIT = 120.0  # seconds; what takes longer has failed

@@ -6,8 +6,8 @@ Lines of `policy_version seconds`, on the clock that all processes of this machi
 import sys
 import time
 
-from learner.__main__ import main
-from learner.reception import Reception
+from daedalus.cli.commands.learner import main
+from daedalus.learner.serving.actor_server import Reception
 
 if __name__ == "__main__":
     notes = open(sys.argv.pop(1), "a", buffering=1)  # noqa: SIM115 - for as long as the process lives

@@ -18,13 +18,13 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
-from actor.learner_link import LearnerLink
-from actor.uploader import Uploader
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.connecting import connect_when_there
-from protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
-from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.actor.session.learner_link import LearnerLink
+from daedalus.actor.session.uploader import Uploader
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.transport.connecting import connect_when_there
 
 SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 ENVIRONMENTS = 16

@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from actor.environments import UnplayableError, make_environments
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.8), (-0.4, 0.3, 0.0), (0.4, 0.3, 0.0))
 ROAD = slice(0, 84)  # the rows above the dashboard
@@ -80,7 +80,11 @@ def test_the_sketch_is_of_car_racing_only() -> None:
 
 @pytest.mark.parametrize("backend", ["gymnasium", "sketch"])
 def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith(("gymnasium.envs.box2d", "actor.car_racing"))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith(("gymnasium.envs.box2d", "daedalus.actor.environments.car_racing"))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     for name in ("Box2D", "pygame"):
         monkeypatch.setitem(sys.modules, name, None)

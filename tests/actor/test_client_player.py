@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from processes import LIMIT, until
 
-from actor.client_player import _HELD_ROLLOUTS, ClientPlayer
-from actor.collector import Collector
-from actor.environments import make_environments
-from actor.learner_link import ActorError
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime
-from protocol.messages import Rollout, RolloutIdentity, Snapshot
-from protocol.spec import RunSpec
+from daedalus.actor.collecting.client_player import _HELD_ROLLOUTS, ClientPlayer
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.session.learner_link import ActorError
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spec import RunSpec
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 ROWS = 5

@@ -8,10 +8,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from actor.collector import Collector
-from actor.environments import make_environments
-from protocol.messages import Rollout, RolloutIdentity
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.environments.make import make_environments
+from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)

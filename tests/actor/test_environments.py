@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from actor.environments import UnplayableError, make_environments
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.protocol.spec import EnvironmentSpec
 
 
 @pytest.mark.parametrize(

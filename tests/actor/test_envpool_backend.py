@@ -8,9 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from actor.environments import UnplayableError, make_environments
-from actor.envpool_backend import EnvpoolEnvironments
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments
+from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.protocol.spec import EnvironmentSpec
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", UserWarning)

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from processes import LIMIT
 
-from actor.evaluator import Evaluator
-from actor.learner_link import ActorError
-from actor.service import ActorConfig
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import program_hash
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.messages import (
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.service import ActorConfig
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
@@ -30,8 +30,8 @@ from protocol.messages import (
     Snapshot,
     Welcome,
 )
-from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
-from protocol.transport import MemoryNetwork, MemoryTransport, Request
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request
 
 
 def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
@@ -318,7 +318,7 @@ def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     network: MemoryNetwork, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endless = Endless()
-    monkeypatch.setattr("actor.evaluator.make_environments", lambda *_, **__: endless)
+    monkeypatch.setattr("daedalus.actor.evaluation.evaluator.make_environments", lambda *_, **__: endless)
     evaluator = RunningEvaluator(network)
     learner.give(learner.snapshot(0))
     assert endless.playing.wait(LIMIT)
@@ -337,7 +337,7 @@ def test_every_evaluation_plays_other_episodes_and_the_same_ones_after_a_restart
     for _ in range(2):
         learner = ScriptedLearner(network, run_spec())
         brief = Brief()
-        monkeypatch.setattr("actor.evaluator.make_environments", lambda *_, made=brief, **__: made)
+        monkeypatch.setattr("daedalus.actor.evaluation.evaluator.make_environments", lambda *_, made=brief, **__: made)
         evaluator = RunningEvaluator(network)
         for version in range(3):
             learner.give(learner.snapshot(version))

@@ -11,10 +11,10 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 
-from actor.environment_processes import EnvironmentProcesses
-from actor.environments import UnplayableError, VectorEnvironment, make_environments
-from actor.gymnasium_backend import MakeOne, RepeatedSteps
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.gymnasium_backend import MakeOne, RepeatedSteps
+from daedalus.actor.environments.make import UnplayableError, VectorEnvironment, make_environments
+from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5
 

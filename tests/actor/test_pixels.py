@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from actor.pixels import Pixels, crop, grey, resize
-from actor.unplayable import UnplayableError
-from protocol.spec import EnvironmentSpec
+from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.pixels import Pixels, crop, grey, resize
+from daedalus.protocol.spec import EnvironmentSpec
 
 
 def _noise(*shape: int) -> np.ndarray:

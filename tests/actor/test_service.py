@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from processes import LIMIT, until
 
-from actor import conversation, learner_link, service
-from actor.learner_link import ActorError
-from actor.service import ActorConfig, ActorService, LinkChoice
-from learner.compact_desk import CompactDesk
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import program_hash
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.messages import (
+from daedalus.actor.session import learner_link, service
+from daedalus.actor.session import upload_session as conversation
+from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
+from daedalus.learner.serving.compact_snapshot_cache import CompactDesk
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import (
     Acknowledgement,
     Farewell,
     Join,
@@ -30,8 +31,8 @@ from protocol.messages import (
     SnapshotRequest,
     Welcome,
 )
-from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
-from protocol.transport import MemoryNetwork, MemoryTransport, Request, TransportError
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request, TransportError
 
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from actor.uploader import Uploader
-from protocol.messages import Acknowledgement
+from daedalus.actor.session.uploader import Uploader
+from daedalus.protocol.messages import Acknowledgement
 
 
 def answer(verdict: str, version: int = 0) -> Acknowledgement:

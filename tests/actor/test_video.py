@@ -1,4 +1,4 @@
-"""actor/video.py: what was shown is in the file, or there is no file."""
+"""actor/evaluation/video.py: what was shown is in the file, or there is no file."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from actor.video import Video, VideoError
+from daedalus.actor.evaluation.video import Video, VideoError
 
 FILES = ["film.mp4", "film.gif"]
 

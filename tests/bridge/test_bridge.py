@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from processes import LIMIT, until
 
-from bridge import client as client_module
-from bridge import service as service_module
-from bridge.parcels import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Parcel, encode
-from bridge.service import Bridge
-from protocol.transport import MemoryNetwork, MemoryTransport, Transport, TransportError
+from daedalus.bridge import connection as client_module
+from daedalus.bridge import service as service_module
+from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Parcel, encode
+from daedalus.bridge.service import Bridge
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Transport, TransportError
 
 HEADER = struct.Struct("<IBBHI")  # once more, by hand
 

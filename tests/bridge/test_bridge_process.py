@@ -8,10 +8,10 @@ import pytest
 from certificates import make_certificates
 from processes import LIMIT, Running, until
 
-from bridge.parcels import GREETING, Kind, Parcel, encode
-from protocol.credentials import load
-from protocol.transport import Transport
-from protocol.zenoh_transport import listen
+from daedalus.bridge.packets import GREETING, Kind, Parcel, encode
+from daedalus.transport.credentials import load
+from daedalus.transport.interface import Transport
+from daedalus.transport.zenoh_transport import listen
 
 Start = Callable[..., Running]
 

@@ -8,7 +8,7 @@ import yaml
 from composition import HERE, Compose
 from docker_host import run
 
-from learner.options import learner_parser, resolve
+from daedalus.cli.settings_arguments import learner_parser, resolve
 
 Status = dict[str, Any]
 

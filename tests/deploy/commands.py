@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import pytest
 
-from actor import options as actor_options
-from launch import exporter, router, status
-from learner import options as learner_options
-from learner.settings import SettingsError
-from protocol.addresses import AddressError, check_listening
+from daedalus.cli import settings_arguments as learner_options
+from daedalus.cli.commands import actor_arguments as actor_options
+from daedalus.cli.commands import exporter, router, status
+from daedalus.learner.run.settings import SettingsError
+from daedalus.transport.addresses import AddressError, check_listening
 
 PARSERS = {
     "actor": actor_options.parser,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from launch.prometheus import metrics
+from daedalus.cli.prometheus_metrics import metrics
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DASHBOARD = json.loads((GRAFANA / "dashboards" / "daedalus.json").read_text())

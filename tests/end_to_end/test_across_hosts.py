@@ -11,7 +11,7 @@ import pytest
 from hosts import Host, Network, NoHostsError
 from processes import Running, until
 
-from launch.certs import certs
+from daedalus.cli.commands.certs import certs
 
 TESTS = Path(__file__).parent.parent
 PORT = 7447

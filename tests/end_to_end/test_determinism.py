@@ -7,13 +7,13 @@ from pathlib import Path
 
 from processes import LIMIT, Running
 
-from actor.service import ActorConfig, ActorService
-from learner import run_directory
-from learner.progress import Progress
-from learner.service import LearnerService, Outcome
-from learner.settings import choose_algorithm, override, read_preset, run_spec
-from protocol.spec import RunSpec
-from protocol.transport import MemoryNetwork, MemoryTransport
+from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.run import run_directory
+from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
+from daedalus.learner.service import LearnerService, Outcome
+from daedalus.protocol.spec import RunSpec
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport
 
 SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
 

@@ -18,16 +18,14 @@ from PIL import Image
 from processes import Running, processes_mentioning
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
-import actor.evaluate
-import launch.train
-import policy.saved_policy
-from actor.environments import make_environments
-from actor.evaluate import main
-from learner.run_directory import create, read_json, write_json
-from policy.best_checkpoints import best_checkpoints, best_score
-from policy.runtime import OnnxRuntime
-from policy.saved_policy import checkpoints, read_policy
-from protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec
+from daedalus.actor.environments.make import make_environments
+from daedalus.cli.commands import train as train_command
+from daedalus.cli.commands.evaluate import main
+from daedalus.learner.run.run_directory import create, read_json, write_json
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec
 
 Start = Callable[..., Running]
 
@@ -222,7 +220,7 @@ def test_a_window_is_shown_where_there_is_a_screen(
 def test_a_shipped_policy_plays_as_it_did_in_its_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], refused: Callable[..., str]
 ) -> None:
-    monkeypatch.setattr(policy.saved_policy, "PRETRAINED", tmp_path / "pretrained")
+    monkeypatch.setattr("daedalus.policy.saving.saved_policy.PRETRAINED", tmp_path / "pretrained")
     assert "'cartpole': none ships" in refused(1, "--pretrained", "cartpole")
     create(tmp_path / "run", RunSpec(environment=CARTPOLE))
     run = save(tmp_path / "run", CARTPOLE, 4, 5)
@@ -264,14 +262,14 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
     (run / "checkpoints" / "0000000005").rename(tmp_path / "no newer one")
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
-    assert launch.train._evaluate(run, spec, None, threading.Event())
+    assert train_command._evaluate(run, spec, None, threading.Event())
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
     assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
     assert evaluation["run_off"] == []
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
-    launch.train._report(run, spec)
+    train_command._report(run, spec)
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in capsys.readouterr().out
 
 
@@ -284,7 +282,7 @@ def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, eval
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
     newest = max(version for version in (1, 2, 3) if version != worst)
-    assert launch.train._evaluate(run, spec, None, threading.Event())
+    assert train_command._evaluate(run, spec, None, threading.Event())
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["run_off"]]
@@ -303,7 +301,7 @@ def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) 
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
     stopping.set()
-    assert not launch.train._evaluate(run, spec, None, stopping)
+    assert not train_command._evaluate(run, spec, None, stopping)
     assert not processes_mentioning(str(run))
 
 
@@ -314,7 +312,7 @@ def test_progress_goes_to_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
-    monkeypatch.setattr(actor.evaluate, "_PROGRESS_SECONDS", 0.0)
+    monkeypatch.setattr("daedalus.cli.commands.evaluate._PROGRESS_SECONDS", 0.0)
     assert main([str(run), "--json", "--episodes", "2", "--envs", "1"]) == 0
     captured = capsys.readouterr()
     lines = captured.err.splitlines()

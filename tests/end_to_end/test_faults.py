@@ -13,7 +13,7 @@ import safetensors.numpy
 from faults import Sender, StallingProxy
 from processes import LIMIT, Running, processes_mentioning, until
 
-from protocol import keys
+from daedalus.protocol import keys
 
 Start = Callable[..., Running]
 Status = Callable[..., dict]

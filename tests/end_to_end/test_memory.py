@@ -10,7 +10,7 @@ import cue_environment
 import pytest
 from processes import Running, until
 
-from policy.best_checkpoints import best_checkpoints, best_score
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 
 Start = Callable[..., Running]
 SETTINGS = (

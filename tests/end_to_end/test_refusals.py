@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 import pytest
 from processes import Running, until
 
-from protocol import keys
-from protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
-from protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
-from protocol.spec import ArraySpace, ChoiceSpace, Spaces
-from protocol.transport import Transport
-from protocol.zenoh_transport import connect, listen
+from daedalus.protocol import keys
+from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
+from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.transport.interface import Transport
+from daedalus.transport.zenoh_transport import connect, listen
 
 CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
 Start = Callable[..., Running]

@@ -7,7 +7,7 @@ import pytest
 from certificates import make_certificates
 from processes import Running, until
 
-from launch.certs import certs
+from daedalus.cli.commands.certs import certs
 
 Start = Callable[..., Running]
 

@@ -41,7 +41,7 @@ def nobody_listens(output: str) -> bool:
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A run of the main job, to its end; several tests look at it."""
     folder = tmp_path_factory.mktemp("solved")
-    words = ["-P", "-c", "from launch.cli import main; raise SystemExit(main())"]
+    words = ["-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
     # More than the preset's budget: no two asynchronous runs are alike, and these tests are not about how fast one
     # learns.
     running = Running(

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from processes import LIMIT
 
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime, program_hash
-from protocol import keys
-from protocol.codec import Limits, decode, encode
-from protocol.messages import Acknowledgement, Farewell, Join, Program, Refusal, Rollout, Snapshot, Welcome
-from protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
-from protocol.transport import MemoryTransport, Request
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime, program_hash
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import Acknowledgement, Farewell, Join, Program, Refusal, Rollout, Snapshot, Welcome
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
+from daedalus.transport.interface import MemoryTransport, Request
 
 SPEC = RunSpec(
     environment=EnvironmentSpec(id="CartPole-v1", reward_scale=0.05, max_episode_steps=40),

@@ -15,12 +15,12 @@ import torch
 from close_look import ONE_AT_A_TIME, SPEC, CloseLook
 from processes import LIMIT, Running, until
 
-from bridge.service import Bridge
-from policy.runtime import OnnxRuntime
-from protocol.codec import PROTOCOL_VERSION
-from protocol.messages import Acknowledgement, Refusal
-from protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
-from protocol.transport import MemoryNetwork, MemoryTransport
+from daedalus.bridge.service import Bridge
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.codec import PROTOCOL_VERSION
+from daedalus.protocol.messages import Acknowledgement, Refusal
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport
 
 Start = Callable[..., Running]
 

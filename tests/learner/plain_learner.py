@@ -1,4 +1,4 @@
-"""learner/learner.py once more, written out plainly: one row of one environment at a time, in the papers' terms."""
+"""The learner once more, written out plainly: one row of one environment at a time, in the papers' terms."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from building import SPACES
 from oracles import Stream, lambda_return, vtrace, vtrace_advantage
 from torch import Tensor, nn
 
-from learner.batch import Batch
-from policy.network import ActorCritic
-from protocol.spec import PolicySpec, TrainingSpec
+from daedalus.algorithms.batch import Batch
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 Cell = tuple[int, int]  # row and environment
 Played = dict[Cell, Tensor]

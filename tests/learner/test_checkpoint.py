@@ -1,4 +1,4 @@
-"""learner/checkpoint.py: what was saved comes back whole, or is not used."""
+"""learner/training/checkpoint.py: what was saved comes back whole, or is not used."""
 
 import errno
 import os
@@ -10,9 +10,9 @@ import pytest
 import torch
 from building import SPACES, run_spec
 
-from learner.checkpoint import load_checkpoint, load_newest, save_checkpoint
-from policy.saved_policy import checkpoints, read_policy
-from policy.sealed import DamagedError
+from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
 COUNTERS = {"env_steps": 12, "returns": [1.5, -2.25], "rollouts_rejected": {"stale": 3}}

@@ -1,4 +1,4 @@
-"""learner/counters.py: what a run has done, over its resumes."""
+"""learner/run/counters.py: what a run has done, over its resumes."""
 
 import json
 from typing import Any
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from building import make_rollout
 
-from learner.counters import RunCounters
-from protocol.messages import Rollout
+from daedalus.learner.run.counters import RunCounters
+from daedalus.protocol.messages import Rollout
 
 
 def rollout(version: int = 0, returns: tuple[float, ...] = (), seed: int = 0) -> Rollout:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
 
-from learner.checkpoint import load_checkpoint, save_checkpoint
-from learner.learner import Learner
-from policy.runtime import OnnxRuntime
-from protocol.messages import Rollout
-from protocol.spec import ArraySpace, PolicySpec, Spaces, TrainingSpec
+from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spec import ArraySpace, PolicySpec, Spaces, TrainingSpec
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device here")
 

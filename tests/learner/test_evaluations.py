@@ -1,4 +1,4 @@
-"""learner/evaluations.py: what was played is kept until it is reported on, the best for good."""
+"""learner/serving/evaluations.py: what was played is kept until it is reported on, the best for good."""
 
 import errno
 import os
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from building import EPOCH, SPACES, run_spec
 
-from learner.checkpoint import load_checkpoint, load_newest, save_checkpoint
-from learner.evaluations import Evaluations
-from learner.metrics import COLUMNS
-from policy.best_checkpoints import best_checkpoints, best_score
-from policy.saved_policy import checkpoints, read_policy
-from protocol.messages import Acknowledgement, EvaluationReport
+from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 
 
 class Run:

@@ -1,13 +1,13 @@
-"""learner/fleet.py: who takes part, under which identity, and what was taken of them."""
+"""learner/serving/fleet.py: who takes part, under which identity, and what was taken of them."""
 
 import pytest
 from building import SPACES, identity, joined_fleet
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.fleet import Fleet, SequenceWindow
-from protocol.messages import Join, Refusal
-from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.learner.serving.fleet import Fleet, SequenceWindow
+from daedalus.protocol.messages import Join, Refusal
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
 
 WINDOW = 1024
 HUGE = 2**62

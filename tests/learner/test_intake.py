@@ -1,4 +1,4 @@
-"""learner/intake.py: every way in which a rollout can be wrong, and that each is taken at most once."""
+"""learner/serving/intake.py: every way in which a rollout can be wrong, and that each is taken at most once."""
 
 import dataclasses
 from typing import Any
@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from learner.fleet import Fleet
-from learner.intake import Intake, Rejected, acknowledgement
-from protocol.codec import encode
-from protocol.messages import Farewell, Join, Rollout
-from protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Farewell, Join, Rollout
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
 

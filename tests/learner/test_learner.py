@@ -1,4 +1,4 @@
-"""learner/learner.py against the same update written out plainly, and against itself after a restart."""
+"""learner/training/learner.py against the same update written out plainly, and against itself after a restart."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +12,11 @@ from plain_learner import PlainLearner
 from torch import Tensor
 from torch.testing import assert_close
 
-from learner.checkpoint import load_checkpoint, save_checkpoint
-from learner.learner import METRICS, Learner
-from policy.network import ActorCritic
-from protocol.messages import Rollout
-from protocol.spec import ArraySpace, PolicySpec, TrainingSpec
+from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
+from daedalus.learner.training.learner import METRICS, Learner
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spec import ArraySpace, PolicySpec, TrainingSpec
 
 STEPS = 5
 

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 from processes import until
 
-from actor.evaluator import Evaluator
-from actor.service import ActorConfig, ActorService
-from learner.progress import Progress
-from learner.service import LearnerService
-from policy.best_checkpoints import best_checkpoints, best_score
-from policy.saved_policy import checkpoints, read_policy
-from protocol.spec import RunSpec
-from protocol.transport import MemoryNetwork, MemoryTransport
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.service import LearnerService
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
+from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.protocol.spec import RunSpec
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport
 
 FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
 

@@ -1,4 +1,4 @@
-"""learner/metrics.py: rows that can be read again by those who read them."""
+"""learner/reporting/metrics.py: rows that can be read again by those who read them."""
 
 import csv
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from learner.learner import METRICS
-from learner.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, TensorBoardWriter
+from daedalus.learner.reporting.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, TensorBoardWriter
+from daedalus.learner.training.learner import METRICS
 
 NONE = Details()
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 from building import join
 
-from actor.collector import Collector
-from actor.environments import make_environments
-from policy.distributions import categorical_log_probs
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime, PolicyRuntime
-from policy.torch_runtime import TorchRuntime
-from protocol.codec import Limits, decode, encode
-from protocol.messages import Rollout, RolloutIdentity
-from protocol.spec import EnvironmentSpec, PolicySpec, Spaces
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.environments.make import make_environments
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.acting.torch_runtime import TorchRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, Spaces
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 POLICIES = {

@@ -1,4 +1,4 @@
-"""learner/optimizers.py against torch's own, and against the paper's formula written out."""
+"""learner/training/optimizers.py against torch's own, and against the paper's formula written out."""
 
 import copy
 import math
@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from learner.optimizers import Adam, FlatParameters, RmsProp
+from daedalus.learner.training.optimizers import Adam, FlatParameters, RmsProp
 
 
 def network() -> nn.Sequential:

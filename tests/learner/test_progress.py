@@ -1,11 +1,11 @@
-"""learner/progress.py: one line on a terminal, lines now and then elsewhere."""
+"""learner/reporting/progress.py: one line on a terminal, lines now and then elsewhere."""
 
 import io
 from types import SimpleNamespace
 
 import pytest
 
-from learner.progress import Progress
+from daedalus.learner.reporting.progress import Progress
 
 CLEAR = "\r\x1b[K"
 

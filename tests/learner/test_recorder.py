@@ -1,4 +1,4 @@
-"""learner/recorder.py: rows reach the disk, and a disk that refuses them costs nothing but those rows."""
+"""learner/reporting/recorder.py: rows reach the disk, and a disk that refuses them costs nothing but those rows."""
 
 import csv
 import errno
@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from processes import until
 
-from learner import recorder
-from learner.metrics import CsvWriter, Details
-from learner.progress import Progress
-from learner.recorder import Recorder
+from daedalus.learner.reporting import recorder
+from daedalus.learner.reporting.metrics import CsvWriter, Details
+from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.recorder import Recorder
 
 ROW = {
     "wall_seconds": 1.0,

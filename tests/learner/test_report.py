@@ -1,4 +1,4 @@
-"""learner/report.py: what a run tells of itself."""
+"""learner/reporting/report.py: what a run tells of itself."""
 
 import dataclasses
 import json
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from building import EPOCH, joined_fleet, make_rollout, run_spec
 
-from learner.counters import RunCounters
-from learner.learner import METRICS
-from learner.metrics import COLUMNS
-from learner.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
+from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.reporting.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.training.learner import METRICS
 
 EVERYTHING = np.ones((6, 3), np.bool_)
 

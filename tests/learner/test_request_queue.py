@@ -1,11 +1,11 @@
-"""learner/request_queue.py: bounded by bytes and by number, first in, first out."""
+"""learner/serving/request_queue.py: bounded by bytes and by number, first in, first out."""
 
 import threading
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.request_queue import RequestQueue
+from daedalus.learner.serving.request_queue import RequestQueue
 
 
 class Asked:

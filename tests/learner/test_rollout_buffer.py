@@ -1,10 +1,10 @@
-"""learner/rollout_buffer.py: when a batch is complete, and of what."""
+"""learner/serving/rollout_buffer.py: when a batch is complete, and of what."""
 
 import pytest
 from building import identity, make_rollout
 
-from learner.rollout_buffer import BarrierBuffer, StreamBuffer, Taken
-from protocol.messages import Rollout
+from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, Taken
+from daedalus.protocol.messages import Rollout
 
 
 def rollout(actor: str, sequence: int = 0, version: int = 0) -> Rollout:

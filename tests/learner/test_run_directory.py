@@ -1,4 +1,4 @@
-"""learner/run_directory.py: what is written there reproduces the run."""
+"""learner/run/run_directory.py: what is written there reproduces the run."""
 
 import json
 from pathlib import Path
@@ -9,10 +9,10 @@ from building import run_spec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner import run_directory
-from learner.settings import SettingsError, read_preset
-from learner.settings import run_spec as run_spec_of
-from protocol.spec import RunSpec
+from daedalus.learner.run import run_directory
+from daedalus.learner.run.settings import SettingsError, read_preset
+from daedalus.learner.run.settings import run_spec as run_spec_of
+from daedalus.protocol.spec import RunSpec
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 ABOVE_0 = st.floats(0.0, 1e9, exclude_min=True)

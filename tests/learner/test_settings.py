@@ -1,11 +1,11 @@
-"""learner/settings.py: what makes a run, and one line that helps where it makes none."""
+"""learner/run/settings.py: what makes a run, and one line that helps where it makes none."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from learner.settings import (
+from daedalus.learner.run.settings import (
     SettingsError,
     choose_algorithm,
     override,

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime, PolicyRuntime
-from policy.torch_runtime import TorchRuntime
-from protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.acting.torch_runtime import TorchRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
 
 Weights = dict[str, np.ndarray]
 

@@ -1,10 +1,10 @@
-"""policy/best_checkpoints.py: which are kept, under which names."""
+"""policy/saving/best_checkpoints.py: which are kept, under which names."""
 
 from pathlib import Path
 
 import pytest
 
-from policy.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, score_anew
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, score_anew
 
 
 def checkpoint(run: Path, version: int) -> Path:

@@ -10,11 +10,11 @@ import torch
 from policies import make_policy, observations, spaces
 from torch import nn
 
-from policy.errors import NetworkError
-from policy.network import ActorCritic
-from policy.program import export_program
-from policy.runtime import OnnxRuntime
-from protocol.spec import PolicySpec
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.errors import NetworkError
+from daedalus.protocol.spec import PolicySpec
 
 PREAMBLE = """
 import torch

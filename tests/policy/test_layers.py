@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from policy.layers import BytesConv2d, PReLU, orthogonal
+from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
 
 
 @pytest.mark.parametrize("slope", [0.25, -0.5, 0.0, 1.5])

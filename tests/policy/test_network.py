@@ -9,11 +9,11 @@ from policies import POLICIES, Policy, make_policy, observations, spaces
 from torch import Tensor, nn
 from torch.nn import functional
 
-from policy.encoders import MultilayerPerceptron, build_encoder
-from policy.errors import NetworkError
-from policy.memory import Gru
-from policy.network import ActorCritic
-from protocol.spec import ArraySpace, PolicySpec
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.encoders import MultilayerPerceptron, build_encoder
+from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.memory import Gru
+from daedalus.protocol.spec import ArraySpace, PolicySpec
 
 ENCODERS = ("small", "nature", "impala", "article")
 

@@ -13,9 +13,9 @@ import torch
 from onnx import TensorProto, helper
 from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
-from policy.constants import with_constants
-from policy.program import export_program
-from policy.runtime import (
+from daedalus.policy.acting.onnx_initializers import with_constants
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import (
     LOGITS,
     NEXT_STATE,
     OBSERVATIONS,
@@ -25,8 +25,8 @@ from policy.runtime import (
     PolicyRuntime,
     program_hash,
 )
-from policy.torch_runtime import TorchRuntime
-from protocol.spec import PolicySpec
+from daedalus.policy.acting.torch_runtime import TorchRuntime
+from daedalus.protocol.spec import PolicySpec
 
 NO_STATE = np.zeros((1, 0), np.float32)
 
@@ -384,6 +384,6 @@ def test_onnxruntime_is_kept_from_telling_its_makers() -> None:
     """Where it may, and cannot write down who we are, it says so."""
     environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
     environment |= {"HOME": "/proc", "XDG_CACHE_HOME": "/proc"}
-    command = [sys.executable, "-c", "import policy.runtime"]
+    command = [sys.executable, "-c", "import daedalus.policy.acting.runtime"]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert "elemetry" not in result.stderr

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from policy.distributions import categorical_log_probs
-from policy.sampling import greedy_categorical, sample_categorical
+from daedalus.policy.acting.sampling import greedy_categorical, sample_categorical
+from daedalus.policy.network.distributions import categorical_log_probs
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 numbers = st.floats(-10, 10, width=32) | st.sampled_from([0.0, 1e4, -1e4, 1e30, -1e30, 88.0, -88.0, -np.inf])

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from policy.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, checkpoints, read_policy
-from policy.sealed import DamagedError, SealedDirectory, write_sealed
+from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 
 FILES = {"weights": bytes(range(40)), "program": b"onnx", "empty": b""}
 CONTENT = {"policy_version": 3, "note": "é", "nested": {"list": [1, None, 2.5]}}

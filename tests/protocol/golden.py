@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from protocol.codec import PROTOCOL_VERSION, encode
-from protocol.compact import bfloat16, planes
-from protocol.messages import (
+from daedalus.protocol.codec import PROTOCOL_VERSION, encode
+from daedalus.protocol.compact import bfloat16, planes
+from daedalus.protocol.messages import (
     Acknowledgement,
     CompactSnapshot,
     EvaluationReport,
@@ -28,7 +28,7 @@ from protocol.messages import (
     StatusReport,
     Welcome,
 )
-from protocol.spec import ActorStatus, ArraySpace, ChoiceSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
+from daedalus.protocol.spec import ActorStatus, ArraySpace, ChoiceSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4

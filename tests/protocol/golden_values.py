@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from golden import FOLDER, MESSAGES
 
-from protocol import schema
-from protocol.codec import PROTOCOL_VERSION
+from daedalus.protocol import schema
+from daedalus.protocol.codec import PROTOCOL_VERSION
 
 PATH: Path = FOLDER / f"v{PROTOCOL_VERSION}" / "values.json"
 

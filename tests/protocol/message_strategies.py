@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 from wire_format import DTYPES, bits
 
-from protocol.messages import (
+from daedalus.protocol.messages import (
     Acknowledgement,
     CompactSnapshot,
     EvaluationReport,
@@ -23,7 +23,7 @@ from protocol.messages import (
     StatusReport,
     Welcome,
 )
-from protocol.spec import (
+from daedalus.protocol.spec import (
     ActorStatus,
     ArraySpace,
     ChoiceSpace,

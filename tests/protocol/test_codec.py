@@ -25,8 +25,8 @@ from wire_format import (
     wire,
 )
 
-from protocol.codec import decode, encode
-from protocol.messages import (
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.messages import (
     Message,
     Program,
     Rollout,

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from message_strategies import messages, text
 from wire_format import DTYPES, LIMITS, SAMPLES, decoded_or_refused, repeatable, unwire, wire, wire_header
 
-from protocol.codec import ProtocolError, decode, encode
-from protocol.messages import (
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.messages import (
     Message,
 )
 

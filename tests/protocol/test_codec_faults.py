@@ -17,8 +17,8 @@ from wire_format import (
     wire_header,
 )
 
-from protocol.codec import PROTOCOL_VERSION, ProtocolError, VersionMismatchError, decode, encode
-from protocol.messages import (
+from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, VersionMismatchError, decode, encode
+from daedalus.protocol.messages import (
     Farewell,
     Join,
     Message,

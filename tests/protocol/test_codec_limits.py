@@ -20,8 +20,8 @@ from wire_format import (
     wire_header,
 )
 
-from protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
-from protocol.messages import (
+from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from daedalus.protocol.messages import (
     Farewell,
     Program,
     Snapshot,

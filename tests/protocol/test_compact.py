@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from protocol.compact import bfloat16, bits_of, float32, planes
+from daedalus.protocol.compact import bfloat16, bits_of, float32, planes
 
 repeatable = settings(max_examples=200, deadline=None, derandomize=True)
 shapes = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5)

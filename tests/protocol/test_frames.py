@@ -11,11 +11,11 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actor.collector import Collector
-from protocol.codec import Limits, decode, encode
-from protocol.frames import FrameStack, stack_rows
-from protocol.messages import Rollout, RolloutIdentity
-from protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
+from daedalus.actor.collecting.collector import Collector
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.frames import FrameStack, stack_rows
+from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 

@@ -10,8 +10,8 @@ import zstandard
 from golden import FOLDER, MESSAGES, path
 from wire_format import PREFIX, the_same
 
-from protocol.codec import PROTOCOL_VERSION, Limits, VersionMismatchError, decode, encode
-from protocol.messages import Message
+from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, VersionMismatchError, decode, encode
+from daedalus.protocol.messages import Message
 
 OLD = sorted(FOLDER.glob("v*/*.bin"))
 

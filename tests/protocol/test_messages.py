@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocol.messages import EvaluationReport, Rollout, RolloutIdentity
+from daedalus.protocol.messages import EvaluationReport, Rollout, RolloutIdentity
 
 T, E, K = 3, 2, 1
 

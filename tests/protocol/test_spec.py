@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from protocol.spec import (
+from daedalus.protocol.spec import (
     ActorStatus,
     ArraySpace,
     ChoiceSpace,

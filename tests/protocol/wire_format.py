@@ -9,8 +9,8 @@ import msgpack
 import numpy as np
 from hypothesis import settings
 
-from protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
-from protocol.messages import (
+from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from daedalus.protocol.messages import (
     Join,
     Message,
     Rollout,
@@ -18,7 +18,7 @@ from protocol.messages import (
     Snapshot,
     Welcome,
 )
-from protocol.spec import (
+from daedalus.protocol.spec import (
     ArraySpace,
     ChoiceSpace,
     EnvironmentSpec,

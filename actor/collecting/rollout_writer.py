@@ -1,0 +1,167 @@
+"""Acts for E environments and writes down what comes of it, row by row. No network, no threads, no environments."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.protocol.frames import FrameStack
+from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.spec import ArraySpace, EnvironmentSpec, Spaces
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinishedEpisodes:
+    """The episodes that ended in some rows, in the order of their ends."""
+
+    returns: np.ndarray  # [K] float32, undiscounted and unscaled
+    lengths: np.ndarray  # [K] int32, env_steps
+
+
+class EpisodeCounter:
+    """Follows E environments' running episodes; says which rows are valid and which episodes ended."""
+
+    def __init__(self, count: int) -> None:
+        self._returns = np.zeros(count, np.float64)
+        self._lengths = np.zeros(count, np.int32)
+        self._ended = np.zeros(count, np.bool_)
+        self._finished: list[tuple[np.ndarray, np.ndarray]] = []
+
+    @property
+    def valid(self) -> np.ndarray:
+        """[E] whether the next step is a real one, and not the reset after an episode's end."""
+        return ~self._ended
+
+    def step(self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
+        """Takes in one row: unscaled rewards [E], terminated [E], truncated [E]."""
+        self._returns += rewards
+        self._lengths += ~self._ended
+        self._ended = terminated | truncated
+        if self._ended.any():
+            self._finished.append((self._returns[self._ended], self._lengths[self._ended]))
+            self._returns[self._ended] = 0.0
+            self._lengths[self._ended] = 0
+
+    def take_finished(self) -> FinishedEpisodes:
+        """The episodes that ended since the last call."""
+        finished, self._finished = self._finished, []
+        returns, lengths = zip(*finished, strict=True) if finished else ((), ())
+        return FinishedEpisodes(
+            returns=np.concatenate([np.zeros(0), *returns]).astype(np.float32),
+            lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
+        )
+
+
+class RolloutWriter:
+    """Holds what rows are made of between rollouts, and the arrays that every rollout is written into.
+
+    `start`, and then for each row `act`, what the environments make of it, and `record`.
+    """
+
+    def __init__(
+        self,
+        spaces: Spaces,
+        count: int,
+        runtime: PolicyRuntime,
+        spec: EnvironmentSpec,
+        *,
+        rollout_length: int,
+        random: np.random.Generator,
+    ) -> None:
+        rows = rollout_length
+        observation, action = spaces.observation, spaces.action
+        self._runtime = runtime
+        self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
+        self._continuing = spec.continuing
+        self._random = random
+        self._episodes = EpisodeCounter(count)
+        self._stack = FrameStack(observation, count)
+        self._state = np.zeros((count, runtime.state_size), np.float32)
+        self._next_state = self._state
+        self._row = 0
+
+        self._frames = _frames(observation, rows, count)
+        self._initial_state = np.zeros_like(self._state)
+        self._actions = np.zeros((rows, count), np.uint8 if action.count <= 256 else np.uint16)
+        self._log_probs = np.zeros((rows, count), np.float32)
+        self._rewards = np.zeros((rows, count), np.float32)
+        self._terminated = np.zeros((rows, count), np.bool_)
+        self._truncated = np.zeros((rows, count), np.bool_)
+        self._valid = np.zeros((rows, count), np.bool_)
+
+    @property
+    def is_between_rollouts(self) -> bool:
+        """Whether the next row is a rollout's first: the moment for other weights."""
+        return self._row == 0
+
+    def start(self, frames: np.ndarray) -> None:
+        """Takes the first frames [E, *frame_shape] of all environments."""
+        self._stack.push(frames, np.ones(len(frames), np.bool_))
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """Plays on with these weights; between rollouts only."""
+        self._runtime.load(weights)
+
+    def act(self) -> np.ndarray:
+        """Chooses the actions [E] of the next row."""
+        if self._row == 0:
+            depth = self._stack.frames.shape[1]
+            self._frames[:depth] = self._stack.frames.swapaxes(0, 1)
+            self._initial_state[:] = self._state
+        actions, self._log_probs[self._row], self._next_state = self._runtime.act(
+            self._stack.observations, self._state, self._random
+        )
+        self._actions[self._row] = actions
+        return actions
+
+    def record(self, frames: np.ndarray, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
+        """Writes down what came of those actions, as VectorEnvironment.step returns it; whether the rollout is full."""
+        row, depth = self._row, self._stack.frames.shape[1]
+        valid = self._episodes.valid
+        self._frames[depth + row] = frames
+        self._rewards[row] = rewards
+        self._terminated[row] = terminated
+        self._truncated[row] = truncated
+        self._valid[row] = valid
+        # The row after one that only reset is the first of its episode: nothing before it is remembered.
+        self._stack.push(frames, ~valid)
+        self._state = self._next_state * valid[:, None]
+        self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
+        self._row += 1
+        return self._row == len(self._actions)
+
+    def finish(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
+        """The full rollout; its arrays are views of ours: encode or copy it before the next `act`."""
+        self._row = 0
+        if self._reward_clip is not None:
+            self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
+        self._rewards *= self._reward_scale
+        if self._continuing:
+            self._truncated |= self._terminated
+            self._terminated[:] = False
+        finished = self._episodes.take_finished()
+        return Rollout(
+            identity=identity,
+            policy_version=policy_version,
+            frames=self._frames,
+            initial_state=self._initial_state,
+            actions=self._actions,
+            behaviour_log_probs=self._log_probs,
+            rewards=self._rewards,
+            terminated=self._terminated,
+            truncated=self._truncated,
+            valid=self._valid,
+            episode_returns=finished.returns,
+            episode_lengths=finished.lengths,
+        )
+
+
+def _frames(space: ArraySpace, rows: int, environments: int) -> np.ndarray:
+    """Room for a rollout's frames [k-1 + T+1, E, *frame_shape].
+
+    Images lie environment by environment, as they are sent: each beside the one that it differs little from.
+    """
+    length = space.frames + rows
+    if len(space.shape) >= 2:
+        return np.zeros((environments, length, *space.shape), space.dtype).swapaxes(0, 1)
+    return np.zeros((length, environments, *space.shape), space.dtype)

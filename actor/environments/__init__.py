@@ -1,0 +1,1 @@
+"""Environments: backends, transforms, action mapping."""

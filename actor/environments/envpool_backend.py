@@ -1,0 +1,175 @@
+"""envpool's environments: many in one C++ pool, on one thread."""
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import (
+    UnplayableError,
+    first_line,
+    import_extra,
+    unknown_environment,
+)
+from daedalus.protocol.spec import EnvironmentSpec
+
+_ATARI_OPTIONS = {"stack_num", "frame_skip", "gray_scale", "img_height", "img_width", "reward_clip"}
+_ATARI_SIZE = (210, 160)
+_ATARI_FRAMES = 108_000  # half an hour of play, as in ALE; envpool's own default counts steps, whatever they repeat
+
+Arrange = Callable[[np.ndarray], np.ndarray]
+
+
+class EnvpoolEnvironments:
+    """A pool as a BareEnvironment. Ended episodes are reset by name, which is what the pool's own autoreset does."""
+
+    def __init__(
+        self,
+        envpool: Any,
+        name: str,
+        options: dict[str, Any],
+        *,
+        repeat: int = 1,
+        patience: int | None = None,
+        arrange: Arrange = np.asarray,
+    ) -> None:
+        """`arrange` makes frames [E, *frame_shape] of the pool's observations."""
+        self.count: int = options["num_envs"]
+        self._make_pool = partial(envpool.make_gymnasium, name, **options)
+        self._pool: Any = None  # it wants its seed when it is made
+        with _quiet():
+            spec = envpool.make_spec(name, **options)
+            self.observation_space: gymnasium.Space = _arranged(spec.gymnasium_observation_space, arrange)
+            self.action_space: gymnasium.Space = spec.gymnasium_action_space
+        self._shape = (self.count, *(self.observation_space.shape or ()))
+        self._arrange = arrange
+        self._repeat = repeat
+        self._patience = patience
+        self._ended = np.zeros(self.count, np.bool_)
+        self._unrewarded = np.zeros(self.count, np.int64)  # steps in a row
+
+    def reset(self, seed: int) -> np.ndarray:
+        """See BareEnvironment."""
+        self.close()
+        with _quiet():
+            self._pool = self._make_pool(seed=seed % (2**31 - self.count))  # environment e gets the int32 seed + e
+            observations, _ = self._pool.reset()
+        self._ended[:] = False
+        self._unrewarded[:] = 0
+        return self._arrange(observations)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See BareEnvironment."""
+        frames = np.empty(self._shape, self.observation_space.dtype)
+        rewards = np.zeros(self.count)
+        terminated, truncated = np.zeros((2, self.count), np.bool_)
+        ended, live = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
+        if len(ended):
+            frames[ended] = self._arrange(self._pool.reset(ended)[0])
+        for repeats_left in reversed(range(self._repeat)):
+            if not len(live):
+                break
+            shown, earned, over, cut, _ = self._pool.step(actions[live], live)
+            rewards[live] += earned
+            terminated[live], truncated[live] = over, cut
+            last = (over | cut) if repeats_left else np.ones(len(live), np.bool_)
+            frames[live[last]] = self._arrange(shown[last])
+            live = live[~last]
+        if self._patience is not None:
+            self._unrewarded = np.where((rewards > 0.0) | self._ended, 0, self._unrewarded + 1)
+            truncated |= (self._unrewarded >= self._patience) & ~terminated
+        self._ended = terminated | truncated
+        return frames, rewards, terminated, truncated
+
+    def close(self) -> None:
+        """See BareEnvironment."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+
+
+def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
+    """The pool, and the specification with what is left to do: Atari games are repeated, greyed and resized in it.
+
+    Raises UnplayableError with one line that says what is wrong and what to do.
+    """
+    with _quiet():
+        envpool = import_extra("envpool", "envpool", "environment.backend=envpool")
+    names = envpool.list_all_envs()
+    if spec.id not in names:
+        raise unknown_environment(spec.id, names, "envpool has none like it (--set environment.backend=gymnasium?)")
+    try:
+        with _quiet():
+            config = envpool.make_spec(spec.id).config
+        if set(config._fields) >= _ATARI_OPTIONS:
+            return _make_atari(envpool, spec, count)
+        limit = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
+        options = _options(spec, count, limit)
+        bare = EnvpoolEnvironments(envpool, spec.id, options, repeat=spec.action_repeat, patience=spec.patience)
+        return bare, spec
+    except UnplayableError:
+        raise
+    except Exception as error:  # whatever envpool says of its options
+        raise UnplayableError(f"environment {spec.id} of envpool cannot be made: {first_line(error)}") from None
+
+
+def _make_atari(envpool: Any, spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
+    cropped = spec.crop is not None  # which envpool does not do, and which comes before the resizing
+    height, width = _ATARI_SIZE if cropped or spec.resize is None else spec.resize
+    options = _options(
+        spec,
+        count,
+        {
+            "stack_num": 1,
+            "frame_skip": spec.action_repeat,
+            "gray_scale": spec.grey,
+            "img_height": height,
+            "img_width": width,
+            "reward_clip": False,
+            "max_episode_steps": math.ceil((spec.max_episode_steps or _ATARI_FRAMES) / spec.action_repeat),
+        },
+    )
+    bare = EnvpoolEnvironments(
+        envpool, spec.id, options, patience=spec.patience, arrange=_grey if spec.grey else _colour
+    )
+    left = {"action_repeat": 1, "grey": False, "resize": spec.resize if cropped else None}
+    return bare, spec.model_copy(update=left)
+
+
+def _arranged(space: gymnasium.Space, arrange: Arrange) -> gymnasium.Space:
+    if not isinstance(space, gymnasium.spaces.Box):
+        return space
+    low, high = arrange(space.low[None])[0], arrange(space.high[None])[0]
+    return gymnasium.spaces.Box(low, high, dtype=space.dtype.type)
+
+
+def _grey(observations: np.ndarray) -> np.ndarray:
+    return observations[:, 0]  # [E, 1, H, W]
+
+
+def _colour(observations: np.ndarray) -> np.ndarray:
+    return np.moveaxis(observations, 1, 3)  # [E, 3, H, W]
+
+
+def _options(spec: EnvironmentSpec, count: int, ours: dict[str, Any]) -> dict[str, Any]:
+    """A pool's options: the user's, and those that are decided elsewhere."""
+    ours = {**ours, "num_envs": count, "batch_size": count, "num_threads": 1}
+    if twice := sorted(ours.keys() & spec.kwargs.keys()):
+        raise UnplayableError(
+            f"environment.kwargs of envpool's {spec.id} names {' and '.join(twice)}, "
+            "which the rest of the specification decides: leave it out of kwargs"
+        )
+    return {**spec.kwargs, **ours}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without envpool's warnings about the precision of its own spaces."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield

@@ -1,0 +1,98 @@
+"""What is done to the pixels of a frame before it is stored or sent: crop, grey, resize. Pure numpy, all E at once."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.protocol.spec import EnvironmentSpec
+
+_GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0.299, 0.587, 0.114
+
+
+class Pixels:
+    """A specification's transforms of frames, in its order; none of them leaves frames as they are."""
+
+    def __init__(self, spec: EnvironmentSpec, space: gymnasium.spaces.Box) -> None:
+        """Raises UnplayableError if a transform does not fit the space."""
+        asked: list[tuple[str, Callable[[np.ndarray], np.ndarray]]] = []
+        if spec.crop is not None:
+            asked.append((f"crop={spec.crop}", partial(crop, margins=spec.crop)))
+        if spec.grey:
+            asked.append(("grey", grey))
+        if spec.resize is not None:
+            asked.append((f"resize={spec.resize}", partial(resize, size=spec.resize)))
+        self._transforms = [transform for _, transform in asked]
+        frames = np.zeros((1, *space.shape), space.dtype)
+        for name, transform in asked:
+            try:
+                if frames.dtype != np.uint8 or frames.ndim not in (3, 4):
+                    raise ValueError("frames must be uint8 images of shape (H, W) or (H, W, C)")
+                frames = transform(frames)
+            except ValueError as error:
+                raise UnplayableError(f"environment.{name} does not fit observation space {space}: {error}") from None
+        self.shape: tuple[int, ...] = frames.shape[1:]  # of one frame that comes out
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """[E, *the space's shape] -> [E, *shape]."""
+        for transform in self._transforms:
+            frames = transform(frames)
+        return frames
+
+
+def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
+    """[E, H, W, ...] without `margins` pixels at the top, bottom, left and right; a view."""
+    top, bottom, left, right = margins
+    height, width = frames.shape[1:3]
+    if top + bottom >= height or left + right >= width:
+        raise ValueError(f"nothing would be left of {height} x {width} pixels")
+    return frames[:, top : height - bottom, left : width - right]
+
+
+def grey(frames: np.ndarray) -> np.ndarray:
+    """[E, H, W, 3] red, green, blue -> [E, H, W] the nearest integer to their luma by ITU-R BT.601."""
+    if frames.ndim != 4 or frames.shape[3] != 3:
+        raise ValueError(f"a frame of shape {frames.shape[1:]} has no red, green and blue")
+    luma, part = np.full(frames.shape[:3], 128, np.uint16), np.empty(frames.shape[:3], np.uint16)  # 128: a half
+    for channel, weight in enumerate(_GREY_WEIGHTS):
+        np.multiply(frames[..., channel], weight, out=part, dtype=np.uint16)
+        luma += part  # at most 255 * 256 + 128, which fits
+    luma >>= 8
+    return luma.astype(np.uint8)
+
+
+def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """[E, H, W, ...] -> [E, h, w, ...] for `size` (h, w): each pixel the mean of the area that it covers.
+
+    Lengths are counted in units of 1/h and 1/w of a source pixel, in which all overlaps are integers, so the sums are
+    exact in float32 up to 65,793 source pixels, and good to a rounding of the last bit beyond.
+    """
+    height, width = frames.shape[1:3]
+    sums = _area_sums(_area_sums(frames, 1, size[0]), 2, size[1])
+    sums /= height * width
+    return np.rint(sums, out=sums).astype(np.uint8)
+
+
+def _area_sums(frames: np.ndarray, axis: int, target: int) -> np.ndarray:
+    """The sums over what each target pixel covers of an axis. By hand: BLAS would start threads over it."""
+    sums = np.zeros((*frames.shape[:axis], target, *frames.shape[axis + 1 :]), np.float32)
+    part = np.empty_like(sums)
+    for sources, weights in zip(*_overlaps(frames.shape[axis], target), strict=True):
+        np.multiply(frames.take(sources, axis), weights.reshape(-1, *[1] * (frames.ndim - 1 - axis)), out=part)
+        sums += part
+    return sums
+
+
+@lru_cache(maxsize=16)
+def _overlaps(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each target pixel the source pixels that it covers, [K, target], and how much of each, float32 likewise.
+
+    Target pixel i spans [i * source, (i + 1) * source), source pixel j spans [j * target, (j + 1) * target).
+    """
+    starts = np.arange(target) * source
+    sources = starts // target + np.arange((source - 1) // target + 2)[:, None]
+    ends = np.minimum(starts + source, (sources + 1) * target)
+    weights = np.maximum(ends - np.maximum(starts, sources * target), 0)
+    return np.minimum(sources, source - 1), weights.astype(np.float32)

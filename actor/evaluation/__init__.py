@@ -1,0 +1,1 @@
+"""Whole episodes played for a score, and videos of them."""

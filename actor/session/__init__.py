@@ -1,0 +1,1 @@
+"""The conversation of an actor with its learner: join, upload, snapshots, reconnect."""

@@ -1,0 +1,1 @@
+"""The commands that a person types, and the processes that they start."""

@@ -1,0 +1,116 @@
+"""A CA in a folder: makes keys, signs certificates (X.509, P-256). The only file that imports `cryptography`."""
+
+import datetime
+import ipaddress
+import os
+import shutil
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from daedalus.transport.credentials import CA, CERTIFICATE, KEY, CredentialsError
+
+_CLOCKS_DIFFER = datetime.timedelta(hours=1)  # between hosts
+
+
+class CertificateAuthority:
+    """The CA of one folder."""
+
+    def __init__(self, directory: Path) -> None:
+        """Reads it. Raises CredentialsError if there is none."""
+        try:
+            self._certificate = x509.load_pem_x509_certificate((directory / CA).read_bytes())
+            key = serialization.load_pem_private_key((directory / KEY).read_bytes(), None)
+        except (OSError, ValueError):
+            raise CredentialsError(f"{directory} holds no CA: `daedalus certs init` makes one") from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise CredentialsError(f"{directory / KEY} is not a key of ours")
+        self._directory, self._key = directory, key
+
+    @classmethod
+    def create(cls, directory: Path, lifetime: datetime.timedelta) -> "CertificateAuthority":
+        """A new CA in a folder that is not there yet."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = _named("Daedalus CA")
+        builder = _builder(name, name, key, lifetime).add_extension(x509.BasicConstraints(True, 0), critical=True)
+        builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
+        directory.mkdir(parents=True)
+        _write(directory / KEY, _pem(key))
+        _write(directory / CA, builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+        return cls(directory)
+
+    def issue(self, folder: Path, common_name: str, hosts: list[str], lifetime: datetime.timedelta) -> None:
+        """Writes certificate, key and ca.pem into a folder; with `hosts` it may also listen, under those names."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
+        builder = _builder(_named(common_name), self._certificate.subject, key, lifetime)
+        builder = builder.add_extension(x509.BasicConstraints(False, None), critical=True)
+        builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
+        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        builder = builder.add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
+        )
+        if hosts:
+            builder = builder.add_extension(x509.SubjectAlternativeName([_alternative(h) for h in hosts]), False)
+        certificate = builder.sign(self._key, hashes.SHA256())
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(folder / KEY, _pem(key))
+        _write(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
+        shutil.copyfile(self._directory / CA, folder / CA)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, lifetime: datetime.timedelta
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, now + lifetime) - _CLOCKS_DIFFER)
+        .not_valid_after(now + lifetime)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _named(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _alternative(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Writes a file that nobody else may read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with open(descriptor, "wb") as file:
+        file.write(data)

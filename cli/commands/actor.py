@@ -1,0 +1,53 @@
+"""`daedalus actor`: constructs one actor and runs it.
+
+Exit status: 0 the run is over, 1 failed, 2 bad usage.
+"""
+
+import sys
+
+from daedalus.actor.environments.make import UnplayableError
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.service import ActorService
+from daedalus.cli.commands import actor_arguments as options
+from daedalus.cli.processes import exit_with_parent, stop_on_signals
+from daedalus.policy.acting.runtime import PolicyError
+from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.interface import TransportError
+from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
+
+
+def main() -> int:
+    """Runs `daedalus actor`."""
+    arguments = options.parser().parse_args()
+    try:
+        credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
+        config = options.config(arguments, credentials)
+    except (ValueError, *SECURITY_ERRORS) as error:
+        print(f"daedalus actor: {error}", file=sys.stderr)
+        return 2
+    stop = stop_on_signals()
+    if arguments.exit_with_parent:
+        exit_with_parent(stop)
+
+    def say(text: str) -> None:
+        if not arguments.quiet:
+            print(f"actor {config.name}: {text}", flush=True)
+
+    try:
+        transport = connect_when_there(arguments.connect, stop, say, config.timeout, credentials)
+        if transport is None:
+            return 0
+        try:
+            role = Evaluator if arguments.evaluator else ActorService
+            role(config, transport, stop, say).run()
+        finally:
+            transport.close()
+    except (ActorError, UnplayableError, PolicyError, TransportError) as error:
+        print(f"daedalus actor: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,209 @@
+"""`daedalus evaluate`: plays a run's best checkpoint, or a given one, and prints how it does."""
+
+import argparse
+import importlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, TextIO
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import load_env_creator
+
+from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
+from daedalus.actor.evaluation.video import Video, VideoError
+from daedalus.cli.commands.evaluate_arguments import check, parser
+from daedalus.cli.processes import exit_with_parent, stop_on_signals
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
+from daedalus.policy.saving.best_checkpoints import is_best
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
+from daedalus.policy.saving.sealed import DamagedError
+from daedalus.protocol.spec import EnvironmentSpec
+
+_PROGRESS_SECONDS = 5.0
+_FRAMES_PER_SECOND = 30.0  # of environments that do not say
+_ATARI_FRAMES_PER_SECOND = 60.0
+
+
+class _StoppedError(Exception):
+    """Told to stop before the last episode ended."""
+
+
+def main(words: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
+    """Runs `daedalus evaluate`. Exit status: 0 done, 1 failed, or stopped by the event, 2 bad usage."""
+    arguments = parser().parse_args(words)
+    stop = stop or threading.Event()
+    try:
+        check(arguments)
+    except ValueError as error:
+        print(f"daedalus evaluate: {error}", file=sys.stderr)
+        return 2
+    if arguments.exit_with_parent:
+        exit_with_parent(stop)
+    try:
+        result = _evaluate(arguments, stop)
+    except (_StoppedError, DamagedError, NoPolicyError, UnplayableError, PolicyError, VideoError) as error:
+        # The signal may have gone to the environments' processes as well; that they have ended is no news then.
+        print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
+        return 1
+    print(json.dumps(result) if arguments.json else _text(result))
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
+    """Everything between the command line and the result."""
+    directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
+    policy = find_policy(directory, lambda text: print(f"daedalus evaluate: {text}", file=sys.stderr), arguments.newest)
+    spec = _environment(policy, arguments)
+    seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
+    progress = _Progress(sys.stderr, arguments.episodes, stop)
+    filmed: dict[str, Any] = {}
+    try:
+        if arguments.video is None:
+            evaluation = _play(policy, spec, arguments, seed, progress, None)
+        else:
+            with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
+                evaluation = _play(policy, spec, arguments, seed, progress, video)
+            filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
+    finally:
+        progress.end()
+    return {**_result(policy, spec, evaluation), "seed": seed, "actions": _actions(policy, arguments), **filmed}
+
+
+def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
+    """What to play: as in training, but for whose implementation it is."""
+    trained = policy.spec.environment
+    watched = arguments.video is not None or arguments.render
+    backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
+    if watched:
+        backend = "gymnasium"
+    played = trained.as_evaluated(backend)
+    if backend == "gymnasium" and trained.backend != "gymnasium":
+        played = _as_gymnasium_has_it(played)
+    return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
+
+
+def _as_gymnasium_has_it(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Atari games of the other backends have another name there, and repeat actions on their own unless told not to."""
+    atari_id = f"ALE/{spec.id.removeprefix('ALE/').removesuffix('-v5')}-v5"
+    with suppress(ImportError):
+        gymnasium.register_envs(importlib.import_module("ale_py"))
+    if atari_id not in gymnasium.registry:
+        return spec
+    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}  # as the others have it by default
+    return spec.model_copy(update={"id": atari_id, "kwargs": kwargs})
+
+
+def _play(
+    policy: SavedPolicy,
+    spec: EnvironmentSpec,
+    arguments: argparse.Namespace,
+    seed: int,
+    progress: "_Progress",
+    video: Video | None,
+) -> Evaluation:
+    episodes = arguments.episodes
+    watched = arguments.render or video is not None
+    environments = make_environments(
+        spec,
+        1 if watched else min(arguments.envs or environments_for(episodes, spec), episodes),
+        wrap=arguments.wrap,
+        render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
+        camera=None if video is None else video.add,
+    )
+    try:
+        if video is not None:
+            video.frames_per_second = _frames_per_second(spec)
+        if environments.spaces != policy.spaces:
+            raise UnplayableError(
+                f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
+                "choose another --backend, or install the version that the run used (versions.json)"
+            )
+        runtime = OnnxRuntime(policy.program)
+        runtime.load(policy.weights)
+        return play_episodes(
+            runtime, environments, episodes, seed, sampled=_actions(policy, arguments) == "sampled", progress=progress
+        )
+    finally:
+        environments.close()
+
+
+def _frames_per_second(spec: EnvironmentSpec) -> float:
+    """How fast an environment's own steps are meant to be seen."""
+    skipped = spec.kwargs.get("frameskip", 4)
+    if spec.id.startswith("ALE/") and isinstance(skipped, int):
+        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30, whatever it skips
+    maker = gymnasium.spec(spec.id.rpartition(":")[2]).entry_point
+    metadata = getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "metadata", {})
+    return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
+
+
+def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
+    return arguments.actions or policy.spec.evaluation.actions
+
+
+def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) -> dict[str, Any]:
+    returns = evaluation.returns.astype(np.float64)
+    return {
+        "environment": spec.id,
+        "backend": spec.backend,
+        "checkpoint": str(policy.directory),
+        "best_checkpoint": is_best(policy.directory),
+        "policy_version": policy.policy_version,
+        "episodes": len(returns),
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "length_mean": float(evaluation.lengths.mean()),
+        "returns": returns.round(4).tolist(),
+        "lengths": evaluation.lengths.tolist(),
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    best = "best checkpoint, " if result["best_checkpoint"] else ""
+    text = (
+        f"{result['backend']}'s {result['environment']}, {best}policy version {result['policy_version']}: "
+        f"return {result['return_mean']:.1f} +- {result['return_std']:.1f} "
+        f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
+        f"over {result['episodes']} {result['actions']} episodes"
+    )
+    return f"{text}\nvideo: {result['video']}, {result['video_seconds']:.1f} s" if "video" in result else text
+
+
+class _Progress:
+    """Says every few seconds how far the episodes are: one line, rewritten on a terminal. Ends them when told to."""
+
+    def __init__(self, stream: TextIO, episodes: int, stop: threading.Event) -> None:
+        self._stream, self._episodes, self._stop = stream, episodes, stop
+        self._terminal = stream.isatty()
+        self._due = time.monotonic() + _PROGRESS_SECONDS
+        self._rewriting = False
+
+    def __call__(self, finished: int, mean: float) -> None:
+        if self._stop.is_set():
+            raise _StoppedError
+        if time.monotonic() < self._due:
+            return
+        self._due = time.monotonic() + _PROGRESS_SECONDS
+        so_far = f", mean return {mean:.1f}" if finished else ""
+        line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
+        self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
+        self._stream.flush()
+        self._rewriting = self._terminal
+
+    def end(self) -> None:
+        """Takes the rewritten line away."""
+        if self._rewriting:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(stop=stop_on_signals()))

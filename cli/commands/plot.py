@@ -1,0 +1,86 @@
+"""`daedalus plot`: the curves of one or more runs, from their metrics.csv, as one picture."""
+
+import argparse
+import csv
+import math
+import sys
+from pathlib import Path
+
+from daedalus.learner.run.run_directory import METRICS
+
+_EXAMPLES = """\
+examples:
+  daedalus plot runs/cartpole-impala-s1-20261121-101500 --output curve.png
+  daedalus plot runs/cartpole-*-s1-* --output algorithms.png"""
+
+_PANELS = (
+    ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: evaluations)"),
+    ("entropy", "entropy (nats)"),
+    ("value_loss", "value loss"),
+    ("policy_lag_mean", "policy lag (updates)"),
+)
+
+
+def plot(arguments: list[str]) -> int:
+    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+    options = argparse.ArgumentParser(
+        prog="daedalus plot",
+        description="Draws return, entropy, value loss and policy lag against env_steps.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, one colour each")
+    options.add_argument("--output", type=Path, required=True, metavar="FILE", help="the picture: .png, .svg or .pdf")
+    parsed = options.parse_args(arguments)
+    try:
+        runs = {directory.name: _read(directory) for directory in parsed.directories}
+        _draw(runs, parsed.output)
+    except ModuleNotFoundError:
+        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[learner]"', file=sys.stderr)
+        return 1
+    except (OSError, ValueError) as error:
+        print(f"daedalus plot: {error}", file=sys.stderr)
+        return 1
+    print(f"wrote {parsed.output}")
+    return 0
+
+
+def _read(directory: Path) -> dict[str, list[float]]:
+    """Columns of a run's metrics; unknown values are NaN."""
+    with open(directory / METRICS, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        raise ValueError(f"{directory / METRICS} has no rows yet")
+    return {name: [float(row[name]) if row[name] else float("nan") for row in rows] for name in rows[0]}
+
+
+def _evaluations(run: dict[str, list[float]]) -> tuple[list[float], list[float]]:
+    """At which env_steps a run was evaluated, and the mean returns; empty where it was not."""
+    env_steps, returns = run.get("evaluation_env_steps", []), run.get("evaluation_return_mean", [])
+    by_env_steps = {at: mean for at, mean in zip(env_steps, returns, strict=True) if not math.isnan(at)}
+    return list(by_env_steps), list(by_env_steps.values())
+
+
+def _draw(runs: dict[str, dict[str, list[float]]], output: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(11, 7), sharex=True, layout="constrained")
+    for axis, (column, title) in zip(axes.flat, _PANELS, strict=True):
+        for label, run in runs.items():
+            (line,) = axis.plot(run["env_steps"], run[column], label=label, linewidth=1.5)
+            if column == "episode_return_mean":
+                mean, std = run[column], run["episode_return_std"]
+                low = [m - s for m, s in zip(mean, std, strict=True)]
+                high = [m + s for m, s in zip(mean, std, strict=True)]
+                axis.fill_between(run["env_steps"], low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+                axis.plot(*_evaluations(run), "o--", color=line.get_color(), linewidth=1, markersize=4)
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.3)
+    for axis in axes[1]:
+        axis.set_xlabel("env_steps")
+    axes[0, 0].legend(fontsize=8, loc="lower right")
+    figure.savefig(output, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,114 @@
+"""`daedalus status`: the service and its fleet as the learner sees them, for a person or for a health check."""
+
+import argparse
+import sys
+
+from daedalus.cli.arguments import add_connect, add_tls, command_parser
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
+from daedalus.transport.zenoh_transport import connect
+
+HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
+
+_DESCRIPTION = """\
+Asks the learners at an address how they and their actors fare. As a health check it says by its exit status
+whether the service does its work: actors take part, updates are made, checkpoints are saved."""
+
+_EXAMPLES = """\
+examples:
+  daedalus status --connect tcp/127.0.0.1:7447
+  daedalus status --connect tcp/gpu-box:7447 --json
+  daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo somebody should look
+
+MB/h up: rollouts; down: snapshots, with an s where the link is slow and they are fetched small.
+
+exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the problems stand in the answer)"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Parses what `daedalus status` takes."""
+    options = command_parser("status", _DESCRIPTION, _EXAMPLES)
+    add_connect(options, "where the learner, or its router, listens")
+    options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="only this run")
+    how = options.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="print each as one JSON object a line")
+    how.add_argument("--quiet", action="store_true", help="print problems only")
+    add_tls(options)
+    return options
+
+
+def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
+    """What the learners behind a transport tell, within 5 s. Raises TransportError or ProtocolError."""
+    answers = transport.ask(keys.status(run), timeout=5.0)
+    reports = [decode(answer, Limits()) for answer in answers]
+    return [report.status for report in reports if isinstance(report, StatusReport)]
+
+
+def status(arguments: list[str]) -> int:
+    """Runs `daedalus status`."""
+    parsed = parser().parse_args(arguments)
+    try:
+        credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
+    except SECURITY_ERRORS as error:
+        print(f"daedalus status: {error}", file=sys.stderr)
+        return BAD_USAGE
+    try:
+        transport = connect(parsed.connect, credentials)
+        try:
+            statuses = ask(transport, parsed.run)
+        finally:
+            transport.close()
+    except (TransportError, ProtocolError) as error:
+        print(f"daedalus status: {error}", file=sys.stderr)
+        return NO_ANSWER
+    if not statuses:
+        print("daedalus status: no learner answers there", file=sys.stderr)
+        return NO_ANSWER
+    for status in statuses:
+        if parsed.json:
+            print(status.model_dump_json())
+        elif not parsed.quiet:
+            print(_table(status))
+        else:
+            for problem in status.problems:
+                print(f"{status.run}: {problem}")
+    return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
+
+
+def _table(status: RunStatus) -> str:
+    mean = "-" if status.episode_return_mean is None else f"{status.episode_return_mean:.1f}"
+    age = status.checkpoint_age_seconds
+    skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
+    lines = [
+        f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
+        f"epoch {status.learner_epoch:x}",
+        *(f"  PROBLEM: {problem}" for problem in status.problems),
+        f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
+        f"updates {status.updates:,}{skipped}",
+        f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
+        f"policy lag {status.policy_lag_mean:.1f}",
+        f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
+        f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
+        f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
+        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}  rejected",
+        *(f"  {_line(actor)}" for actor in status.actors),
+        *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
+    ]
+    return "\n".join(lines)
+
+
+def _line(actor: ActorStatus) -> str:
+    state = "quarantined" if actor.quarantined else "alive" if actor.alive else "gone"
+    rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
+    answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
+    down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.slow_link else ''}"
+    return (
+        f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
+        f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
+        f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
+        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}"
+    )

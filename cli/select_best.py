@@ -1,0 +1,93 @@
+"""Which checkpoint of a run is its best: those that scored highest, and the newest, play it out.
+
+The best of many scores over a few episodes was lucky; over fresh episodes, more of them and the same for all, it counts
+what each can do.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from daedalus.cli.supervisor import stop
+from daedalus.learner.run.candidates import candidates
+from daedalus.protocol.spec import RunSpec
+
+_POLL_SECONDS = 0.05
+_SEEDS = 2**33  # added to the run's: neither training nor the final episodes have these
+
+
+class PlayFailedError(Exception):
+    """Episodes could not be played, and why was said; or they were to be played no more."""
+
+
+def run_off(
+    directory: Path,
+    spec: RunSpec,
+    options: list[str],
+    stopping: threading.Event,
+    say: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """Scores each candidate anew; what each got, the best first. Nothing, if there are not two to choose from.
+
+    `options` are what `daedalus evaluate` takes. Raises PlayFailedError.
+    """
+    finalists = candidates(directory, say)
+    if len(finalists) < 2:
+        return []
+    backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
+    say(f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}")
+    with_it = [*options, "--backend", backend, "--seed", str(seed)]
+    results = play([[str(each.directory), *with_it] for each in finalists], stopping)
+    scores = []
+    for candidate, result in zip(finalists, results, strict=True):
+        version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
+        before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
+        say(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
+        try:
+            candidate.score_anew(mean)
+        except OSError as error:
+            say(f"  which could not be written down ({error.strerror})")
+        scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
+    return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
+
+
+def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str, Any]]:
+    """Runs `daedalus evaluate`, once for each list of words, beside one another; their results.
+
+    Raises PlayFailedError.
+    """
+    with ExitStack() as stack:
+        outputs = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
+        # The first tells how far it is, for all of them; what the others say is for when they fail.
+        errors = [None, *(stack.enter_context(tempfile.TemporaryFile()) for _ in commands[1:])]
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate", *words, "--json", "--exit-with-parent"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=error,
+            )
+            for words, output, error in zip(commands, outputs, errors, strict=True)
+        ]
+        while any(process.poll() is None for process in processes) and not stopping.wait(_POLL_SECONDS):
+            pass
+        stop(processes)
+        failed = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
+        if failed:
+            for error in filter(None, [] if stopping.is_set() else failed):
+                error.seek(0)
+                sys.stderr.write(error.read().decode(errors="replace"))
+            raise PlayFailedError
+        for output in outputs:
+            output.seek(0)
+        results = [json.load(output) for output in outputs]
+    for result in results:
+        for each_episode in ("returns", "lengths"):
+            del result[each_episode]
+    return results

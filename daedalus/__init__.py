@@ -1,0 +1,1 @@
+"""Actor-critic reinforcement learning with one learner and any number of actors, anywhere."""

@@ -1,1 +1,0 @@
-"""The commands that a person types. Starts the others as processes."""

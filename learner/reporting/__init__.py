@@ -1,0 +1,1 @@
+"""Metrics, their writers, the status, the progress line."""

@@ -1,0 +1,185 @@
+"""What a run tells of itself: metrics rows, the status, the summary. Reads counters and fleet; no I/O."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.spec import RunSpec, RunStatus
+
+_STALLED_SECONDS = 60.0  # without an update for so long, something is wrong
+_ALONE_SECONDS = 10.0  # and without an actor
+
+
+@dataclass(slots=True)
+class Health:
+    """What the service observes of itself, on the monotonic clock; from it come the problems that a status tells of."""
+
+    started: float
+    updated: float  # the last update, or the start
+    attended: float  # when an actor last took part, or the start
+    saved: float | None = None  # the last checkpoint
+    save_fault: str = ""  # why the newest attempt at one failed
+    gradient_fault: bool = False  # the last update was skipped
+
+    def problems(self, now: float, live: int) -> tuple[str, ...]:
+        """What keeps the service from doing its work, worst first; none if it is healthy."""
+        found = []
+        if not live and now - self.attended > _ALONE_SECONDS:
+            found.append(f"no actor has taken part for {now - self.attended:.0f} s")
+        elif now - self.updated > _STALLED_SECONDS:
+            found.append(f"no update for {now - self.updated:.0f} s")
+        if self.gradient_fault:
+            found.append("updates are skipped: the gradient is not finite")
+        if self.save_fault:
+            found.append(f"checkpoints cannot be saved: {self.save_fault}")
+        return tuple(found)
+
+
+class RateMeter:
+    """Rates since the last look."""
+
+    def __init__(self, counters: RunCounters, now: float) -> None:
+        self.rates: dict[str, float] = {}  # as of the last look
+        self._actors: dict[str, tuple[int, int, int]] = {}  # their env_steps, bytes received, bytes of answers
+        self._pushed_bytes = 0
+        self._mark(counters, now)
+
+    def _mark(self, counters: RunCounters, now: float) -> None:
+        self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
+        self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
+
+    def look(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
+        """env_steps and updates a second, and the mean policy lag, since the last look; each actor is told its own."""
+        seconds = max(now - self._then, 1e-9)
+        pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
+        for actor in fleet.actors.values():
+            now_at = actor.env_steps, actor.received_bytes, actor.answered_bytes
+            env_steps, received, answered = np.subtract(now_at, self._actors.get(actor.name, (0, 0, 0))) / seconds
+            self._actors[actor.name] = now_at
+            followed = 0.0 if actor.slow_link or not fleet.is_live(actor) else pushed / seconds
+            actor.env_steps_per_second = float(env_steps)
+            actor.bytes_up_per_hour = 3600 * float(received)
+            actor.bytes_down_per_hour = 3600 * float(answered + followed)
+        self._actors = {name: self._actors[name] for name in fleet.actors}  # whom the fleet forgot is forgotten here
+        rollouts = max(counters.rollouts_trained - self._rollouts, 1)
+        self.rates = {
+            "env_steps_per_second": (counters.env_steps - self._env_steps) / seconds,
+            "updates_per_second": (counters.updates - self._updates) / seconds,
+            "policy_lag_mean": (counters.policy_lag_sum - self._lag) / rollouts,
+        }
+        self._mark(counters, now)
+        return self.rates
+
+
+def episode_statistics(counters: RunCounters) -> dict[str, float]:
+    """How the newest training episodes went; empty before the first."""
+    if not counters.returns:
+        return {}
+    returns = np.array(counters.returns)
+    return {
+        "episode_return_mean": float(returns.mean()),
+        "episode_return_std": float(returns.std()),
+        "episode_return_min": float(returns.min()),
+        "episode_return_max": float(returns.max()),
+        "episode_length_mean": float(np.mean(counters.lengths)),
+    }
+
+
+def metrics_row(
+    counters: RunCounters,
+    fleet: Fleet,
+    rates: dict[str, float],
+    learning: dict[str, float],
+    wall_seconds: float,
+) -> dict[str, float]:
+    """One row of learner/reporting/metrics.py; `learning` is what the learner measured."""
+    return {
+        "wall_seconds": wall_seconds,
+        "env_steps": counters.env_steps,
+        "updates": counters.updates,
+        "episodes": counters.episodes,
+        **episode_statistics(counters),
+        **rates,
+        "policy_lag_max": counters.policy_lag_max,
+        "actors": len(fleet.live),
+        "rollouts_accepted": counters.rollouts_accepted,
+        "rollouts_rejected": counters.rollouts_rejected.total(),
+        "updates_skipped": counters.updates_skipped,
+        **learning,
+    }
+
+
+def run_status(
+    run: str,
+    learner_epoch: int,
+    spec: RunSpec,
+    counters: RunCounters,
+    fleet: Fleet,
+    rates: dict[str, float],
+    health: Health,
+    queue_bytes: int,
+    now: float,
+) -> RunStatus:
+    """The answer to a status query; `now` is on the monotonic clock."""
+    return RunStatus(
+        run=run,
+        learner_epoch=learner_epoch,
+        algorithm=spec.training.algorithm,
+        environment=spec.environment.id,
+        problems=health.problems(now, len(fleet.live)),
+        uptime_seconds=now - health.started,
+        env_steps=counters.env_steps,
+        env_steps_budget=spec.training.env_steps,
+        updates=counters.updates,
+        updates_skipped=counters.updates_skipped,
+        episode_return_mean=counters.episode_return_mean,
+        env_steps_per_second=rates.get("env_steps_per_second", 0.0),
+        updates_per_second=rates.get("updates_per_second", 0.0),
+        policy_lag_mean=rates.get("policy_lag_mean", 0.0),
+        queue_bytes=queue_bytes,
+        queue_bytes_limit=spec.service.queue_bytes,
+        checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        rollouts_rejected=dict(counters.rollouts_rejected),
+        actors=fleet.statuses(now),
+    )
+
+
+def summary(
+    run: str,
+    spec: RunSpec,
+    counters: RunCounters,
+    *,
+    solved: bool,
+    finished: bool,
+    seconds_to_target: float | None,
+    wall_seconds: float,
+    env_steps_per_second: float,
+) -> dict[str, Any]:
+    """What summary.json holds when training ends; the evaluation is added by who makes it."""
+    return {
+        "run": run,
+        "algorithm": spec.training.algorithm,
+        "environment": spec.environment.id,
+        "seed": spec.training.seed,
+        "solved": solved,
+        "finished": finished,
+        "env_steps": counters.env_steps,
+        "updates": counters.updates,
+        "updates_skipped": counters.updates_skipped,
+        "episodes": counters.episodes,
+        "wall_seconds": wall_seconds,
+        "seconds_to_target": seconds_to_target,
+        "env_steps_per_second": env_steps_per_second,
+        "episode_return_mean": counters.episode_return_mean,
+        "evaluation_return_mean": None,
+        "evaluation_return_std": None,
+        "policy_lag_mean": counters.policy_lag_mean,
+        "policy_lag_max": counters.policy_lag_max,
+        "rollouts_accepted": counters.rollouts_accepted,
+        "rollouts_rejected": dict(counters.rollouts_rejected),
+        "rollout_bytes_per_env_step": counters.rollout_bytes / max(counters.accepted_env_steps, 1),
+        "snapshots_published": counters.snapshots_published,
+    }

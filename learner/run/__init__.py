@@ -1,0 +1,1 @@
+"""A run: its settings, presets, directory and counters."""

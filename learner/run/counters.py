@@ -1,0 +1,103 @@
+"""What a run has done so far: counters and recent episodes. State, saved with every checkpoint."""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from daedalus.protocol.messages import Rollout
+
+_SAVED = (
+    "env_steps",
+    "updates",
+    "updates_skipped",
+    "episodes",
+    "rollouts_accepted",
+    "rollouts_trained",
+    "rollout_bytes",
+    "accepted_env_steps",
+    "policy_lag_sum",
+    "policy_lag_max",
+    "snapshots_published",
+)
+
+
+@dataclass(slots=True)
+class RunCounters:
+    """Counts over the whole run, resumes included."""
+
+    target_episodes: int  # how many episodes the mean return is over
+    env_steps: int = 0  # real steps that were trained on
+    updates: int = 0
+    updates_skipped: int = 0  # of them, for a gradient that was not finite
+    episodes: int = 0
+    rollouts_accepted: int = 0
+    rollouts_rejected: Counter[str] = field(default_factory=Counter)  # by cause
+    rollouts_trained: int = 0
+    rollout_bytes: int = 0  # of the accepted, as they came over the wire
+    accepted_env_steps: int = 0
+    policy_lag_sum: int = 0
+    policy_lag_max: int = 0
+    snapshots_published: int = 0
+    wall_seconds: float = 0.0  # of the lives before this one
+    returns: deque[float] = field(init=False)
+    lengths: deque[int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.returns = deque(maxlen=self.target_episodes)
+        self.lengths = deque(maxlen=self.target_episodes)
+
+    def accepted(self, rollout: Rollout, size: int) -> None:
+        """Counts a rollout that was accepted as a message of `size` bytes."""
+        self.rollouts_accepted += 1
+        self.rollout_bytes += size
+        self.accepted_env_steps += int(np.count_nonzero(rollout.valid))
+
+    def trained(self, rollouts: Sequence[Rollout], policy_version: int, updates: int) -> None:
+        """Counts a batch that is about to be learned from, by so many updates."""
+        for rollout in rollouts:
+            lag = policy_version - rollout.policy_version
+            self.policy_lag_sum += lag
+            self.policy_lag_max = max(self.policy_lag_max, lag)
+            self.returns.extend(rollout.episode_returns.tolist())
+            self.lengths.extend(rollout.episode_lengths.tolist())
+            self.episodes += len(rollout.episode_returns)
+            self.env_steps += int(np.count_nonzero(rollout.valid))
+        self.rollouts_trained += len(rollouts)
+        self.updates += updates
+
+    @property
+    def episode_return_mean(self) -> float | None:
+        """Mean over the last `target_episodes` training episodes; None before the first."""
+        return float(np.mean(self.returns)) if self.returns else None
+
+    @property
+    def policy_lag_mean(self) -> float:
+        """Mean policy lag of the rollouts trained on, in updates."""
+        return self.policy_lag_sum / max(self.rollouts_trained, 1)
+
+    def reached(self, target: float | None) -> bool:
+        """Whether the last `target_episodes` episodes are there and their mean is at least the target."""
+        mean = self.episode_return_mean
+        return target is not None and mean is not None and len(self.returns) == self.target_episodes and mean >= target
+
+    def state(self, wall_seconds: float) -> dict[str, Any]:
+        """Everything as plain JSON; `wall_seconds` is the whole run's so far."""
+        return {
+            **{name: getattr(self, name) for name in _SAVED},
+            "rollouts_rejected": dict(self.rollouts_rejected),
+            "wall_seconds": wall_seconds,
+            "returns": list(self.returns),
+            "lengths": list(self.lengths),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from what `state` returned."""
+        for name in _SAVED:
+            setattr(self, name, state.get(name, 0))  # an earlier release counted fewer things
+        self.rollouts_rejected = Counter(state["rollouts_rejected"])
+        self.wall_seconds = state["wall_seconds"]
+        self.returns.extend(state["returns"])
+        self.lengths.extend(state["lengths"])

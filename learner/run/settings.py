@@ -1,0 +1,146 @@
+"""Presets, files and `--set` -> a checked RunSpec. Every complaint is one line that says what to do."""
+
+import difflib
+import importlib.resources
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from daedalus.protocol.spec import RunSpec
+
+
+class SettingsError(Exception):
+    """Settings that make no run; the message says which, why, and what would."""
+
+
+def preset_names() -> list[str]:
+    """The presets that ship with the package."""
+    folder = importlib.resources.files("daedalus.learner.run.presets")
+    return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def read_preset(name: str) -> dict[str, Any]:
+    """The settings of a preset, or of a TOML file where `name` is a path to one. Raises SettingsError."""
+    if name.endswith(".toml"):
+        return read_file(Path(name))
+    if name not in preset_names():
+        near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(preset_names())}"
+        raise SettingsError(f"unknown preset {name!r}: {hint}; any gymnasium environment runs with --env ID")
+    text = (importlib.resources.files("daedalus.learner.run.presets") / f"{name}.toml").read_text("utf-8")
+    return tomllib.loads(text)
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """The settings in a TOML file, such as a run's config.toml. Raises SettingsError."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path} is not TOML: {error}") from None
+
+
+def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
+    """Applies `section.key=value` assignments in place; values are TOML, or plain text where they are not.
+
+    Raises SettingsError for an assignment that names nothing.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        keys = path.strip().split(".")
+        if not equals or len(keys) < 2:
+            raise SettingsError(f"--set {assignment}: write section.key=value, such as training.learning_rate=0.001")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        section = settings
+        for key in keys[:-1]:
+            section = section.setdefault(key, {})
+            if not isinstance(section, dict):
+                raise SettingsError(f"--set {assignment}: {key} is a value, not a section")
+        _assign(section, keys[-1], value)
+
+
+def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
+    """Sets the algorithm, if one is named, and applies what a preset keeps for it in `[for_algorithm.NAME]`.
+
+    Raises SettingsError if that is no table of sections.
+    """
+    training = settings.setdefault("training", {})
+    if algorithm is not None:
+        training["algorithm"] = algorithm
+    tables = settings.pop("for_algorithm", {})
+    table = tables.get(training.get("algorithm"), {}) if isinstance(tables, dict) else tables
+    if not isinstance(table, dict) or not all(isinstance(section, dict) for section in table.values()):
+        raise SettingsError("for_algorithm: write [for_algorithm.NAME.SECTION], such as [for_algorithm.a3c.training]")
+    for section, values in table.items():
+        for key, value in values.items():
+            _assign(settings.setdefault(section, {}), key, value)
+
+
+def _assign(section: dict[str, Any], key: str, value: Any) -> None:
+    if value == "none":  # TOML has no word for it
+        section.pop(key, None)
+    else:
+        section[key] = value
+
+
+def run_spec(settings: dict[str, Any]) -> RunSpec:
+    """The specification that the settings make. Raises SettingsError, naming the first that is wrong."""
+    try:
+        return RunSpec.model_validate(settings)
+    except ValidationError as error:
+        raise SettingsError(_one_line(error)) from None
+
+
+def _one_line(error: ValidationError) -> str:
+    first = error.errors()[0]
+    path = [str(part) for part in first["loc"]]
+    name = ".".join(path)
+    if first["type"] == "extra_forbidden":
+        known = _known_names(path[:-1])
+        near = difflib.get_close_matches(path[-1], known, 3, 0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
+        return f"unknown setting {name}: {hint}"
+    if first["type"] == "missing":
+        return f"setting {name} is missing"
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    if not name:
+        return message
+    bounds = _bounds(path)
+    return f"setting {name} {message}, not {first['input']!r}{f' (it must be {bounds})' if bounds else ''}"
+
+
+def _known_names(path: list[str]) -> list[str]:
+    model = _model(path)
+    return sorted(model.model_fields) if model else []
+
+
+def _model(path: list[str]) -> type[BaseModel] | None:
+    model: Any = RunSpec
+    for part in path:
+        field = model.model_fields.get(part)
+        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+            return None
+        model = field.annotation
+    return model
+
+
+def _bounds(path: list[str]) -> str:
+    """The whole range that a setting allows, where it has one."""
+    model = _model(path[:-1])
+    field = model.model_fields.get(path[-1]) if model else None
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    found = []
+    for constraint in field.metadata if field else ():
+        found += [
+            f"{text} {getattr(constraint, key):g}"
+            for key, text in words.items()
+            if getattr(constraint, key, None) is not None
+        ]
+    return " and ".join(found)

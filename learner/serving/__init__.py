@@ -1,0 +1,1 @@
+"""What serves the actors: joins, intake, buffers, publishing."""

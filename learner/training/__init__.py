@@ -1,0 +1,1 @@
+"""The update: optimisers, precision, checkpoints."""

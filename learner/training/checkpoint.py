@@ -1,0 +1,97 @@
+"""Checkpoints: the learner's full restart state, written atomically, verified when read.
+
+A checkpoint is a sealed directory (policy/saving/sealed.py) named by its policy version. Its policy part is read by
+policy/saving/saved_policy.py too; this file adds what learning goes on from.
+"""
+
+import shutil
+from collections.abc import Callable, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+import safetensors.torch
+from torch import Tensor
+
+from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, SavedPolicy, checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
+from daedalus.protocol.spec import RunSpec, Spaces
+
+_STATE_FILE = "learner.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checkpoint:
+    """What a learner continues from."""
+
+    policy: SavedPolicy
+    state: dict[str, Tensor]  # optimiser statistics and random state, as Learner.state gave them
+    counters: dict[str, Any]  # as RunCounters.state gave them
+
+
+def save_checkpoint(
+    run_directory: Path,
+    *,
+    spec: RunSpec,
+    spaces: Spaces,
+    policy_version: int,
+    program: bytes,
+    parameters: dict[str, np.ndarray],
+    state: dict[str, Tensor],
+    counters: dict[str, Any],
+    keep: int,
+    also_keep: Set[Path] = frozenset(),
+) -> Path:
+    """Writes a checkpoint, then removes all but the newest `keep` and `also_keep`.
+
+    Raises OSError if the disk refuses.
+    """
+    directory = run_directory / "checkpoints" / f"{policy_version:010d}"
+    files = {
+        PROGRAM_FILE: program,
+        PARAMETERS_FILE: safetensors.numpy.save(parameters),
+        _STATE_FILE: safetensors.torch.save(state),
+    }
+    content = {
+        "policy_version": policy_version,
+        "spec": spec.model_dump(mode="json"),
+        "spaces": spaces.model_dump(mode="json"),
+        "counters": counters,
+    }
+    write_sealed(directory, files, content)
+    # A damaged one of a higher version may be there: the learner then went on from an earlier one.
+    others = [other for other in checkpoints(run_directory) if other != directory]
+    for old in others[keep - 1 :]:
+        if old not in also_keep:
+            shutil.rmtree(old, ignore_errors=True)
+    for unfinished in directory.parent.glob(".*"):  # what a crash left
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return directory
+
+
+def load_checkpoint(directory: Path) -> Checkpoint:
+    """Reads one checkpoint; raises DamagedError if it is not what was written."""
+    policy = read_policy(directory)
+    sealed = SealedDirectory(directory)
+    try:
+        state = safetensors.torch.load(sealed.read(_STATE_FILE))
+        counters = sealed.content["counters"]
+    except (KeyError, safetensors.SafetensorError) as error:
+        raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None
+    return Checkpoint(policy=policy, state=state, counters=counters)
+
+
+def load_newest(run_directory: Path, warn: Callable[[str], None]) -> Checkpoint:
+    """The newest checkpoint that is whole; names each damaged one that it passes over.
+
+    Raises DamagedError if none is left.
+    """
+    for directory in checkpoints(run_directory):
+        try:
+            return load_checkpoint(directory)
+        except DamagedError as error:
+            warn(f"checkpoint passed over: {error}")
+    raise DamagedError(f"{run_directory} has no checkpoint that can be read")

@@ -1,0 +1,131 @@
+"""The encoders of images. `uint8` observations count as numbers from 0 to 1."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.network.images import ImageLayout, as_floats
+from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
+from daedalus.protocol.spec import ArraySpace
+
+_GAIN = math.sqrt(2.0)  # of a layer before a rectifier
+
+
+class ImageEncoder(nn.Module):
+    """Convolutions, then a head over all that they leave of an image: [N, *stacked_shape] -> [N, features]."""
+
+    def __init__(
+        self, layout: ImageLayout, convolutions: nn.Sequential, head: Callable[[int], tuple[nn.Module, int]]
+    ) -> None:
+        """`head` makes the head for a number of inputs, and says how many outputs it has."""
+        super().__init__()
+        self.layout = layout
+        self.convolutions = convolutions
+        try:
+            with torch.no_grad():
+                inputs = convolutions(torch.zeros(1, *layout.shape)).numel()
+        except RuntimeError:
+            raise NetworkError(
+                f"the encoder {layout.encoder!r} leaves nothing of a {layout.space}: enlarge the images "
+                "(environment.resize) or set policy.encoder to impala"
+            ) from None
+        self.head, self.features = head(inputs)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """[N, *stacked_shape] -> [N, features]."""
+        return self.head(self.convolutions(self.layout.arrange(self.prepare(observations))).flatten(1))
+
+    def prepare(self, observations: Tensor) -> Tensor:
+        """What is done to the numbers before the first convolution, which scales them."""
+        return as_floats(observations)
+
+
+def nature(space: ArraySpace) -> ImageEncoder:
+    """The network of Mnih et al. (2015), "Human-level control through deep reinforcement learning"."""
+    return _atari("nature", space, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
+
+
+def small(space: ArraySpace) -> ImageEncoder:
+    """The network of Mnih et al. (2013), which A3C also used: a third of nature's work."""
+    return _atari("small", space, ((16, 8, 4), (32, 4, 2)), 256)
+
+
+def impala(space: ArraySpace) -> ImageEncoder:
+    """The residual network of Espeholt et al. (2018), figure 3, right; without its memory."""
+    layout = ImageLayout("impala", space)
+    first = _first(space)
+    stages = [_stage(first(layout.shape[0], 16, 3, padding=1))]
+    stages += [_stage(nn.Conv2d(inputs, outputs, 3, padding=1)) for inputs, outputs in ((16, 32), (32, 32))]
+    return ImageEncoder(layout, nn.Sequential(*stages, nn.ReLU()), lambda inputs: _rectified(inputs, 256))
+
+
+class ArticleEncoder(ImageEncoder):
+    """The network of the article that this project follows, for a memory to follow on.
+
+    Its batch normalisations are normalisations of each image by itself, which are the same for one row and for many.
+    The first has no weights of its own: the convolution after it has as many, and learning through it costs much.
+    """
+
+    def __init__(self, space: ArraySpace) -> None:
+        layout = ImageLayout("article", space)
+        layers: list[nn.Module] = []
+        for inputs, kernel in ((layout.shape[0], 4), (32, 3), (32, 3), (32, 3)):
+            convolution = nn.Conv2d(inputs, 32, kernel, stride=2, padding=1)
+            nn.init.xavier_uniform_(convolution.weight, nn.init.calculate_gain("leaky_relu"))
+            nn.init.constant_(convolution.get_parameter("bias"), 0.01)
+            layers += [convolution, PReLU()]
+        super().__init__(layout, nn.Sequential(*layers), lambda inputs: (nn.LayerNorm(inputs), inputs))
+        unit = 255.0 if space.dtype == "uint8" else 1.0
+        self._epsilon = 1e-5 * unit**2  # below the variance of an image that shows anything
+
+    def prepare(self, observations: Tensor) -> Tensor:
+        """Each image's numbers, brought to mean 0 and variance 1."""
+        # One group of one channel: torch is far slower at normalising what lies pixel by pixel.
+        images = as_floats(observations).flatten(1).unsqueeze(1)
+        return functional.group_norm(images, 1, eps=self._epsilon)
+
+
+def _atari(name: str, space: ArraySpace, convolutions: tuple[tuple[int, int, int], ...], units: int) -> ImageEncoder:
+    """Rectified convolutions (filters, kernel, stride), then a rectified layer of so many units."""
+    layout = ImageLayout(name, space)
+    inputs, make, layers = layout.shape[0], _first(space), []
+    for filters, kernel, stride in convolutions:
+        layers += [orthogonal(make(inputs, filters, kernel, stride), _GAIN), nn.ReLU()]
+        inputs, make = filters, nn.Conv2d
+    return ImageEncoder(layout, nn.Sequential(*layers), lambda inputs: _rectified(inputs, units))
+
+
+class _Residual(nn.Module):
+    """x + conv(relu(conv(relu(x)))), [N, C, H, W] -> the same."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.ReLU(),
+            orthogonal(nn.Conv2d(channels, channels, 3, padding=1)),
+            nn.ReLU(),
+            orthogonal(nn.Conv2d(channels, channels, 3, padding=1)),
+        )
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        return inputs + self.layers(inputs)
+
+
+def _stage(convolution: nn.Conv2d) -> nn.Sequential:
+    """The convolution, pooled to half the size, and two residual blocks."""
+    channels = convolution.out_channels
+    return nn.Sequential(
+        orthogonal(convolution), nn.MaxPool2d(3, 2, padding=1), _Residual(channels), _Residual(channels)
+    )
+
+
+def _rectified(inputs: int, units: int) -> tuple[nn.Module, int]:
+    return nn.Sequential(orthogonal(nn.Linear(inputs, units), _GAIN), nn.ReLU()), units
+
+
+def _first(space: ArraySpace) -> type[nn.Conv2d]:
+    return BytesConv2d if space.dtype == "uint8" else nn.Conv2d

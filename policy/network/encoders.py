@@ -1,0 +1,65 @@
+"""The encoders by their names. Torch: the actor never imports this file.
+
+Each is an nn.Module [N, *stacked_shape] -> [N, features] that says what `features` is.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
+from daedalus.policy.network.custom_encoder import CustomEncoder
+from daedalus.policy.network.layers import orthogonal
+from daedalus.protocol.spec import ArraySpace, PolicySpec
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
+_GAIN = math.sqrt(2.0)
+
+
+class MultilayerPerceptron(nn.Module):
+    """Flattens an observation and passes it through fully connected layers, of which there may be none.
+
+    [N, *stacked_shape] -> [N, features]. `uint8` observations are scaled to [0, 1].
+    """
+
+    def __init__(self, space: ArraySpace, hidden: tuple[int, ...], activation: str) -> None:
+        super().__init__()
+        self._scale = 1.0 / 255.0 if space.dtype == "uint8" else None
+        layers: list[nn.Module] = []
+        width = math.prod(space.stacked_shape)
+        for units in hidden:
+            layers += [orthogonal(nn.Linear(width, units), _GAIN), _ACTIVATIONS[activation]()]
+            width = units
+        self.layers = nn.Sequential(*layers)
+        self.features = width
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """[N, *stacked_shape] -> [N, features]."""
+        flat = observations.flatten(1)  # [N, prod(stacked_shape)]
+        if self._scale is not None:
+            flat = flat.to(torch.float32) * self._scale
+        return self.layers(flat)
+
+
+Encoder = MultilayerPerceptron | ImageEncoder | CustomEncoder
+
+
+def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
+    """The encoder that the specification names, for observations of the space.
+
+    Raises NetworkError if there is none such, or it is not for observations like these.
+    """
+    match spec.encoder:
+        case "mlp":
+            return MultilayerPerceptron(space, spec.hidden, spec.activation)
+        case "nature":
+            return nature(space)
+        case "small":
+            return small(space)
+        case "impala":
+            return impala(space)
+        case "article":
+            return ArticleEncoder(space)
+        case name:
+            return CustomEncoder(name, space)

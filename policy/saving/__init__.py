@@ -1,0 +1,1 @@
+"""Policies on disk: sealed directories, and the names of checkpoints."""

@@ -1,0 +1,120 @@
+"""algorithms/batch.py: rollouts side by side, and in memory that is used again."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from building import ENVIRONMENTS, ROWS, SPACES, identity, join, make_rollout
+
+from daedalus.algorithms.batch import Batch, BatchAssembler
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spec import ArraySpace
+
+CPU = torch.device("cpu")
+COPIED = ("actions", "behaviour_log_probs", "rewards", "terminated", "truncated", "valid")
+PIXELS = ArraySpace(shape=(2, 3), dtype="uint8", frames=4)
+
+
+def pixels(seed: int, environments: int = ENVIRONMENTS, rows: int = ROWS, **replaced: Any) -> Rollout:
+    """A rollout of 4-stacks, its frames environment by environment in memory."""
+    random = np.random.default_rng(seed)
+    frames = random.integers(0, 256, (environments, rows + PIXELS.frames, *PIXELS.shape), np.uint8).swapaxes(0, 1)
+    return make_rollout(environments=environments, rows=rows, seed=seed, **{"frames": frames, **replaced})
+
+
+def stack(rollout: Rollout, row: int, environment: int, depth: int) -> np.ndarray:
+    """The newest `depth` frames at a row, the first of its episode in place of those before it. The slow way."""
+    start = -depth  # frames of before row 0 were put in order by who collected them
+    for earlier in range(row):
+        if not rollout.valid[earlier, environment]:
+            start = earlier + 1
+    rows = [max(row - age, start) for age in range(depth - 1, -1, -1)]
+    return np.stack([rollout.frames[depth - 1 + each, environment] for each in rows])
+
+
+def assert_holds(batch: Batch, rollouts: list[Rollout], depth: int) -> None:
+    """Every number of a batch is that of its rollout."""
+    first = 0
+    for rollout in rollouts:
+        part = slice(first, first + rollout.environments)
+        for name in COPIED:
+            np.testing.assert_array_equal(getattr(batch, name)[:, part].numpy(), getattr(rollout, name))
+        np.testing.assert_array_equal(batch.initial_state[part].numpy(), rollout.initial_state)
+        assert not batch.starts[0, part].any()
+        np.testing.assert_array_equal(batch.starts[1:, part].numpy(), ~rollout.valid)
+        for row in range(rollout.rows + 1):
+            for environment in range(rollout.environments):
+                seen = batch.observations[row, first + environment].numpy()
+                expected = stack(rollout, row, environment, depth)
+                np.testing.assert_array_equal(seen, expected if depth > 1 else expected[0])
+        first += rollout.environments
+    assert batch.actions.shape == (rollouts[0].rows, first)
+
+
+def test_rollouts_are_joined_on_the_environment_axis_in_the_order_given() -> None:
+    rollouts = [
+        make_rollout(identity("b"), seed=1, state_size=5),
+        make_rollout(identity("a"), environments=2, seed=2, state_size=5),
+        make_rollout(identity("c"), environments=1, seed=3, state_size=5),
+    ]
+    assert_holds(join(rollouts), rollouts, depth=1)
+
+
+def test_stacks_are_made_of_the_frames_of_each_rollout() -> None:
+    rollouts = [pixels(1), pixels(2, environments=1), pixels(3, environments=2)]
+    assert not all(rollout.valid.all() for rollout in rollouts)
+    batch = join(rollouts, PIXELS)
+    assert batch.observations.shape == (ROWS + 1, 6, 4, 2, 3)
+    assert_holds(batch, rollouts, depth=4)
+
+
+@pytest.mark.parametrize("rows", [4, 5, 9])
+def test_an_episode_that_starts_at_any_row_shows_nothing_of_the_one_before(rows: int) -> None:
+    for start in range(rows):
+        valid = np.ones((rows, 2), np.bool_)
+        valid[start, 0] = False
+        rollout = pixels(start, environments=2, rows=rows, valid=valid)
+        batch = join([rollout], PIXELS)
+        first = rollout.frames[PIXELS.frames - 1 + start + 1, 0]
+        assert (batch.observations[start + 1, 0].numpy() == first).all()
+        assert_holds(batch, [rollout], depth=4)
+
+
+@pytest.mark.parametrize(("space", "make"), [(SPACES.observation, make_rollout), (PIXELS, pixels)])
+def test_memory_is_used_again_and_holds_nothing_of_the_batch_before(space: ArraySpace, make: Any) -> None:
+    assembler = BatchAssembler(space, CPU)
+    places = set()
+    for seed in range(6):
+        rollouts = [make(seed=10 * seed), make(seed=10 * seed + 1)]
+        batch = assembler.join(rollouts)
+        assert_holds(batch, rollouts, space.frames)
+        places.add(tuple(getattr(batch, name).data_ptr() for name in ("observations", "starts", *COPIED)))
+    assert len(places) == 1
+
+
+def test_batches_of_other_sizes_get_memory_that_fits() -> None:
+    assembler = BatchAssembler(PIXELS, CPU)
+    for environments in (3, 5, 1, 3):
+        rollouts = [pixels(environments, environments), pixels(7)]
+        assert_holds(assembler.join(rollouts), rollouts, depth=4)
+
+
+def test_a_batch_has_the_dtypes_that_learning_wants() -> None:
+    batch = join([make_rollout()])
+    assert batch.actions.dtype == torch.int64
+    assert batch.valid.dtype == batch.initial_state.dtype == torch.float32
+    assert batch.terminated.dtype == batch.truncated.dtype == batch.starts.dtype == torch.bool
+    assert batch.observations.dtype == batch.rewards.dtype == torch.float32
+
+
+def test_pixels_stay_bytes() -> None:
+    assert join([pixels(1)], PIXELS).observations.dtype == torch.uint8
+
+
+def test_a_batch_is_a_copy_of_its_rollouts() -> None:
+    rollout = make_rollout()
+    batch = join([rollout])
+    before = batch.rewards.clone()
+    rollout.rewards[:] = 5.0
+    assert torch.equal(batch.rewards, before)

@@ -1,0 +1,204 @@
+"""algorithms/losses.py, element by element."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from daedalus.algorithms.losses import (
+    clipped_fraction,
+    clipped_policy_loss,
+    explained_variance,
+    masked_mean,
+    normalized,
+    policy_gradient_loss,
+    value_loss,
+)
+from daedalus.policy.network.distributions import categorical_log_probs
+
+ROWS, COLUMNS = 5, 3
+CELLS = [(t, b) for t in range(ROWS) for b in range(COLUMNS)]
+
+
+@pytest.fixture
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(5)
+
+
+@pytest.fixture
+def valid(random: torch.Generator) -> Tensor:
+    mask = (torch.rand(ROWS, COLUMNS, generator=random) > 0.4).float()
+    assert 0 < mask.sum() < mask.numel()
+    return mask
+
+
+def normal(random: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*(shape or (ROWS, COLUMNS)), generator=random) * 2.0
+
+
+def mean_of(terms: dict[tuple[int, int], float], valid: Tensor) -> float:
+    kept = [terms[cell] for cell in CELLS if valid[cell] == 1.0]
+    return math.fsum(kept) / len(kept)
+
+
+def test_masked_mean_is_the_mean_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+    values = normal(random)
+    expected = mean_of({cell: values[cell].item() for cell in CELLS}, valid)
+    assert masked_mean(values, valid).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_masked_mean_of_no_valid_row_is_0() -> None:
+    assert masked_mean(torch.ones(2, 2), torch.zeros(2, 2)).item() == 0.0
+
+
+def test_policy_gradient_loss_is_minus_the_mean_log_prob_times_advantage(
+    random: torch.Generator, valid: Tensor
+) -> None:
+    log_probs, advantages = normal(random), normal(random)
+    expected = -mean_of({cell: log_probs[cell].item() * advantages[cell].item() for cell in CELLS}, valid)
+    assert policy_gradient_loss(log_probs, advantages, valid).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid: Tensor) -> None:
+    # d/dlogits_k of - log pi(a) A is A (pi_k - [k = a]), a share of it for each valid row.
+    logits = normal(random, ROWS, COLUMNS, 4).requires_grad_()
+    actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
+    advantages = normal(random)
+    log_probs, _ = categorical_log_probs(logits, actions)
+    policy_gradient_loss(log_probs, advantages, valid).backward()
+    chosen = torch.nn.functional.one_hot(actions, 4)
+    expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)
+    assert logits.grad is not None
+    assert_close(logits.grad, expected)
+
+
+@pytest.mark.parametrize("clip_range", [0.1, 0.5, 2.0])
+def test_clipped_policy_loss_is_the_papers(random: torch.Generator, valid: Tensor, clip_range: float) -> None:
+    log_ratios, advantages = normal(random) / 2.0, normal(random)
+
+    def gain(cell: tuple[int, int]) -> float:
+        ratio, advantage = math.exp(log_ratios[cell].item()), advantages[cell].item()
+        clipped = min(max(ratio, 1.0 - clip_range), 1.0 + clip_range)
+        return min(ratio * advantage, clipped * advantage)
+
+    expected = -mean_of({cell: gain(cell) for cell in CELLS}, valid)
+    loss = clipped_policy_loss(log_ratios, advantages, valid, clip_range)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_clipped_policy_loss_by_hand() -> None:
+    # Ratios 1.5, 1.5, 0.5, 0.5, 1.1, 1 with a range of 0.2; the last row is not valid.
+    log_ratios = torch.tensor([[1.5, 1.5, 0.5, 0.5, 1.1, 1.0]]).log().requires_grad_()
+    advantages = torch.tensor([[2.0, -2.0, 2.0, -2.0, 3.0, 100.0]])
+    valid = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
+    loss = clipped_policy_loss(log_ratios, advantages, valid, 0.2)
+    # min(3, 2.4) + min(-3, -2.4) + min(1, 1.6) + min(-1, -1.6) + min(3.3, 3.3), over five rows
+    assert loss.item() == pytest.approx(-(2.4 - 3.0 + 1.0 - 1.6 + 3.3) / 5.0)
+    loss.backward()
+    # Where the ratio went too far already, nothing pulls it on; where it went the wrong way, it is pulled back.
+    expected = torch.tensor([[0.0, 3.0, -1.0, 0.0, -3.3, 0.0]]) / 5.0
+    assert log_ratios.grad is not None
+    assert_close(log_ratios.grad, expected)
+    assert clipped_fraction(log_ratios.detach(), valid, 0.2).item() == pytest.approx(4 / 5)
+
+
+def test_at_a_ratio_of_1_the_clipped_gradient_is_the_policy_gradient(random: torch.Generator, valid: Tensor) -> None:
+    advantages, before = normal(random), normal(random)
+    gradients = []
+    for clipped in (False, True):
+        log_probs = before.clone().requires_grad_()
+        if clipped:
+            clipped_policy_loss(log_probs - before, advantages, valid, 0.2).backward()
+        else:
+            policy_gradient_loss(log_probs, advantages, valid).backward()
+        gradients.append(log_probs.grad)
+    assert_close(gradients[0], gradients[1])
+
+
+def test_clipped_fraction_is_of_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+    log_ratios = normal(random) / 4.0
+    left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}
+    assert clipped_fraction(log_ratios, valid, 0.3).item() == pytest.approx(mean_of(left, valid))
+    assert clipped_fraction(torch.zeros(ROWS, COLUMNS), valid, 0.3).item() == 0.0
+
+
+def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
+    values = normal(random).requires_grad_()
+    log_probs = normal(random).requires_grad_()
+    policy_gradient_loss(log_probs, normal(random) - values, valid).backward()
+    assert values.grad is None
+    clipped_policy_loss(log_probs, normal(random) - values, valid, 0.2).backward()
+    assert values.grad is None
+    for kind in ("mse", "huber"):
+        targets = normal(random).requires_grad_()
+        value_loss(values, targets, valid, kind).backward()
+        assert targets.grad is None
+        assert values.grad is not None
+
+
+def test_mse_is_the_mean_squared_error_without_a_half(random: torch.Generator, valid: Tensor) -> None:
+    values, targets = normal(random), normal(random)
+    expected = mean_of({cell: (values[cell].item() - targets[cell].item()) ** 2 for cell in CELLS}, valid)
+    assert value_loss(values, targets, valid, "mse").item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_huber_is_quadratic_within_1_and_linear_beyond(random: torch.Generator, valid: Tensor) -> None:
+    def huber(error: float) -> float:
+        return 0.5 * error * error if abs(error) <= 1.0 else abs(error) - 0.5
+
+    values, targets = normal(random), normal(random)
+    terms = {cell: huber(values[cell].item() - targets[cell].item()) for cell in CELLS}
+    assert value_loss(values, targets, valid, "huber").item() == pytest.approx(mean_of(terms, valid), rel=1e-5)
+
+
+def test_normalized_has_mean_0_and_deviation_1_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+    kept = normalized(normal(random) * 9.0 + 4.0, valid)[valid == 1.0]
+    assert kept.mean().item() == pytest.approx(0.0, abs=1e-5)
+    assert kept.std(correction=0).item() == pytest.approx(1.0, rel=1e-5)
+
+
+def test_normalized_of_equal_advantages_is_0() -> None:
+    assert torch.equal(normalized(torch.full((2, 2), 3.0), torch.ones(2, 2)), torch.zeros(2, 2))
+
+
+def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_for_worse(
+    random: torch.Generator, valid: Tensor
+) -> None:
+    targets = normal(random)
+    assert explained_variance(targets, targets, valid).item() == pytest.approx(1.0)
+    assert explained_variance(targets + 7.0, targets, valid).item() == pytest.approx(1.0, abs=1e-5)
+    assert explained_variance(torch.full_like(targets, 2.0), targets, valid).item() == pytest.approx(0.0, abs=1e-5)
+    assert explained_variance(-targets, targets, valid).item() == pytest.approx(-3.0, rel=1e-4)
+
+
+def test_explained_variance_is_the_papers_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+    values, targets = normal(random), normal(random)
+    kept = valid == 1.0
+    residual = (targets - values)[kept]
+    expected = 1.0 - residual.var(correction=0) / targets[kept].var(correction=0)
+    assert_close(explained_variance(values, targets, valid), expected)
+
+
+def test_what_invalid_rows_hold_changes_no_loss_and_no_gradient(random: torch.Generator, valid: Tensor) -> None:
+    first, second = normal(random), normal(random)
+    garbage = torch.where(valid == 1.0, 0.0, 1e6)
+
+    def outcome(shift: Tensor) -> list[Tensor]:
+        ours = (first + shift).requires_grad_()
+        theirs = second - 3.0 * shift
+        losses = [
+            policy_gradient_loss(ours, theirs, valid),
+            policy_gradient_loss(ours, normalized(theirs, valid), valid),
+            clipped_policy_loss(ours * valid, theirs, valid, 0.2),
+            value_loss(ours, theirs, valid, "mse"),
+            value_loss(ours, theirs, valid, "huber"),
+            explained_variance(ours, theirs, valid),
+        ]
+        gradients = torch.autograd.grad(losses, ours, [torch.ones(())] * len(losses))
+        assert torch.equal(gradients[0] * (1.0 - valid), torch.zeros_like(valid))
+        return [*(loss.detach() for loss in losses), *gradients]
+
+    for clean, dirty in zip(outcome(torch.zeros(())), outcome(garbage), strict=True):
+        assert torch.equal(clean, dirty)

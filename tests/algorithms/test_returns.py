@@ -1,0 +1,241 @@
+"""algorithms/returns.py against the papers' sums, against itself where one case is another, and by hand."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles import Stream, lambda_return, n_step_return, vtrace, vtrace_advantage
+from torch import Tensor
+from torch.testing import assert_close
+
+from daedalus.algorithms.returns import actor_critic_targets, lambda_returns, n_step_returns, vtrace_targets
+
+NUMBER = st.floats(-10.0, 10.0, width=32)
+UNIT = st.floats(0.0, 1.0, width=32)
+CLIP = st.floats(0.125, 4.0, width=32)
+ENDS = st.sampled_from(["no", "no", "no", "terminated", "truncated", "both"])
+
+
+@st.composite
+def streams(draw: st.DrawFn, rows: int) -> Stream:
+    """The rows of one environment under NEXT_STEP resets; the rows that only reset hold large numbers."""
+    ends, valid = [], []
+    resets = draw(st.booleans())  # the rollout before may have ended with an episode
+    for _ in range(rows):
+        valid.append(not resets)
+        ends.append("no" if resets else draw(ENDS))
+        resets = ends[-1] != "no"
+    return Stream(
+        r=[draw(NUMBER) if ok else 1e4 for ok in valid],
+        V=[draw(NUMBER) for _ in range(rows + 1)],
+        log_ratios=[draw(st.floats(-3.0, 3.0, width=32)) if ok else 80.0 for ok in valid],
+        terminated=[end in ("terminated", "both") for end in ends],
+        truncated=[end in ("truncated", "both") for end in ends],
+        valid=valid,
+    )
+
+
+ROLLOUTS = st.integers(1, 7).flatmap(lambda rows: st.lists(streams(rows), min_size=1, max_size=3))
+
+
+class Columns:
+    """Streams side by side, as the functions want them: [T, B] tensors."""
+
+    def __init__(self, columns: list[Stream], gamma: float) -> None:
+        def stacked(name: str, dtype: torch.dtype = torch.float64) -> Tensor:
+            return torch.tensor([getattr(column, name) for column in columns], dtype=dtype).T
+
+        self.rewards, values = stacked("r"), stacked("V")
+        self.values, self.next_values = values[:-1], values[1:]
+        self.log_ratios = stacked("log_ratios")
+        self.truncated, self.valid = stacked("truncated", torch.bool), stacked("valid", torch.bool)
+        self.discounts = gamma * (~stacked("terminated", torch.bool)).double()
+        self.of_returns = (self.rewards, self.discounts, self.next_values, self.truncated)
+        self.of_targets = (self.rewards, self.discounts, self.values, self.next_values, self.truncated)
+
+
+def assert_rows(result: Tensor, columns: list[Stream], expected) -> None:
+    """Holds every valid row of `result` [T, B] against `expected(stream, t)`."""
+    for number, column in enumerate(columns):
+        for t in column.rows:
+            assert result[t, number].item() == pytest.approx(expected(column, t), rel=1e-5, abs=1e-4)
+
+
+# --------------------------------------------------------------------------------------------- oracles
+
+
+@given(ROLLOUTS, UNIT)
+def test_n_step_returns_are_the_explicit_sums(columns: list[Stream], gamma: float) -> None:
+    result = n_step_returns(*Columns(columns, gamma).of_returns)
+    assert_rows(result, columns, lambda x, t: n_step_return(x, gamma, t, len(x.r)))
+
+
+@given(ROLLOUTS, UNIT, UNIT)
+def test_lambda_returns_are_the_weighted_mixture_of_n_step_returns(
+    columns: list[Stream], gamma: float, lam: float
+) -> None:
+    result = lambda_returns(*Columns(columns, gamma).of_returns, lam)
+    assert_rows(result, columns, lambda x, t: lambda_return(x, gamma, lam, t))
+
+
+@given(ROLLOUTS, UNIT, UNIT)
+def test_actor_critic_advantages_are_returns_above_the_value(columns: list[Stream], gamma: float, lam: float) -> None:
+    data = Columns(columns, gamma)
+    targets = actor_critic_targets(*data.of_targets, lam)
+    assert_rows(targets.values, columns, lambda x, t: lambda_return(x, gamma, lam, t))
+    assert_rows(targets.advantages, columns, lambda x, t: lambda_return(x, gamma, lam, t) - x.V[t])
+
+
+@given(ROLLOUTS, UNIT, UNIT, CLIP, CLIP)
+def test_vtrace_is_the_papers_sum_of_products(
+    columns: list[Stream], gamma: float, lam: float, rho_bar: float, c_bar: float
+) -> None:
+    data = Columns(columns, gamma)
+    targets = vtrace_targets(data.log_ratios, *data.of_targets, lam, rho_bar, c_bar)
+    assert_rows(targets.values, columns, lambda x, t: vtrace(x, gamma, lam, rho_bar, c_bar, t))
+    assert_rows(targets.advantages, columns, lambda x, t: vtrace_advantage(x, gamma, lam, rho_bar, c_bar, t))
+
+
+# ------------------------------------------------------------------------------------------ identities
+
+
+@given(ROLLOUTS, UNIT)
+def test_lambda_of_0_gives_one_step_returns(columns: list[Stream], gamma: float) -> None:
+    data = Columns(columns, gamma)
+    expected = data.rewards + data.discounts * data.next_values
+    assert_close(lambda_returns(*data.of_returns, 0.0), expected)
+
+
+@given(ROLLOUTS, UNIT)
+def test_lambda_of_1_gives_n_step_returns(columns: list[Stream], gamma: float) -> None:
+    data = Columns(columns, gamma)
+    assert torch.equal(lambda_returns(*data.of_returns, 1.0), n_step_returns(*data.of_returns))
+
+
+@given(ROLLOUTS, UNIT, UNIT, st.floats(1.0, 4.0), st.floats(1.0, 4.0))
+def test_vtrace_on_policy_is_the_lambda_return_and_its_advantage(
+    columns: list[Stream], gamma: float, lam: float, rho_bar: float, c_bar: float
+) -> None:
+    data = Columns(columns, gamma)
+    on_policy = torch.zeros_like(data.log_ratios)
+    targets = vtrace_targets(on_policy, *data.of_targets, lam, rho_bar, c_bar)
+    expected = actor_critic_targets(*data.of_targets, lam)
+    assert_close(targets.values, expected.values, rtol=1e-5, atol=1e-4)
+    assert_close(targets.advantages, expected.advantages, rtol=1e-5, atol=1e-4)
+
+
+@given(ROLLOUTS, UNIT, UNIT, CLIP)
+def test_vtrace_with_a_vanishing_rho_clip_learns_nothing(
+    columns: list[Stream], gamma: float, lam: float, c_bar: float
+) -> None:
+    data = Columns(columns, gamma)
+    targets = vtrace_targets(data.log_ratios, *data.of_targets, lam, 1e-12, c_bar)
+    assert torch.where(data.valid, targets.values - data.values, 0.0).abs().max() < 1e-6
+    assert torch.where(data.valid, targets.advantages, 0.0).abs().max() < 1e-6
+
+
+@given(ROLLOUTS, UNIT, CLIP)
+def test_vtrace_with_a_vanishing_trace_clip_looks_one_step_ahead(
+    columns: list[Stream], gamma: float, rho_bar: float
+) -> None:
+    data = Columns(columns, gamma)
+    targets = vtrace_targets(data.log_ratios, *data.of_targets, 1.0, rho_bar, 1e-12)
+    rhos = data.log_ratios.exp().clamp(max=rho_bar)
+    one_step = data.values + rhos * (data.rewards + data.discounts * data.next_values - data.values)
+    assert_close(targets.values[data.valid], one_step[data.valid], rtol=1e-5, atol=1e-5)
+
+
+@given(ROLLOUTS, UNIT, UNIT)
+def test_ratios_above_both_clips_count_as_the_clips(columns: list[Stream], gamma: float, lam: float) -> None:
+    data = Columns(columns, gamma)
+    high, higher = torch.full_like(data.log_ratios, 2.0), torch.full_like(data.log_ratios, 60.0)
+    first = vtrace_targets(high, *data.of_targets, lam, 1.5, 0.75)
+    second = vtrace_targets(higher, *data.of_targets, lam, 1.5, 0.75)
+    assert torch.equal(first.values, second.values)
+    assert torch.equal(first.advantages, second.advantages)
+
+
+@given(ROLLOUTS, UNIT, UNIT, NUMBER)
+def test_nothing_flows_from_the_rows_that_only_reset(
+    columns: list[Stream], gamma: float, lam: float, garbage: float
+) -> None:
+    data = Columns(columns, gamma)
+
+    def results() -> list[Tensor]:
+        corrected = vtrace_targets(data.log_ratios, *data.of_targets, lam, 1.0, 1.0)
+        plain = actor_critic_targets(*data.of_targets, lam)
+        return [result[data.valid].clone() for result in (*corrected, *plain)]
+
+    before = results()
+    data.rewards[~data.valid] = garbage
+    data.log_ratios[~data.valid] = garbage
+    for ours, theirs in zip(before, results(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+# ---------------------------------------------------------------------------------------- worked by hand
+
+
+def column(*numbers: float) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float32).unsqueeze(1)
+
+
+def test_n_step_returns_by_hand() -> None:
+    # gamma = 1/2; no episode ends.
+    #   G_2 = 4 + 1/2 * 30   = 19
+    #   G_1 = 2 + 1/2 * 19   = 11.5
+    #   G_0 = 1 + 1/2 * 11.5 = 6.75
+    cut = torch.zeros(3, 1, dtype=torch.bool)
+    result = n_step_returns(column(1, 2, 4), column(0.5, 0.5, 0.5), column(10, 20, 30), cut)
+    assert torch.equal(result, column(6.75, 11.5, 19))
+
+
+def test_lambda_returns_by_hand() -> None:
+    # gamma = lambda = 1/2; no episode ends.
+    #   G_2 = 4 + 1/2 * 30                         = 19
+    #   G_1 = 2 + 1/2 * (1/2 * 20 + 1/2 * 19)      = 11.75
+    #   G_0 = 1 + 1/2 * (1/2 * 10 + 1/2 * 11.75)   = 6.4375
+    cut = torch.zeros(3, 1, dtype=torch.bool)
+    result = lambda_returns(column(1, 2, 4), column(0.5, 0.5, 0.5), column(10, 20, 30), cut, 0.5)
+    assert torch.equal(result, column(6.4375, 11.75, 19))
+
+
+def test_vtrace_by_hand() -> None:
+    # gamma = 1/2, lambda = 1, rho-bar = 3/2, c-bar = 1; ratios 2 and 1/2; V = 4, 8, 16; r = 1, 2.
+    #   rho = 3/2, 1/2      c_0 = 1
+    #   delta_0 = 3/2 * (1 + 1/2 * 8  - 4) = 1.5     delta_1 = 1/2 * (2 + 1/2 * 16 - 8) = 1
+    #   v_1 = 8 + 1 = 9                              v_0 = 4 + 1.5 + 1/2 * 1 * 1 = 6
+    #   A_1 = 1/2 * (2 + 1/2 * 16 - 8) = 1           A_0 = 3/2 * (1 + 1/2 * 9 - 4) = 2.25
+    targets = vtrace_targets(
+        column(2, 0.5).log(),
+        column(1, 2),
+        column(0.5, 0.5),
+        column(4, 8),
+        column(8, 16),
+        torch.zeros(2, 1, dtype=torch.bool),
+        1.0,
+        1.5,
+        1.0,
+    )
+    assert_close(targets.values, column(6, 9))
+    assert_close(targets.advantages, column(2.25, 1))
+
+
+def test_truncation_bootstraps_and_termination_does_not_within_one_rollout() -> None:
+    # gamma = 1/2. Row 1 is truncated, row 2 only resets, row 4 terminates, row 5 only resets, row 6 plays on.
+    #   G_0 = 1 + 1/2 * 12 = 7      G_1 = 2 + 1/2 * 20 = 12, of V(s_2) = 20
+    #   G_3 = 3 + 1/2 * 4  = 5      G_4 = 4, of V(s_5) = 50 nothing
+    #   G_6 = 6 + 1/2 * 70 = 41
+    no, yes = False, True
+    rewards = column(1, 2, 1000, 3, 4, 1000, 6)
+    discounts = column(0.5, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5)
+    next_values = column(10, 20, 30, 40, 50, 60, 70)
+    truncated = torch.tensor([no, yes, no, no, no, no, no]).unsqueeze(1)
+    played = [0, 1, 3, 4, 6]
+    expected = column(7, 12, 5, 4, 41)
+    assert torch.equal(n_step_returns(rewards, discounts, next_values, truncated)[played], expected)
+    values = torch.cat([column(0), next_values[:-1]])
+    on_policy = torch.zeros_like(rewards)
+    targets = vtrace_targets(on_policy, rewards, discounts, values, next_values, truncated, 1.0, 1.0, 1.0)
+    assert_close(targets.values[played], expected)
+    assert_close(targets.advantages[played], expected - values[played])

@@ -1,0 +1,90 @@
+"""What the learner's tests are made of: small specifications, rollouts, batches, a fleet that has joined."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from daedalus.algorithms.batch import Batch, BatchAssembler
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.messages import Join, Rollout, RolloutIdentity
+from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces, TrainingSpec
+
+EPOCH = 77
+ROWS, ENVIRONMENTS = 6, 3
+SPACES = Spaces(observation=ArraySpace(shape=(3,), dtype="float32"), action=ChoiceSpace(count=4))
+POLICY = PolicySpec(hidden=(8,))
+RECURRENT = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
+
+
+def run_spec(rows: int = ROWS, actors: int = 2, **training: Any) -> RunSpec:
+    return RunSpec.model_validate(
+        {
+            "environment": EnvironmentSpec(id="Any-v0"),
+            "policy": POLICY,
+            "collection": {"rollout_length": rows, "actors": actors, "envs_per_actor": ENVIRONMENTS},
+            "training": TrainingSpec.model_validate(training),
+        }
+    )
+
+
+def identity(actor: str = "a", sequence: int = 0, incarnation: int = 1, epoch: int = EPOCH) -> RolloutIdentity:
+    return RolloutIdentity(actor=actor, incarnation=incarnation, sequence=sequence, learner_epoch=epoch)
+
+
+def make_rollout(
+    who: RolloutIdentity | None = None,
+    *,
+    version: int = 0,
+    rows: int = ROWS,
+    environments: int = ENVIRONMENTS,
+    shape: Sequence[int] = (3,),
+    stack: int = 1,
+    state_size: int = 0,
+    seed: int = 0,
+    **replaced: np.ndarray,
+) -> Rollout:
+    """A rollout of random content, with ends of both kinds and the reset rows that follow them."""
+    random = np.random.default_rng(seed)
+    terminated, truncated = np.zeros((2, rows, environments), np.bool_)
+    valid = np.ones((rows, environments), np.bool_)
+    valid[0] = random.random(environments) > 0.3
+    for row in range(rows):
+        if row:
+            valid[row] = ~(terminated[row - 1] | truncated[row - 1])
+        terminated[row] = valid[row] & (random.random(environments) < 0.15)
+        truncated[row] = valid[row] & (random.random(environments) < 0.15)
+    cells = (rows, environments)
+    content: dict[str, Any] = {
+        "frames": random.standard_normal((stack + rows, environments, *shape), np.float32),
+        "initial_state": random.standard_normal((environments, state_size), np.float32),
+        "actions": random.integers(0, SPACES.action.count, cells, np.uint8),
+        "behaviour_log_probs": -random.uniform(0.5, 2.5, cells).astype(np.float32),
+        "rewards": random.standard_normal(cells, np.float32),
+        "terminated": terminated,
+        "truncated": truncated,
+        "valid": valid,
+        "episode_returns": np.array([-1.5], np.float32),
+        "episode_lengths": np.array([4], np.int32),
+    }
+    return Rollout(identity=who or identity(), policy_version=version, **{**content, **replaced})
+
+
+def make_rollouts(seed: int, count: int = 2, state_size: int = 0) -> list[Rollout]:
+    """Those of one batch."""
+    return [make_rollout(seed=seed * 100 + number, state_size=state_size) for number in range(count)]
+
+
+def join(rollouts: Sequence[Rollout], observation: ArraySpace = SPACES.observation) -> Batch:
+    """One batch of them, in memory of its own."""
+    return BatchAssembler(observation, torch.device("cpu")).join(rollouts)
+
+
+def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:
+    """A fleet in which the named actors have joined, in their incarnation 1, and are present."""
+    fleet = Fleet(seed, None)
+    for actor in actors:
+        assert fleet.join(Join(actor=actor, incarnation=1, spaces=spaces, environments=environments), 0.0) is None
+        fleet.set_present(actor, 1, True)
+    return fleet

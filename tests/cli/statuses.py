@@ -1,0 +1,52 @@
+"""Statuses as a learner would send them."""
+
+from typing import Any
+
+from daedalus.protocol.spec import ActorStatus, RunStatus
+
+
+def actor_status(name: str, **changes: Any) -> ActorStatus:
+    values = {
+        "actor": name,
+        "alive": True,
+        "quarantined": "",
+        "lives": 1,
+        "seconds_since_seen": 0.5,
+        "environments": 4,
+        "env_steps": 50,
+        "env_steps_per_second": 10.0,
+        "rollouts_accepted": 5,
+        "rollouts_rejected": {"stale": 1},
+        "rollouts_missed": 0,
+        "busy_answers": 0,
+        "policy_lag": 1,
+        "slow_link": False,
+        "bytes_up_per_hour": 7200.0,
+        "bytes_down_per_hour": 3600.0,
+    }
+    return ActorStatus(**{**values, **changes})
+
+
+def run_status(**changes: Any) -> RunStatus:
+    values = {
+        "run": "mine",
+        "learner_epoch": 1,
+        "algorithm": "impala",
+        "environment": "CartPole-v1",
+        "problems": (),
+        "uptime_seconds": 12.0,
+        "env_steps": 100,
+        "env_steps_budget": 1000,
+        "updates": 7,
+        "updates_skipped": 0,
+        "episode_return_mean": 20.0,
+        "env_steps_per_second": 20.0,
+        "updates_per_second": 1.5,
+        "policy_lag_mean": 1.0,
+        "queue_bytes": 0,
+        "queue_bytes_limit": 1024,
+        "checkpoint_age_seconds": 3.0,
+        "rollouts_rejected": {"stale": 2},
+        "actors": (),
+    }
+    return RunStatus(**{**values, **changes})

@@ -1,0 +1,77 @@
+"""`daedalus certs`: what it makes, and what it refuses."""
+
+import json
+import stat
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli.commands.certs import certs
+from daedalus.transport.credentials import load
+
+
+def make(directory: Path) -> Path:
+    assert certs(["init", str(directory), "--host", "gpu-box"]) == 0
+    return directory
+
+
+def test_a_new_ca_makes_the_first_identities(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make(tmp_path / "certs")
+    assert sorted(entry.name for entry in made.iterdir()) == ["ca", "learner", "operator", "router"]
+    for role in ("learner", "router", "operator"):
+        assert load(made / role, role).role == role
+    assert "reached as gpu-box, " in capsys.readouterr().out
+
+
+def test_keys_are_for_nobody_else(tmp_path: Path) -> None:
+    for key in make(tmp_path / "certs").rglob("key.pem"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+
+
+def test_actors_are_known_to_those_who_let_them_in(tmp_path: Path) -> None:
+    made = make(tmp_path / "certs")
+    assert certs(["issue", "actor", "arm", "box", "--directory", str(made)]) == 0
+    assert certs(["issue", "operator", "ann", "--directory", str(made)]) == 0
+    credentials = load(made / "actor-arm", "actor")
+    assert (credentials.role, credentials.name) == ("actor", "arm")
+    for role in ("learner", "router"):
+        names = json.loads((made / role / "names.json").read_text())
+        assert names == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
+    zenohd = json.loads((made / "router" / "zenoh.json5").read_text())
+    assert {"actor:arm", "actor:box"} < {
+        name for subject in zenohd["access_control"]["subjects"] for name in subject.get("cert_common_names", ())
+    }
+    assert certs(["revoke", "actor", "box", "--directory", str(made)]) == 0
+    assert json.loads((made / "learner" / "names.json").read_text())["actors"] == ["arm"]
+    assert not (made / "actor-box").exists()
+
+
+def test_an_actor_may_bear_the_name_of_a_role(tmp_path: Path) -> None:
+    made = make(tmp_path / "certs")
+    assert certs(["issue", "actor", "learner", "operator", "--directory", str(made)]) == 0
+    assert load(made / "actor-learner", "actor").name == "learner"
+    assert load(made / "learner", "learner").role == "learner"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["init", "{certs}"], "is not empty"),
+        (["issue", "actor", "--directory", "{certs}"], "issued by name"),
+        (["issue", "learner", "x", "--directory", "{certs}"], "issued by name"),
+        (["issue", "actor", "a.b", "--directory", "{certs}"], "no '.' in a certificate's name"),
+        (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
+        (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
+        (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    made = make(tmp_path / "certs")
+    before = sorted(made.rglob("*"))
+    assert certs([argument.format(certs=made) for argument in arguments]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(made.rglob("*")) == before

@@ -1,0 +1,92 @@
+"""cli/commands/exporter.py: what it does with a network, and with mistakes."""
+
+import socket
+import sys
+
+import pytest
+from prometheus_client import CollectorRegistry
+from statuses import run_status
+
+from daedalus.cli.commands.exporter import StatusCollector, exporter
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import StatusReport
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport, TransportError
+
+UNUSED = "tcp/127.0.0.1:1"
+
+
+def up(collector: StatusCollector) -> float | None:
+    registry = CollectorRegistry()
+    registry.register(collector)
+    return registry.get_sample_value("daedalus_up")
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def collector(network: MemoryNetwork) -> StatusCollector:
+    collector = StatusCollector()
+    collector.transport = MemoryTransport(network)
+    return collector
+
+
+def test_every_scrape_asks_anew(network: MemoryNetwork, collector: StatusCollector) -> None:
+    assert (up(collector), collector.unanswered) == (0.0, True)
+    learner = MemoryTransport(network)
+    answer = encode(StatusReport(status=run_status()))
+    learner.serve(keys.status("mine"), lambda request: request.reply(answer))
+    assert (up(collector), collector.unanswered) == (1.0, False)
+    learner.close()
+    assert (up(collector), collector.unanswered) == (0.0, True)
+
+
+def test_without_a_router_no_learner_is_up() -> None:
+    assert up(StatusCollector()) == 0.0
+
+
+def test_an_answer_that_is_none_of_ours_is_no_learner(network: MemoryNetwork, collector: StatusCollector) -> None:
+    MemoryTransport(network).serve(keys.status("mine"), lambda request: request.reply(b"nonsense"))
+    assert up(collector) == 0.0
+
+
+def test_a_failing_transport_is_no_learner(collector: StatusCollector, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_arguments: object, **_options: object) -> list[bytes]:
+        raise TransportError("closed")
+
+    monkeypatch.setattr(collector.transport, "ask", fail)
+    assert up(collector) == 0.0
+
+
+def test_to_register_it_asks_nobody(collector: StatusCollector) -> None:
+    CollectorRegistry().register(collector)
+    assert not collector.unanswered
+
+
+def test_a_missing_package_is_told_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    assert exporter(["--connect", UNUSED]) == 1
+    message = capsys.readouterr().err
+    assert 'pip install "daedalus-rl[monitoring]"' in message
+    assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize("listen", ["9464", ":9464", "host:", "host:metrics", "host:65536"])
+def test_a_bad_address_is_bad_usage(listen: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        exporter(["--connect", UNUSED, "--listen", listen])
+    assert ended.value.code == 2
+    assert "is not HOST:PORT" in capsys.readouterr().err
+
+
+def test_an_address_in_use_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        assert exporter(["--connect", UNUSED, "--listen", f"127.0.0.1:{other.getsockname()[1]}"]) == 1
+    assert "cannot listen on 127.0.0.1:" in capsys.readouterr().err

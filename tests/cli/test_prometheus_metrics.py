@@ -1,0 +1,95 @@
+"""cli/prometheus_metrics.py: a status in Prometheus' words."""
+
+from collections.abc import Iterable
+
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import Metric
+from prometheus_client.parser import text_string_to_metric_families
+from statuses import actor_status, run_status
+
+from daedalus.cli.prometheus_metrics import metrics
+from daedalus.protocol.spec import RunStatus
+
+Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+
+
+class Fixed:
+    def __init__(self, statuses: Iterable[RunStatus]) -> None:
+        self.statuses = statuses
+
+    def collect(self) -> Iterable[Metric]:
+        return metrics(self.statuses)
+
+
+def scraped(*statuses: RunStatus) -> Samples:
+    """What Prometheus reads, by name and labels; a series that comes twice fails."""
+    registry = CollectorRegistry()
+    registry.register(Fixed(statuses))
+    samples: Samples = {}
+    for family in text_string_to_metric_families(generate_latest(registry).decode()):
+        for sample in family.samples:
+            key = (sample.name, tuple(sorted(sample.labels.items())))
+            assert key not in samples
+            samples[key] = sample.value
+    return samples
+
+
+def value(samples: Samples, name: str, **labels: str) -> float | None:
+    return samples.get((name, tuple(sorted(labels.items()))))
+
+
+def test_no_answer_is_one_sample() -> None:
+    assert scraped() == {("daedalus_up", ()): 0.0}
+
+
+def test_a_run_and_its_actors() -> None:
+    samples = scraped(run_status(actors=(actor_status("a", env_steps=40), actor_status("b", env_steps=60))))
+    assert value(samples, "daedalus_up") == 1.0
+    assert value(samples, "daedalus_run_info", run="mine", environment="CartPole-v1", algorithm="impala") == 1.0
+    assert value(samples, "daedalus_healthy", run="mine") == 1.0
+    assert value(samples, "daedalus_env_steps_total", run="mine") == 100.0
+    assert value(samples, "daedalus_updates_total", run="mine") == 7.0
+    assert value(samples, "daedalus_rollouts_rejected_total", run="mine", cause="stale") == 2.0
+    assert value(samples, "daedalus_actor_env_steps_total", run="mine", actor="b") == 60.0
+    assert value(samples, "daedalus_actor_up_bytes_per_second", run="mine", actor="b") == 2.0
+    assert value(samples, "daedalus_actors", run="mine", state="alive") == 2.0
+
+
+def test_what_is_not_known_yet_has_no_sample() -> None:
+    samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None))
+    assert value(samples, "daedalus_episode_return_mean", run="mine") is None
+    assert value(samples, "daedalus_checkpoint_age_seconds", run="mine") is None
+
+
+def test_problems_are_not_healthy() -> None:
+    samples = scraped(run_status(problems=("no update for 70 s",)))
+    assert value(samples, "daedalus_healthy", run="mine") == 0.0
+    assert value(samples, "daedalus_up") == 1.0
+
+
+@pytest.mark.parametrize(("alive", "quarantined", "state"), [(False, "", "gone"), (True, "unfit", "quarantined")])
+def test_actors_that_do_not_take_part_are_counted(alive: bool, quarantined: str, state: str) -> None:
+    samples = scraped(run_status(actors=(actor_status("a"), actor_status("b", alive=alive, quarantined=quarantined))))
+    counts = {each: value(samples, "daedalus_actors", run="mine", state=each) for each in ("alive", state)}
+    assert counts == {"alive": 1.0, state: 1.0}
+
+
+def test_an_actor_that_is_gone_leaves_no_series() -> None:
+    samples = scraped(run_status(actors=(actor_status("a"), actor_status("b", alive=False))))
+    assert {labels["actor"] for _, each in samples if "actor" in (labels := dict(each))} == {"a"}
+
+
+def test_two_runs_stand_side_by_side_and_a_run_that_answers_twice_counts_once() -> None:
+    samples = scraped(run_status(), run_status(run="other", updates=9), run_status(run="other", updates=9))
+    assert value(samples, "daedalus_updates_total", run="mine") == 7.0
+    assert value(samples, "daedalus_updates_total", run="other") == 9.0
+
+
+def test_names_from_outside_are_escaped() -> None:
+    nasty = 'a"} 1\nevil_total{x="'
+    assert value(scraped(run_status(environment=nasty)), "daedalus_run_info", **_info(nasty)) == 1.0
+
+
+def _info(environment: str) -> dict[str, str]:
+    return {"run": "mine", "environment": environment, "algorithm": "impala"}

@@ -1,0 +1,378 @@
+"""The actor server over the memory transport: which versions are welcome, what evaluators ask and tell."""
+
+import queue
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_spec
+from processes import LIMIT, until
+
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.actor_server import Reception
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol import keys
+from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Farewell,
+    Join,
+    Message,
+    Refusal,
+    Snapshot,
+)
+from daedalus.protocol.spec import RunSpec, RunStatus
+from daedalus.transport.interface import MemoryNetwork, MemoryTransport, TransportError
+
+REPORT = EvaluationReport(
+    evaluator="e",
+    learner_epoch=EPOCH,
+    policy_version=0,
+    returns=np.ones(3, np.float32),
+    lengths=np.ones(3, np.int32),
+)
+
+
+def no_status(fleet: Fleet) -> RunStatus:
+    raise AssertionError("nobody asked for it")
+
+
+def made(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> Reception:
+    """One that is open."""
+    transport = MemoryTransport(network)
+    reception = Reception(
+        "r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
+    )
+    reception.open()
+    return reception
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def reception(network: MemoryNetwork) -> Iterator[Reception]:
+    opened = made(network, run_spec(), RunCounters(10))
+    yield opened
+    opened.close("the test is over")
+
+
+@pytest.mark.parametrize(("algorithm", "updates"), [("impala", 1), ("appo", 6)])
+def test_rollouts_of_the_version_that_a_batch_makes_are_welcome_as_soon_as_it_is_taken(
+    network: MemoryNetwork, algorithm: str, updates: int
+) -> None:
+    """The snapshot of that version may be played before the next batch is complete."""
+    counters = RunCounters(10)
+    spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
+    reception = made(network, spec, counters)
+    actor = MemoryTransport(network)
+    join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+
+    def verdict(sequence: int, version: int) -> str:
+        rollout = make_rollout(identity("a", sequence), version=version)
+        (answer,) = actor.ask(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        acknowledgement = decode(answer, Limits())
+        assert isinstance(acknowledgement, Acknowledgement)
+        return acknowledgement.verdict
+
+    try:
+        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        assert verdict(0, version=1) == "rejected"
+        assert verdict(1, version=0) == "accepted"
+        assert len(reception.take_batch(0)) == 1
+        assert verdict(2, version=updates + 1) == "rejected"
+        assert verdict(3, version=updates) == "accepted"
+        assert len(reception.take_batch(updates)) == 1
+    finally:
+        reception.close("the test is over")
+    assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
+
+
+class Asker:
+    """Sends without waiting; keeps the answers as they come."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self._transport = MemoryTransport(network)
+        self.answers: list[Message] = []
+
+    def send(self, payload: bytes, evaluator: str = "e") -> None:
+        def on_answer(answer: bytes | None) -> None:
+            if answer is not None:  # None: the test took it and forgot it
+                self.answers.append(decode(answer, Limits()))
+
+        self._transport.send(keys.evaluations("r", evaluator), payload, timeout=1.0, on_answer=on_answer)
+
+
+@pytest.fixture
+def asker(network: MemoryNetwork, reception: Reception) -> Asker:
+    return Asker(network)
+
+
+def offer_policy(reception: Reception) -> None:
+    reception.offer_program(b"program", 0)
+    reception.publish(3, {"w": np.zeros(2, np.float32)})
+
+
+def codes(asker: Asker) -> list[str]:
+    return [answer.code for answer in asker.answers if isinstance(answer, Refusal)]
+
+
+def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    asker.send(encode(REPORT))
+    assert asker.answers == []
+    (first, asked), (_, told) = reception.take_evaluations()
+    assert asked == EvaluationRequest(evaluator="e")
+    assert isinstance(told, EvaluationReport)
+    assert reception.take_evaluations() == []
+    first.reply(reception.newest_snapshot())
+    (answer,) = asker.answers
+    assert isinstance(answer, Snapshot)
+    assert answer.policy_version == 3
+
+
+def test_before_there_is_a_policy_nothing_can_be_evaluated(reception: Reception, asker: Asker) -> None:
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(asker) == ["not_ready"]
+    assert reception.take_evaluations() == []
+
+
+def test_evaluators_beyond_measure_are_told_to_ask_later(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    for _ in range(64):
+        asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert asker.answers == []
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(asker) == ["not_ready"]
+    assert len(reception.take_evaluations()) == 64
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff" * 100,
+        encode(Farewell(learner_epoch=EPOCH, reason="")),
+        encode(EvaluationRequest(evaluator="f")),
+        encode(EvaluationRequest(evaluator="")),
+    ],
+    ids=["empty", "noise", "another message", "another's name", "no name"],
+)
+def test_what_is_no_question_of_an_evaluators_own_is_refused(
+    reception: Reception, asker: Asker, payload: bytes
+) -> None:
+    offer_policy(reception)
+    asker.send(payload)
+    assert codes(asker) == ["malformed"]
+    assert reception.take_evaluations() == []
+
+
+def test_a_report_beyond_measure_is_refused(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    many = 200_000
+    asker.send(
+        encode(
+            EvaluationReport(
+                evaluator="e",
+                learner_epoch=EPOCH,
+                policy_version=0,
+                returns=np.zeros(many, np.float32),
+                lengths=np.zeros(many, np.int32),
+            )
+        )
+    )
+    assert codes(asker) == ["malformed"]
+
+
+def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(reception: Reception, asker: Asker) -> None:
+    offer_policy(reception)
+    asker.send(encode(EvaluationRequest(evaluator="e")))
+    reception.close("solved")
+    asker.send(encode(REPORT))
+    assert codes(asker) == ["finished", "finished"]
+
+
+def test_many_at_once_are_all_held(reception: Reception, network: MemoryNetwork) -> None:
+    offer_policy(reception)
+    askers = [Asker(network) for _ in range(16)]
+    threads = [
+        threading.Thread(target=asker.send, args=(encode(EvaluationRequest(evaluator=f"e{number}")), f"e{number}"))
+        for number, asker in enumerate(askers)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    taken = {message.evaluator for _, message in reception.take_evaluations()}
+    assert taken == {f"e{number}" for number in range(16)}
+
+
+class Silent(MemoryTransport):
+    """Keeps what it is asked to reopen, and cannot."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        super().__init__(network)
+        self.reopened: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        self.reopened.put(unless_served)
+        raise TransportError("nothing answers there")
+
+
+def test_a_reception_that_hears_nobody_has_its_session_reopened(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 0.02)
+    transport, counters = Silent(network), RunCounters(10)
+    reception = Reception(
+        "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
+    )
+    reception.open()
+    try:
+        for _ in range(3):
+            assert transport.reopened.get(timeout=LIMIT) == keys.status("r")
+    finally:
+        reception.close("the test is over")
+
+
+def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 1000.0)
+    reception = made(network, run_spec(), RunCounters(10))
+    try:
+        before = reception._heard_at
+        MemoryTransport(network).ask(keys.snapshots("r"), timeout=LIMIT)
+        assert reception._heard_at > before
+    finally:
+        reception.close("the test is over")
+
+
+def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(network: MemoryNetwork) -> None:
+    counters = RunCounters(10)
+    reception = made(network, run_spec(actors=2, max_policy_lag=0), counters)
+    actor = MemoryTransport(network)
+    try:
+        actor.ask(
+            keys.join("r"),
+            encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)),
+            timeout=LIMIT,
+        )
+        actor.ask(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
+        del reception.fleet.actors["a"]
+        assert reception.take_batch(5) == []
+        assert counters.rollouts_rejected == {"stale": 1}
+    finally:
+        reception.close("the test is over")
+
+
+@pytest.mark.parametrize(
+    ("training", "most"),
+    [
+        ({"algorithm": "impala", "max_policy_lag": 3}, 8),  # four batches of two
+        ({"algorithm": "a3c", "max_policy_lag": 7}, 8),  # eight batches of one
+        ({"algorithm": "appo", "passes": 2, "minibatches": 2, "max_policy_lag": 13, "batch_rollouts": 3}, 12),
+        ({"algorithm": "impala", "max_policy_lag": 0}, 4),  # two for each actor in any case
+    ],
+)
+def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
+    network: MemoryNetwork, training: dict[str, Any], most: int
+) -> None:
+    """The buffer holds a batch, one is being judged, and the queue what can still be learned from after them."""
+    counters = RunCounters(10)
+    spec = run_spec(actors=2, **training)
+    reception = made(network, spec, counters)
+    actor = MemoryTransport(network)
+    answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    try:
+        join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        held = max(spec.training.batch_rollouts or 2, 2)
+        for sequence in range(held + 1):
+            payload = encode(make_rollout(identity("a", sequence)))
+            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+        until(lambda: counters.rollouts_accepted == held and reception.queue_bytes == 0)
+        for sequence in range(held + 1, held + most + 3):
+            payload = encode(make_rollout(identity("a", sequence)))
+            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+        told = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
+        verdicts = [message.verdict for message in told if isinstance(message, Acknowledgement)]
+        assert verdicts == ["accepted"] * held + ["busy"] * 2
+        assert answers.empty()
+        assert reception.fleet.actors["a"].busy == 2
+    finally:
+        reception.close("the test is over")
+
+
+# ------------------------------------------------------------------------------------- how often it publishes
+
+
+def with_fleet(network: MemoryNetwork, reception: Reception, count: int) -> MemoryTransport:
+    """So many actors that take part."""
+    actors = MemoryTransport(network)
+    for number in range(count):
+        join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+        actors.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        actors.announce(keys.presence("r", f"a{number}", 1))
+    return actors
+
+
+@pytest.mark.parametrize(
+    ("count", "published"),
+    [(1, [1, 2, 3, 4, 5, 6]), (4, [1, 2, 3, 4, 5, 6]), (8, [2, 4, 6]), (12, [3, 6]), (40, [])],
+)
+def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
+    network: MemoryNetwork, reception: Reception, count: int, published: list[int]
+) -> None:
+    actors = with_fleet(network, reception, count)
+    news: list[int] = []
+    inbox = actors.follow(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
+    for version in range(1, 7):
+        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    assert news == published
+    assert reception.published_version == (published or [0])[-1]
+
+
+def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
+    network: MemoryNetwork, reception: Reception
+) -> None:
+    with_fleet(network, reception, 400)
+    published = set()
+    for version in range(1, 41):  # of 32 batches at most
+        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        published.add(reception.published_version)
+    assert published == {0, 8, 16, 24, 32, 40}
+
+
+def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> None:
+    reception = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
+    try:
+        with_fleet(network, reception, 40)
+        for version in (1, 2):
+            reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            assert reception.published_version == version
+    finally:
+        reception.close("the test is over")
+
+
+def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, reception: Reception) -> None:
+    """Of one that is not published an actor would ask for in vain."""
+    offer_policy(reception)
+    actors = with_fleet(network, reception, 40)
+    reception.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    rollout = make_rollout(identity("a0", 0), version=0)
+    (answer,) = actors.ask(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
+    acknowledgement = decode(answer, Limits())
+    assert isinstance(acknowledgement, Acknowledgement)
+    assert (acknowledgement.verdict, acknowledgement.policy_version) == ("accepted", 3)
+
+
+def version_of(data: bytes | None) -> int:
+    assert data is not None
+    message = decode(data, Limits())
+    return message.policy_version if isinstance(message, Snapshot) else -1

@@ -1,0 +1,292 @@
+"""Who may do what, over real TLS on a real router: the learner, an actor, another actor, an operator, a stranger."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+from certificates import issue_expired, make_certificates, unchecked
+
+from daedalus.protocol import keys
+from daedalus.transport.credentials import CredentialsError, load
+from daedalus.transport.interface import AddressInUseError, RefusedError, Transport, TransportError
+from daedalus.transport.zenoh_transport import connect, listen
+
+LIMIT = 60.0
+DENIED_SECONDS = 1.0  # for an answer that must not come
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificates(tmp_path_factory.mktemp("tls") / "certs")
+
+
+@pytest.fixture(scope="module")
+def strange(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another CA's, which names its actors and its learner alike."""
+    return make_certificates(tmp_path_factory.mktemp("strange") / "certs")
+
+
+def listen_somewhere(folder: Path) -> tuple[str, Transport]:
+    while True:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            address = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+        try:
+            return address, listen([address], credentials=unchecked(folder, "router", ""))
+        except AddressInUseError:
+            continue
+
+
+@pytest.fixture(scope="module")
+def address(certificates: Path) -> Iterator[str]:
+    """A router, and a learner that is its client and answers everything."""
+    where, router = listen_somewhere(certificates / "router")
+    with closing(router), closing(connect([where], load(certificates / "learner", "learner"))) as learner:
+        for key in (
+            keys.join("r"),
+            keys.rollouts("r", "*"),
+            keys.evaluations("r", "*"),
+            keys.program("r", "*"),
+            keys.snapshots("r"),
+            keys.status("r"),
+        ):
+            learner.serve(key, lambda request: request.reply(b"the learner's"))
+        yield where
+
+
+IDENTITIES = {
+    "learner": ("learner", "learner", "learner"),  # its folder, its role, the name that it uploads under
+    "actor": ("actor-arm", "actor", "arm"),
+    "one of an actor's host": ("actor-arm", "actor", "arm.3"),
+    "another actor": ("actor-box", "actor", "box"),
+    "operator": ("operator", "operator", "operator"),
+}
+
+
+class Scene:
+    """One identity, and an honest learner and actor that watch what it does."""
+
+    def __init__(self, address: str, certificates: Path, identity: str, stack: ExitStack) -> None:
+        folder, role, self.name = IDENTITIES[identity]
+
+        def session(folder: str, role: str) -> Transport:
+            return stack.enter_context(closing(connect([address], load(certificates / folder, role))))
+
+        self.own = session(folder, role)
+        self.learner, self.actor = session("learner", "learner"), session("actor-box", "actor")
+
+    def answered(self, key: str) -> bool:
+        return self.own.ask(key, b"x", timeout=DENIED_SECONDS) == [b"the learner's"]
+
+    def arrives(self, end: Transport, other: Transport, key: str) -> bool:
+        """Whether what `end` publishes on a key reaches `other`, who surely gets what comes from the learner."""
+        news: list[bytes] = []
+        inbox = other.follow(key, lambda: news.append(inbox.take() or b""))
+        self.until_heard(lambda: self.learner.publish(key, b"first"), lambda: b"first" in news)
+        end.publish(key, b"second")
+        end.ask(keys.join("r"), timeout=DENIED_SECONDS)  # all that was sent before is through
+        self.until_heard(lambda: self.learner.publish(key, b"third"), lambda: b"third" in news)
+        return b"second" in news
+
+    @staticmethod
+    def until_heard(say: Callable[[], None], heard: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + LIMIT
+        while not heard():
+            assert time.monotonic() < deadline
+            say()
+            time.sleep(0.02)
+
+
+def joins(scene: Scene) -> bool:
+    return scene.answered(keys.join("r")) and scene.answered(keys.join("*")) and scene.answered(keys.program("r", "*"))
+
+
+def uploads_as_itself(scene: Scene) -> bool:
+    return scene.answered(keys.rollouts("r", scene.name)) and scene.answered(keys.evaluations("r", scene.name))
+
+
+def uploads_as_another(scene: Scene) -> bool:
+    own = scene.name.partition(".")[0]
+    other = "arm" if own == "box" else "box"
+    keys_of_others = [keys.rollouts("r", name) for name in (other, f"{own}x", f"{other}.{own}", "*")]
+    return any(scene.answered(key) for key in [*keys_of_others, keys.evaluations("r", other)])
+
+
+def reads_snapshots(scene: Scene) -> bool:
+    if not scene.answered(keys.snapshots("r")):
+        return False
+    news: list[bytes] = []
+    inbox = scene.own.follow(keys.snapshots("r"), lambda: news.append(inbox.take() or b""))
+    scene.until_heard(lambda: scene.learner.publish(keys.snapshots("r"), b"new"), lambda: bool(news))
+    return True
+
+
+def publishes_snapshots(scene: Scene) -> bool:
+    return scene.arrives(scene.own, scene.actor, keys.snapshots("r"))
+
+
+def answers_joins(scene: Scene) -> bool:
+    scene.own.serve(keys.join("fake"), lambda request: request.reply(b"come to me"))
+    scene.own.ask(keys.join("r"), timeout=DENIED_SECONDS)
+    return scene.actor.ask(keys.join("fake"), timeout=DENIED_SECONDS) == [b"come to me"]
+
+
+def watches_presence(scene: Scene) -> bool:
+    seen: list[str] = []
+    sure: list[str] = []
+    scene.own.watch(keys.presence("r", "*", "*"), lambda key, _: seen.append(key))
+    scene.learner.watch(keys.presence("r", "*", "*"), lambda key, _: sure.append(key))
+    scene.actor.announce(keys.presence("r", "box", 7))
+    scene.until_heard(lambda: None, lambda: bool(sure))
+    scene.own.ask(keys.join("r"), timeout=DENIED_SECONDS)
+    time.sleep(0.1)
+    return bool(seen)
+
+
+def reads_the_status(scene: Scene) -> bool:
+    return scene.answered(keys.status("r"))
+
+
+OPERATIONS = (
+    joins,
+    uploads_as_itself,
+    uploads_as_another,
+    reads_snapshots,
+    publishes_snapshots,
+    answers_joins,
+    watches_presence,
+    reads_the_status,
+)
+PLAYS = {joins, uploads_as_itself, reads_snapshots}
+ALLOWED = {
+    "learner": set(OPERATIONS),
+    "actor": PLAYS,
+    "one of an actor's host": PLAYS,
+    "another actor": PLAYS,
+    "operator": {watches_presence, reads_the_status},
+}
+
+
+@pytest.mark.parametrize("operation", OPERATIONS, ids=lambda operation: operation.__name__)
+@pytest.mark.parametrize("identity", IDENTITIES)
+def test_the_table(address: str, certificates: Path, identity: str, operation: Callable[[Scene], bool]) -> None:
+    with ExitStack() as stack:
+        assert operation(Scene(address, certificates, identity, stack)) == (operation in ALLOWED[identity])
+
+
+def test_all_see_the_learner_go(address: str, certificates: Path) -> None:
+    with ExitStack() as stack:
+        scene = Scene(address, certificates, "actor", stack)
+        there: list[bool] = []
+        scene.own.watch(keys.learner("r"), lambda _, present: there.append(present))
+        scene.learner.announce(keys.learner("r"))
+        scene.until_heard(lambda: None, lambda: there == [True])
+        scene.learner.close()
+        scene.until_heard(lambda: None, lambda: there == [True, False])
+
+
+# ------------------------------------------------------------------------------------- strangers and mistakes
+
+
+def test_a_stranger_is_not_let_in_at_all(address: str, strange: Path) -> None:
+    with pytest.raises(RefusedError, match="different CAs"):
+        connect([address], load(strange / "actor-arm", "actor"))
+    with pytest.raises(TransportError, match="wants --tls"):
+        connect([address.replace("tls/", "tcp/")])
+
+
+def test_a_stranger_who_knows_the_ca_by_sight_is_refused(address: str, certificates: Path, strange: Path) -> None:
+    """It trusts our CA; its own certificate is still another's."""
+    (strange / "actor-box" / "ca.pem").write_bytes((certificates / "actor-box" / "ca.pem").read_bytes())
+    with pytest.raises(CredentialsError, match="different CAs"):
+        load(strange / "actor-box", "actor")
+    with pytest.raises(RefusedError, match=r"refuses the certificate in .*different CAs"):
+        connect([address], unchecked(strange / "actor-box"))
+
+
+def test_an_expired_certificate_is_found_before_it_is_used(certificates: Path) -> None:
+    with pytest.raises(CredentialsError, match="expired: issue it anew"):
+        load(issue_expired(certificates, "actor", "arm"), "actor")
+
+
+def test_an_expired_certificate_is_refused_and_its_owner_told(address: str, certificates: Path) -> None:
+    with pytest.raises(RefusedError, match=r"refuses the certificate in .*expired"):
+        connect([address], unchecked(issue_expired(certificates, "actor", "arm")))
+
+
+def test_nobody_talks_to_a_listener_whose_certificate_is_expired(certificates: Path) -> None:
+    address, router = listen_somewhere(issue_expired(certificates, "router"))
+    with closing(router), pytest.raises(RefusedError, match=r"does not serve: .*expired"):
+        connect([address], load(certificates / "actor-arm", "actor"))
+
+
+def test_an_actor_cannot_pass_for_a_learner(certificates: Path) -> None:
+    """Not by its own start, and not to an actor that trusts the CA."""
+    with pytest.raises(CredentialsError, match="holds the certificate of actor 'arm': learner was expected"):
+        load(certificates / "actor-arm", "learner")
+    folder = certificates / "actor-arm"
+    (folder / "names.json").write_text('{"actors": [], "operators": []}')
+    address, router = listen_somewhere(folder)
+    with closing(router), pytest.raises(RefusedError, match="does not serve"):
+        connect([address], load(certificates / "actor-box", "actor"))
+
+
+def test_a_host_that_the_certificate_does_not_name_is_not_trusted(certificates: Path) -> None:
+    address, router = listen_somewhere(certificates / "router")
+    port = address.rpartition(":")[2]
+    with closing(router):
+        pass
+    other = f"tls/127.0.0.3:{port}"
+    with (
+        closing(listen([other], credentials=load(certificates / "router", "router"))),
+        pytest.raises(RefusedError, match=r"mismatch.*--host"),
+    ):
+        connect([other], load(certificates / "actor-arm", "actor"))
+
+
+def test_a_name_that_was_revoked_may_do_nothing_any_more(tmp_path: Path) -> None:
+    from daedalus.cli.commands.certs import certs
+
+    folder = make_certificates(tmp_path / "certs")
+    arm = load(folder / "actor-arm", "actor")
+    kept = tmp_path / "kept"
+    (folder / "actor-arm").rename(kept)
+    assert certs(["revoke", "actor", "arm", "--directory", str(folder)]) == 0
+    address, router = listen_somewhere(folder / "router")
+    router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
+    with closing(router), closing(connect([address], unchecked(kept, arm.role, arm.name))) as actor:
+        assert actor.ask(keys.join("r"), timeout=DENIED_SECONDS) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "key.pem").unlink(), "has no key.pem"),
+        (lambda folder: (folder / "key.pem").write_text("x"), "is damaged"),
+        (lambda folder: (folder / "certificate.pem").write_bytes(b"\xff"), "is damaged"),
+        (lambda folder: (folder / "ca.pem").write_text("x"), "ca.pem is damaged"),
+    ],
+)
+def test_a_damaged_folder_is_named(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
+    folder = make_certificates(tmp_path / "certs") / "actor-arm"
+    damage(folder)
+    with pytest.raises(CredentialsError, match=message):
+        load(folder, "actor")
+
+
+def test_a_certificate_and_a_key_that_do_not_fit_are_named(certificates: Path, tmp_path: Path) -> None:
+    for name, source in (("ca.pem", "actor-arm"), ("certificate.pem", "actor-arm"), ("key.pem", "actor-box")):
+        (tmp_path / name).write_bytes((certificates / source / name).read_bytes())
+    with pytest.raises(CredentialsError, match=r"key.pem is not the key of certificate.pem"):
+        load(tmp_path, "actor")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"actors": []}'])
+def test_a_listener_that_does_not_know_whom_to_let_in_does_not_start(tmp_path: Path, text: str) -> None:
+    folder = make_certificates(tmp_path / "certs") / "learner"
+    (folder / "names.json").write_text(text)
+    with pytest.raises(CredentialsError, match=r"names\.json"):
+        listen(["tls/127.0.0.1:0"], credentials=load(folder, "learner"))

@@ -1,0 +1,466 @@
+"""One contract, held by every transport; what only Zenoh can do is at the end.
+
+Sessions are always closed by the fixture: one that leaks would keep the process from ending.
+"""
+
+import itertools
+import queue
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from daedalus.transport.interface import (
+    AddressInUseError,
+    MemoryNetwork,
+    MemoryTransport,
+    Request,
+    Transport,
+    TransportError,
+)
+from daedalus.transport.zenoh_transport import connect, listen
+
+WAIT = 30.0  # seconds; generous, so that only a real fault reaches it
+MakeEnd = Callable[[], Transport]
+numbers = itertools.count()
+
+
+class Tape(queue.SimpleQueue[Any]):
+    """A callback that keeps what it is called with; `next` waits for it."""
+
+    def __call__(self, *arguments: Any) -> None:
+        self.put(arguments[0] if len(arguments) == 1 else arguments)
+
+    def next(self) -> Any:
+        return self.get(timeout=WAIT)
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def listen_somewhere() -> tuple[str, Transport]:
+    for _ in range(10):
+        endpoint = free_endpoint()
+        try:
+            return endpoint, listen([endpoint])
+        except AddressInUseError:  # somebody took it in the meantime
+            continue
+    raise AssertionError("no free port")
+
+
+def memory_ends() -> MakeEnd:
+    network = MemoryNetwork()
+    return lambda: MemoryTransport(network)
+
+
+def zenoh_ends() -> MakeEnd:
+    """The first end is the router, the others are its clients."""
+    endpoints: list[str] = []
+
+    def make() -> Transport:
+        if endpoints:
+            return connect(endpoints)
+        endpoint, router = listen_somewhere()
+        endpoints.append(endpoint)
+        return router
+
+    return make
+
+
+@pytest.fixture
+def closing() -> Iterator[Callable[[Transport], Transport]]:
+    """Closes what it was given, when the test is over."""
+    ends: list[Transport] = []
+
+    def keep(end: Transport) -> Transport:
+        ends.append(end)
+        return end
+
+    yield keep
+    for end in reversed(ends):
+        end.close()
+
+
+@pytest.fixture(params=[memory_ends, zenoh_ends], ids=["memory", "zenoh"])
+def make_end(request: pytest.FixtureRequest, closing: Callable[[Transport], Transport]) -> MakeEnd:
+    make: MakeEnd = request.param()
+    return lambda: closing(make())
+
+
+@pytest.fixture(params=["router to client", "client to router", "client to client"])
+def pair(request: pytest.FixtureRequest, make_end: MakeEnd) -> tuple[Transport, Transport]:
+    """Two ends, in every constellation that Zenoh tells apart: (the one that serves, the one that asks)."""
+    router, first, second = make_end(), make_end(), make_end()
+    constellations = {"router to client": (router, first), "client to router": (first, router)}
+    return constellations.get(request.param, (first, second))
+
+
+def settle(declarer: Transport, other: Transport) -> None:
+    """Waits until `other` can know all that `declarer` declared so far: declarations keep their order."""
+    key = f"settled/{next(numbers)}"
+    tape = Tape()
+    other.watch(key, tape)
+    declarer.announce(key)
+    assert tape.next() == (key, True)
+
+
+def echo(request: Request) -> None:
+    request.reply(request.key.encode() + b" " + request.payload)
+
+
+# -------------------------------------------------------------------------------------------- queries
+
+
+def test_a_question_is_answered_with_its_key_and_payload_at_hand(pair: tuple[Transport, Transport]) -> None:
+    server, asker = pair
+    server.serve("d/r/join", echo)
+    settle(server, asker)
+    payload = bytes(range(256)) * 1000
+    assert asker.ask("d/r/join", payload, timeout=WAIT) == [b"d/r/join " + payload]
+    assert asker.ask("d/r/join", timeout=WAIT) == [b"d/r/join "]
+
+
+def test_an_end_answers_itself(make_end: MakeEnd) -> None:
+    end = make_end()
+    end.serve("d/r/join", echo)
+    assert end.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
+
+
+def test_nobody_answers_a_question_that_nobody_serves(pair: tuple[Transport, Transport]) -> None:
+    server, asker = pair
+    server.serve("d/r/join", echo)
+    settle(server, asker)
+    for key in ("d/r/other", "d/r", "d/r/join/more", "d/other/join"):
+        assert asker.ask(key, timeout=WAIT) == []
+
+
+def test_a_served_wildcard_stands_for_one_chunk(pair: tuple[Transport, Transport]) -> None:
+    server, asker = pair
+    server.serve("d/r/rollouts/*", echo)
+    settle(server, asker)
+    assert asker.ask("d/r/rollouts/a1", b"x", timeout=WAIT) == [b"d/r/rollouts/a1 x"]
+    assert asker.ask("d/r/rollouts", timeout=WAIT) == []
+    assert asker.ask("d/r/rollouts/a/b", timeout=WAIT) == []
+
+
+def test_an_asked_wildcard_reaches_all_that_match_and_each_sees_its_own_key(make_end: MakeEnd) -> None:
+    asker, first, second = make_end(), make_end(), make_end()
+    for end, key in ((first, "d/one/status"), (second, "d/two/status"), (second, "d/two/join")):
+        end.serve(key, echo)
+    settle(first, asker)
+    settle(second, asker)
+    assert sorted(asker.ask("d/*/status", b"x", timeout=WAIT)) == [b"d/one/status x", b"d/two/status x"]
+
+
+def test_every_server_of_one_key_answers(make_end: MakeEnd) -> None:
+    asker, first, second = make_end(), make_end(), make_end()
+    first.serve("d/r/status", lambda request: request.reply(b"first"))
+    second.serve("d/r/status", lambda request: request.reply(b"second"))
+    settle(first, asker)
+    settle(second, asker)
+    assert sorted(asker.ask("d/r/status", timeout=WAIT)) == [b"first", b"second"]
+    assert sorted(asker.ask("d/*/status", timeout=WAIT)) == [b"first", b"second"]
+
+
+def test_what_is_sent_is_answered_exactly_once(pair: tuple[Transport, Transport]) -> None:
+    server, asker = pair
+
+    def answer_twice(request: Request) -> None:
+        request.reply(b"one " + request.payload)
+        request.reply(b"two " + request.payload)
+
+    server.serve("d/r/rollouts/*", answer_twice)
+    settle(server, asker)
+    tape = Tape()
+    for index in range(20):
+        asker.send("d/r/rollouts/a", b"%d" % index, timeout=WAIT, on_answer=tape)
+    assert sorted(tape.next() for _ in range(20)) == sorted(b"one %d" % index for index in range(20))
+    assert asker.ask("d/r/rollouts/a", b"last", timeout=WAIT) == [b"one last"]
+    assert tape.empty()
+
+
+def test_what_nobody_serves_is_answered_by_none(pair: tuple[Transport, Transport]) -> None:
+    _, asker = pair
+    tape = Tape()
+    asker.send("d/r/nobody", b"x", timeout=WAIT, on_answer=tape)
+    assert tape.next() is None
+
+
+def test_an_answer_may_come_later_and_from_another_thread(pair: tuple[Transport, Transport]) -> None:
+    server, asker = pair
+    requests, answers = Tape(), Tape()
+    server.serve("d/r/program/*", requests)
+    settle(server, asker)
+    asker.send("d/r/program/x", b"?", timeout=WAIT, on_answer=answers)
+    request = requests.next()
+    assert (request.key, request.payload) == ("d/r/program/x", b"?")
+    assert answers.empty()
+    thread = threading.Thread(target=request.reply, args=(b"!",))
+    thread.start()
+    thread.join(WAIT)
+    assert answers.next() == b"!"
+    request.reply(b"again")
+    asker.send("d/r/nobody", b"", timeout=WAIT, on_answer=answers)  # comes after whatever "again" could cause
+    assert answers.next() is None
+
+
+def test_a_request_that_is_forgotten_is_answered_by_none(make_end: MakeEnd) -> None:
+    server, asker = make_end(), make_end()
+    server.serve("d/r/join", lambda request: None)
+    settle(server, asker)
+    assert asker.ask("d/r/join", timeout=1.0) == []
+    tape = Tape()
+    asker.send("d/r/join", b"x", timeout=1.0, on_answer=tape)
+    assert tape.next() is None
+
+
+def test_an_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
+    server, asker = make_end(), make_end()
+    requests = Tape()
+    server.serve("d/r/join", requests)
+    settle(server, asker)
+    answers = asker.ask("d/r/join", timeout=0.2)
+    requests.next().reply(b"late")
+    assert answers == []
+
+
+def test_an_end_that_closed_serves_no_more(make_end: MakeEnd) -> None:
+    asker, server = make_end(), make_end()
+    gone = Tape()
+    asker.watch("d/r/learner", gone)
+    server.serve("d/r/join", echo)
+    server.announce("d/r/learner")
+    assert gone.next() == ("d/r/learner", True)
+    server.close()
+    assert gone.next() == ("d/r/learner", False)
+    assert asker.ask("d/r/join", timeout=WAIT) == []
+
+
+# ------------------------------------------------------------------------------------------ snapshots
+
+
+def test_only_the_newest_value_is_kept(pair: tuple[Transport, Transport]) -> None:
+    publisher, follower = pair
+    news = Tape()
+    inbox = follower.follow("d/r/snapshots", lambda: news(None))
+    settle(follower, publisher)
+    assert inbox.take() is None
+    for value in (b"1", b"2", b"3" * 100_000):
+        publisher.publish("d/r/snapshots", value)
+    for _ in range(3):
+        news.next()
+    assert inbox.take() == b"3" * 100_000
+    assert inbox.take() is None
+    publisher.publish("d/r/snapshots", b"4")
+    news.next()
+    assert inbox.take() == b"4"
+
+
+def test_every_follower_gets_the_value_and_no_other_key_does(make_end: MakeEnd) -> None:
+    publisher, first, second = make_end(), make_end(), make_end()
+    first_news, second_news, other_news = Tape(), Tape(), Tape()
+    first_inbox = first.follow("d/r/snapshots", lambda: first_news(None))
+    other_inbox = second.follow("d/q/snapshots", lambda: other_news(None))
+    second_inbox = second.follow("d/r/snapshots", lambda: second_news(None))
+    settle(first, publisher)
+    settle(second, publisher)
+    publisher.publish("d/r/snapshots", b"x")
+    first_news.next()
+    second_news.next()
+    assert (first_inbox.take(), second_inbox.take(), other_inbox.take()) == (b"x", b"x", None)
+    assert other_news.empty()
+
+
+def test_a_value_that_nobody_follows_is_no_error(make_end: MakeEnd) -> None:
+    make_end().publish("d/r/snapshots", b"x")
+
+
+# ------------------------------------------------------------------------------------------- presence
+
+
+def test_a_watch_tells_who_is_there_who_comes_and_who_goes(pair: tuple[Transport, Transport]) -> None:
+    actor, learner = pair
+    tape = Tape()
+    actor.announce("d/r/actors/early")
+    settle(actor, learner)
+    learner.watch("d/r/actors/*", tape)
+    assert tape.next() == ("d/r/actors/early", True)
+    actor.announce("d/q/actors/elsewhere")
+    actor.announce("d/r/actors/late")
+    assert tape.next() == ("d/r/actors/late", True)
+    actor.close()
+    assert sorted((tape.next(), tape.next())) == [("d/r/actors/early", False), ("d/r/actors/late", False)]
+    assert tape.empty()
+
+
+def test_every_watch_is_told(make_end: MakeEnd) -> None:
+    actor, first, second = make_end(), make_end(), make_end()
+    tapes = [Tape(), Tape()]
+    first.watch("d/r/actors/*", tapes[0])
+    second.watch("d/r/actors/a", tapes[1])
+    actor.announce("d/r/actors/a")
+    assert [tape.next() for tape in tapes] == [("d/r/actors/a", True)] * 2
+
+
+def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
+    learner, first, second = make_end(), make_end(), make_end()
+    shared, own = Tape(), Tape()
+    for end, key in ((first, "d/r/actors/a"), (second, "d/r/actors/a"), (first, "d/r/own")):
+        end.announce(key)
+        settle(end, learner)
+    learner.watch("d/r/own", own)
+    assert own.next() == ("d/r/own", True)
+    learner.watch("d/r/actors/*", shared)
+    assert shared.next() == ("d/r/actors/a", True)
+    while not shared.empty():  # one call for each end is as good as one for both
+        assert shared.next() == ("d/r/actors/a", True)
+    first.close()
+    assert own.next() == ("d/r/own", False)
+    second.announce("d/r/actors/b")
+    assert shared.next() == ("d/r/actors/b", True)
+    second.close()
+    assert sorted((shared.next(), shared.next())) == [("d/r/actors/a", False), ("d/r/actors/b", False)]
+
+
+def test_closing_twice_is_closing_once(make_end: MakeEnd) -> None:
+    learner, actor = make_end(), make_end()
+    tape = Tape()
+    learner.watch("d/r/actors/*", tape)
+    actor.announce("d/r/actors/a")
+    assert tape.next() == ("d/r/actors/a", True)
+    actor.close()
+    actor.close()
+    assert tape.next() == ("d/r/actors/a", False)
+    learner.announce("d/r/actors/own")
+    assert tape.next() == ("d/r/actors/own", True)
+
+
+# ---------------------------------------------------------------------------------------- Zenoh alone
+
+
+def test_a_taken_address_is_named(closing: Callable[[Transport], Transport]) -> None:
+    endpoint, router = listen_somewhere()
+    closing(router)
+    with pytest.raises(AddressInUseError, match=f"{endpoint} is already in use.*--listen"):
+        closing(listen([endpoint]))
+
+
+def test_an_address_that_cannot_be_is_refused(closing: Callable[[Transport], Transport]) -> None:
+    with pytest.raises(TransportError, match="cannot listen on tcp/256"):
+        closing(listen(["tcp/256.0.0.1:1"]))
+
+
+def test_a_dead_address_is_named_at_once(closing: Callable[[Transport], Transport]) -> None:
+    endpoint = free_endpoint()
+    refused = Tape()
+
+    def try_to_connect() -> None:
+        try:
+            closing(connect([endpoint]))
+        except TransportError as error:
+            refused(str(error))
+
+    threading.Thread(target=try_to_connect, daemon=True).start()
+    assert refused.next() == f"nothing answers at {endpoint}"
+
+
+def test_a_client_is_answered_by_none_once_its_router_is_gone(closing: Callable[[Transport], Transport]) -> None:
+    endpoint, router = listen_somewhere()
+    closing(router)
+    client = closing(connect([endpoint]))
+    requests, answers = Tape(), Tape()
+    router.serve("d/r/join", requests)
+    settle(router, client)
+    client.send("d/r/join", b"", timeout=1.0, on_answer=answers)
+    requests.next()
+    router.close()
+    assert answers.next() is None
+    assert client.ask("d/r/join", timeout=1.0) == []
+
+
+@pytest.mark.parametrize("act", ["ask", "send", "publish"])
+def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[Transport], Transport]) -> None:
+    end = closing(listen_somewhere()[1])
+    end.close()
+    acts: dict[str, Callable[[], object]] = {
+        "ask": lambda: end.ask("d/r/join", timeout=1.0),
+        "send": lambda: end.send("d/r/join", b"", timeout=1.0, on_answer=Tape()),
+        "publish": lambda: end.publish("d/r/snapshots", b""),
+    }
+    with pytest.raises(TransportError, match="d/r/"):
+        acts[act]()
+
+
+# ------------------------------------------------------------------------------------------- reopening
+
+
+def test_what_cannot_die_is_not_reopened(make_end: MakeEnd) -> None:
+    assert make_end().reopen() is False
+
+
+@pytest.fixture
+def client(closing: Callable[[Transport], Transport]) -> tuple[Transport, Transport]:
+    """A router, and a client of it."""
+    endpoint, router = listen_somewhere()
+    return closing(router), closing(connect([endpoint]))
+
+
+def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport, Transport]) -> None:
+    router, end = client
+    news, seen, there = Tape(), Tape(), Tape()
+    end.serve("d/r/join", echo)
+    inbox = end.follow("d/r/snapshots", lambda: news("news"))
+    end.announce("d/r/actors/a")
+    router.announce("d/r/learner")
+    end.watch("d/r/learner", seen)
+    router.watch("d/r/actors/*", there)
+    router.serve("d/r/status", echo)
+    assert (seen.next(), there.next()) == (("d/r/learner", True), ("d/r/actors/a", True))
+    answers = Tape()
+    end.send("d/r/status", b"1", timeout=WAIT, on_answer=answers)
+    assert answers.next() == b"d/r/status 1"
+    assert end.reopen() is True
+    # Who was there is gone for a moment: it may have left while the session was dead.
+    assert [seen.next(), seen.next()] == [("d/r/learner", False), ("d/r/learner", True)]
+    assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
+    settle(end, router)
+    assert router.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
+    router.publish("d/r/snapshots", b"7")
+    news.next()
+    assert inbox.take() == b"7"
+    end.send("d/r/status", b"2", timeout=WAIT, on_answer=answers)
+    assert answers.next() == b"d/r/status 2"
+
+
+def test_a_client_that_others_reach_is_left_as_it_is(client: tuple[Transport, Transport]) -> None:
+    router, end = client
+    there = Tape()
+    router.watch("d/r/actors/*", there)
+    end.serve("d/r/status", echo)
+    end.announce("d/r/actors/a")
+    assert there.next() == ("d/r/actors/a", True)
+    assert end.reopen(unless_served="d/r/status") is False
+    assert end.reopen(unless_served="d/r/nobody") is True
+    assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
+
+
+def test_a_client_whose_router_is_gone_stays_as_it_is(closing: Callable[[Transport], Transport]) -> None:
+    endpoint, router = listen_somewhere()
+    closing(router)
+    end = closing(connect([endpoint]))
+    end.serve("d/r/join", echo)
+    router.close()
+    with pytest.raises(TransportError, match="nothing answers"):
+        end.reopen()
+    assert end.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]  # itself
+
+
+def test_a_closed_client_is_not_brought_back(client: tuple[Transport, Transport]) -> None:
+    _, end = client
+    end.close()
+    assert end.reopen() is False

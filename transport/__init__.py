@@ -1,0 +1,1 @@
+"""What both sides need of a network: the interface, the in-memory one, Zenoh, addresses and TLS."""

@@ -1,0 +1,30 @@
+"""The credentials that an address needs, checked before a socket is opened."""
+
+from pathlib import Path
+
+from daedalus.transport.addresses import AddressError, check_connecting, check_listening
+from daedalus.transport.credentials import Credentials, CredentialsError, load
+
+SECURITY_ERRORS = (AddressError, CredentialsError)
+
+
+def credentials_to_listen(endpoints: list[str], tls: Path | None, role: str, *, insecure: bool) -> Credentials | None:
+    """Return the certificate to listen with, or None without `tls`. Raises one of SECURITY_ERRORS."""
+    check_listening(endpoints, tls=tls is not None, insecure=insecure)
+    return None if tls is None else load(tls, role)
+
+
+def credentials_to_connect(endpoints: list[str], tls: Path | None, *roles: str) -> Credentials | None:
+    """Return the certificate to connect with, or None without `tls`. Raises one of SECURITY_ERRORS."""
+    check_connecting(endpoints, tls=tls is not None)
+    return None if tls is None else load(tls, *roles)
+
+
+def authorization_hint(credentials: Credentials | None) -> str:
+    """Return a hint for an actor that finds no learner: a router drops unauthorised actors silently."""
+    if credentials is None:
+        return ""
+    return (
+        f"; is there one, does it (or its router) know the actor {credentials.name!r}? "
+        "It reads whom it lets in when it starts (daedalus certs issue)"
+    )
