@@ -25,10 +25,10 @@ from typing import Any
 import gymnasium
 
 from daedalus.actor.collecting.client_player import ClientPlayer
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.security import authorization_hint, credentials_to_connect
 
 
@@ -60,7 +60,7 @@ class Client:
           timeout: seconds to wait for a learner and its first policy.
           say: is told what happens.
 
-        Raises ActorError, TransportError, UnplayableError, AddressError or CredentialsError, which say what to do.
+        Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
         credentials = credentials_to_connect([connect], tls, "actor")
         host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
@@ -75,7 +75,7 @@ class Client:
         self._stop = threading.Event()
         self._player = ClientPlayer(observation_space, action_space)
         self._error: Exception | None = None
-        transport = connect_when_there([connect], self._stop, say, timeout, credentials)
+        transport = connect_with_retry([connect], self._stop, say, timeout, credentials)
         assert transport is not None  # nobody tells it to stop
         self._transport = transport
         self._service = ActorService(config, transport, self._stop, say, self._player)

@@ -11,7 +11,7 @@ from daedalus.algorithms.returns import Targets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sample:
+class Minibatch:
     """R rows of B environments; R is 1 where rows are shuffled one by one."""
 
     observations: Tensor  # [R, B, *stacked_shape]
@@ -24,7 +24,7 @@ class Sample:
     valid: Tensor  # [R, B] float32
 
 
-def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -> Iterator[Sample]:
+def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -> Iterator[Minibatch]:
     """One pass over a batch in `count` parts of nearly equal size, shuffled; some are empty in a batch that small.
 
     A batch with memory is cut along its environments: rows in their order are what the memory learns from. Without,
@@ -33,7 +33,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     if batch.initial_state.shape[1]:
         order = torch.randperm(batch.actions.shape[1]).to(batch.actions.device)
         for part in order.tensor_split(count):
-            yield Sample(
+            yield Minibatch(
                 observations=batch.observations[:-1, part],
                 initial_state=batch.initial_state[part],
                 starts=batch.starts[:-1, part],
@@ -52,7 +52,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
         return values.flatten(0, 1)[part].unsqueeze(0)
 
     for part in order.tensor_split(count):
-        yield Sample(
+        yield Minibatch(
             observations=observations[part].unsqueeze(0),
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
             starts=chosen(batch.starts[:-1], part),

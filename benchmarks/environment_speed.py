@@ -13,7 +13,7 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.learner.run.settings import read_preset, run_spec
 
 CASES = (
-    ("car_racing", "sketch"),
+    ("car_racing", "fast"),
     ("car_racing", "envpool"),
     ("car_racing", "gymnasium"),
     ("pong", "envpool"),

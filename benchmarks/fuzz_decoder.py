@@ -23,7 +23,7 @@ with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
     from daedalus.protocol.codec import Limits, ProtocolError, decode
     from daedalus.protocol.compact import bits_of
     from daedalus.protocol.messages import CompactSnapshot, Join
-    from daedalus.protocol.spec import ArraySpace, ChoiceSpace, RunSpec, Spaces
+    from daedalus.protocol.spec import ArraySpace, DiscreteSpace, RunSpec, Spaces
 
 _GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
 _LIMITS = Limits(max_bytes=1 << 20)
@@ -34,7 +34,7 @@ def _intake() -> Intake:
     spec = RunSpec.model_validate(
         {"environment": {"id": "CartPole-v1"}, "collection": {"rollout_length": 3, "envs_per_actor": 2}}
     )
-    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=6))
+    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=6))
     fleet = Fleet(1, spaces)
     fleet.join(Join(actor="wing-1", incarnation=2**61 + 1, spaces=spaces, environments=2), 0.0)
     intake = Intake(spec, 2**60 + 3, fleet)

@@ -25,7 +25,7 @@ from running import machine, table
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.optimizers import Adam, FlatParameters
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, Spaces
 
 # Name: policy, observations, rows, environments.
 NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {
@@ -45,7 +45,7 @@ NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {
 
 def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int, bfloat16: bool) -> Callable[[], None]:
     """A function that learns once from the same random batch."""
-    network = ActorCritic(policy, Spaces(observation=space, action=ChoiceSpace(count=6)))
+    network = ActorCritic(policy, Spaces(observation=space, action=DiscreteSpace(count=6)))
     flat = FlatParameters(network.parameters())
     optimizer = Adam(flat.values, 1e-5)
     shape = (rows, environments, *space.stacked_shape)

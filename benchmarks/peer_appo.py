@@ -1,4 +1,4 @@
-"""Another peer: Sample Factory's APPO on Pong, asynchronous, its own Atari environment. Prints env_steps/s.
+"""Another peer: Minibatch Factory's APPO on Pong, asynchronous, its own Atari environment. Prints env_steps/s.
 
 What it requires fits nobody else's, so it has an environment of its own. ale-py 0.10 brings the games along, and still
 works with the gymnasium that it wants:

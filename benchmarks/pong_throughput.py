@@ -3,7 +3,7 @@
     python benchmarks/pong_throughput.py --rounds 3
     python benchmarks/pong_throughput.py --sample-factory PLACE/bin/python       (peer_appo.py says how to make PLACE)
 
-Peers are stable-baselines3's A2C and, if asked for, Sample Factory's APPO; the ratio is that to the better of them.
+Peers are stable-baselines3's A2C and, if asked for, Minibatch Factory's APPO; the ratio is that to the better of them.
 84 x 84 grey, skip 4, stack 4, Nature CNN, 256 rows an update and one pass over them, for all. The limit is of this
 machine's cores, were there nothing to do but step the environments, run the policy and update: each measured alone, on
 one core. All take turns, round by round; ratios are those of each round.
@@ -31,7 +31,7 @@ from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import ChoiceSpace, Spaces
+from daedalus.protocol.spec import DiscreteSpace, Spaces
 
 ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
 SETTINGS = {
@@ -83,7 +83,7 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
     finally:
         environments.close()
     policy, space, _, _ = NETWORKS["nature"]
-    network = ActorCritic(policy, Spaces(observation=space, action=ChoiceSpace(count=count)))
+    network = ActorCritic(policy, Spaces(observation=space, action=DiscreteSpace(count=count)))
     runtime = OnnxRuntime(export_program(network, space))
     runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
     random = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def main() -> None:
     steps = ("--env-steps", str(parsed.peer_env_steps))
     peers = {"stable-baselines3 A2C": [sys.executable, "peer_a2c.py", "--pong", *steps]}
     if parsed.sample_factory:
-        peers["Sample Factory APPO"] = [parsed.sample_factory, "peer_appo.py", *steps]
+        peers["Minibatch Factory APPO"] = [parsed.sample_factory, "peer_appo.py", *steps]
     rows, ratios, shares = [], [], []
     for index in range(parsed.rounds):
         most, parts = limit(parsed.backend, parsed.seconds)

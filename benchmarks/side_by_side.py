@@ -37,9 +37,11 @@ def main() -> None:
     parsed = options.parse_args()
     settings = read_preset("car_racing")["environment"]
     actions = np.random.default_rng(parsed.seed).integers(0, len(settings["action_table"]), parsed.env_steps).tolist()
-    spec = run_spec(read_preset("car_racing")).environment.model_copy(update={"patience": None, "processes": False})
+    spec = run_spec(read_preset("car_racing")).environment.model_copy(
+        update={"no_reward_limit": None, "processes": False}
+    )
     drives = []
-    for backend in ("gymnasium", "sketch"):
+    for backend in ("gymnasium", "fast"):
         environments = make_environments(EnvironmentSpec.model_validate({**dict(spec), "backend": backend}), 1)
         try:
             drives.append(drive(environments, parsed.seed, actions))

@@ -1,6 +1,6 @@
 """Pong with one actor far away: what training loses over a slow link, and what compact snapshots buy there.
 
-    python -m benchmarks.slow_link --rounds 2
+    python -m benchmarks.compact_snapshots --rounds 2
 
 1 Mbit/s up, 4 Mbit/s down, 100 ms each way, beside loopback: one after the other, each with a learner and an actor of
 its own. Over the slow link twice: as an actor does it that has measured its link, and as one that is told that the link
@@ -99,7 +99,7 @@ def measure(slow: bool, link: LinkChoice, warm_up: float, duration: float) -> tu
         here.start("learner", "pong", "--listen", here.address, "--run-dir", "run", *settings, *ENDLESS)
         here.wait("the learner", here.status)
         with link_to(here, slow) as (address, carried):
-            actor = here.run([sys.executable, "-m", "benchmarks.slow_link", "--play", address, "--link", link])
+            actor = here.run([sys.executable, "-m", "benchmarks.compact_snapshots", "--play", address, "--link", link])
             here.wait_for_training("far")
             time.sleep(warm_up)
             first, carried_before, lines = _status(here), dict(carried), len(actor.lines)
@@ -137,7 +137,7 @@ def _sizes(here: Scene) -> list[tuple[str, str]]:
     """Bytes of the newest snapshot, whole and compact, and of the differences to it of later ones."""
     transport = connect([here.address])
     try:
-        (answer,) = transport.ask(keys.snapshots("run"), timeout=30.0)
+        (answer,) = transport.query(keys.snapshots("run"), timeout=30.0)
         snapshot = decode(answer, Limits(max_bytes=len(answer)))
         assert isinstance(snapshot, Snapshot)
         held, compact = _fetched(transport, None)
@@ -160,7 +160,7 @@ def _fetched(transport: Transport, held: int | None) -> tuple[int, int]:
     size, part, version = 0, 0, None
     while True:
         request = SnapshotRequest(actor="sizes", held_version=held, policy_version=version, part=part)
-        (answer,) = transport.ask(keys.snapshots("run"), encode(request), timeout=30.0)
+        (answer,) = transport.query(keys.snapshots("run"), encode(request), timeout=30.0)
         message = decode(answer, Limits())
         assert isinstance(message, SnapshotPart)
         size, part, version = size + message.data.size, part + 1, message.policy_version

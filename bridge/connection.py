@@ -1,6 +1,6 @@
 """One client of the bridge: its connection, and the Transport that it alone uses.
 
-    its own thread      reads parcels and does what they ask
+    its own thread      reads packets and does what they ask
     a thread a query    waits for the answers and hands them over
     news thread         hands over what was published, and who came and went
 
@@ -20,22 +20,22 @@ from daedalus.bridge.packets import (
     HEADER_BYTES,
     MAX_ANSWER_BYTES,
     Kind,
-    Parcel,
-    ParcelError,
+    Packet,
+    PacketError,
     check_key,
-    encode,
+    encode_packet,
     read_header,
 )
 from daedalus.transport.interface import Inbox, Transport, TransportError
 
-STALL_SECONDS = 30.0  # a client that takes nothing for so long, or stops within a parcel, is given up
+STALL_SECONDS = 30.0  # a client that takes nothing for so long, or stops within a packet, is given up
 _MOST_DECLARED = 64  # keys that one client follows, watches or is present under
 _MOST_CHANGES = 1024  # of presence, that the client has not taken yet
 _CHUNK_BYTES = 64 << 10  # memory is taken for what came, not for what was declared
 _KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))  # a host that vanished is missed by this
 
 
-class Client:
+class ClientConnection:
     """Serves one connection from `run` to its end."""
 
     def __init__(self, connection: socket.socket, open_transport: Callable[[], Transport]) -> None:
@@ -49,7 +49,7 @@ class Client:
         self._declared = 0
         self._inboxes: dict[int, tuple[str, Inbox]] = {}  # by number
         self._fresh: set[int] = set()  # whose inbox may have something new
-        self._changes: deque[Parcel] = deque()
+        self._changes: deque[Packet] = deque()
 
     def run(self) -> str:
         """Serves it until it goes, is told to by `close`, or is given up; says why, or nothing if the client went."""
@@ -67,12 +67,12 @@ class Client:
             if not self._keep(transport):
                 return ""
             threading.Thread(target=self._pass_on_news, name="bridge-news", daemon=True).start()
-            while (parcel := self._next()) is not None:
-                self._do(transport, parcel)
+            while (packet := self._next()) is not None:
+                self._do(transport, packet)
             return ""
-        except (ParcelError, TransportError) as error:
+        except (PacketError, TransportError) as error:
             with contextlib.suppress(OSError):
-                self._send(Parcel(Kind.ERROR, 0, payload=str(error).encode()))
+                self._send(Packet(Kind.ERROR, 0, payload=str(error).encode()))
             return str(error)
         except ConnectionError:
             return ""  # it went with something unread
@@ -105,51 +105,51 @@ class Client:
 
     # ----------------------------------------------------------------------------------------- its own thread
 
-    def _next(self) -> Parcel | None:
-        """The next parcel; None if the client went between two."""
+    def _next(self) -> Packet | None:
+        """The next packet; None if the client went between two."""
         head = self._read(HEADER_BYTES, begun=False)
         if not head:
             return None
         header = read_header(head)
         key = check_key(self._read(header.key_bytes, begun=True), header.kind)
         payload = self._read(header.payload_bytes, begun=True)
-        return Parcel(header.kind, header.number, key, header.timeout, payload)
+        return Packet(header.kind, header.number, key, header.timeout, payload)
 
     def _read(self, size: int, *, begun: bool) -> bytes:
-        """So many bytes; none at all if the client went before the first, and the parcel was not `begun`."""
+        """So many bytes; none at all if the client went before the first, and the packet was not `begun`."""
         data = bytearray()
         while len(data) < size:
             try:
                 chunk = self._connection.recv(min(size - len(data), _CHUNK_BYTES))
             except TimeoutError:
                 if data or begun:
-                    raise ParcelError(f"no more came within {STALL_SECONDS:g} s") from None
+                    raise PacketError(f"no more came within {STALL_SECONDS:g} s") from None
                 continue  # it just has nothing to say
             if not chunk and (data or begun):
-                raise ParcelError("it went in the middle")
+                raise PacketError("it went in the middle")
             if not chunk:
                 return b""
             data += chunk
         return bytes(data)
 
-    def _do(self, transport: Transport, parcel: Parcel) -> None:
-        if parcel.kind == Kind.QUERY:
-            if not self._budget.take(len(parcel.payload), self._has_gone):
+    def _do(self, transport: Transport, packet: Packet) -> None:
+        if packet.kind == Kind.QUERY:
+            if not self._budget.take(len(packet.payload), self._has_gone):
                 raise ConnectionAbortedError
-            threading.Thread(target=self._ask, args=(transport, parcel), name="bridge-query", daemon=True).start()
+            threading.Thread(target=self._ask, args=(transport, packet), name="bridge-query", daemon=True).start()
             return
         self._declared += 1
         if self._declared > _MOST_DECLARED:
-            raise ParcelError(f"more than {_MOST_DECLARED} keys followed, watched or announced")
-        number = parcel.number
-        if parcel.kind == Kind.ANNOUNCE:
-            transport.announce(parcel.key)
-        elif parcel.kind == Kind.WATCH:
-            transport.watch(parcel.key, lambda key, present: self._on_presence(number, key, present))
+            raise PacketError(f"more than {_MOST_DECLARED} keys followed, watched or announced")
+        number = packet.number
+        if packet.kind == Kind.ANNOUNCE:
+            transport.declare_presence(packet.key)
+        elif packet.kind == Kind.WATCH:
+            transport.watch_presence(packet.key, lambda key, present: self._on_presence(number, key, present))
         else:
-            inbox = transport.follow(parcel.key, lambda: self._on_news(number))
+            inbox = transport.subscribe(packet.key, lambda: self._on_news(number))
             with self._changed:
-                self._inboxes[number] = parcel.key, inbox
+                self._inboxes[number] = packet.key, inbox
             self._on_news(number)  # what came before the inbox had its number
 
     def _has_gone(self) -> bool:
@@ -160,20 +160,20 @@ class Client:
 
     # ------------------------------------------------------------------------------- the threads of its queries
 
-    def _ask(self, transport: Transport, parcel: Parcel) -> None:
+    def _ask(self, transport: Transport, packet: Packet) -> None:
         try:
-            for answer in transport.ask(parcel.key, parcel.payload, timeout=parcel.timeout):
+            for answer in transport.query(packet.key, packet.payload, timeout=packet.timeout):
                 if len(answer) <= MAX_ANSWER_BYTES:
-                    self._send(Parcel(Kind.ANSWER, parcel.number, payload=answer))
-            self._send(Parcel(Kind.END, parcel.number))
+                    self._send(Packet(Kind.ANSWER, packet.number, payload=answer))
+            self._send(Packet(Kind.END, packet.number))
         except (OSError, TransportError):
             self.close()  # neither of them can be used any more
         finally:
-            self._budget.give_back(len(parcel.payload))
+            self._budget.give_back(len(packet.payload))
 
-    def _send(self, parcel: Parcel) -> None:
+    def _send(self, packet: Packet) -> None:
         with self._sending:
-            self._connection.sendall(encode(parcel))
+            self._connection.sendall(encode_packet(packet))
 
     # ---------------------------------------------------------------------- the transport's threads hand over only
 
@@ -184,7 +184,7 @@ class Client:
 
     def _on_presence(self, number: int, key: str, present: bool) -> None:
         with self._changed:
-            self._changes.append(Parcel(Kind.PRESENT if present else Kind.ABSENT, number, key))
+            self._changes.append(Packet(Kind.PRESENT if present else Kind.ABSENT, number, key))
             too_slow = len(self._changes) > _MOST_CHANGES
             self._changed.notify_all()
         if too_slow:
@@ -195,24 +195,24 @@ class Client:
 
     def _pass_on_news(self) -> None:
         try:
-            while (parcels := self._await_news()) is not None:
-                for parcel in parcels:
-                    self._send(parcel)
+            while (packets := self._await_news()) is not None:
+                for packet in packets:
+                    self._send(packet)
         except OSError:
             self.close()
 
-    def _await_news(self) -> list[Parcel] | None:
+    def _await_news(self) -> list[Packet] | None:
         """What is new, once there is something; None when closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._fresh or self._changes)
             if self._closed:
                 return None
-            parcels = list(self._changes)
+            packets = list(self._changes)
             self._changes.clear()
             followed = [(number, *self._inboxes[number]) for number in self._fresh if number in self._inboxes]
             self._fresh.clear()
         for number, key, inbox in followed:
             value = inbox.take()
             if value is not None and len(value) <= MAX_ANSWER_BYTES:
-                parcels.append(Parcel(Kind.NEWS, number, key, payload=value))
-        return parcels
+                packets.append(Packet(Kind.NEWS, number, key, payload=value))
+        return packets

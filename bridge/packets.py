@@ -1,6 +1,6 @@
 """What travels between the bridge and its client, and how. Pure functions; this file knows no socket.
 
-Each end first sends the four bytes b"DBR1", then parcels:
+Each end first sends the four bytes b"DBR1", then packets:
 
     offset  bytes
          0      4  length of the payload, little-endian like all numbers here
@@ -28,7 +28,7 @@ _KEY = re.compile(rf"daedalus(?:/{_CHUNK}){{1,4}}")
 
 
 class Kind(enum.IntEnum):
-    """What a parcel is for."""
+    """What a packet is for."""
 
     QUERY = 1  # client: asks whoever serves the key
     FOLLOW = 2  # client: wants what is published under the key
@@ -37,7 +37,7 @@ class Kind(enum.IntEnum):
     ANSWER = 5  # bridge: one answer to a query
     END = 6  # bridge: the query has no more answers
     NEWS = 7  # bridge: the newest value of a followed key
-    PRESENT = 8  # bridge: somebody is there, under the key that the parcel bears
+    PRESENT = 8  # bridge: somebody is there, under the key that the packet bears
     ABSENT = 9  # bridge: they have gone
     ERROR = 10  # bridge: why it closes the connection, as text
 
@@ -45,11 +45,11 @@ class Kind(enum.IntEnum):
 _PATTERNS = (Kind.QUERY, Kind.WATCH)  # may bear a key with `*` in it
 
 
-class ParcelError(Exception):
-    """The client sent what is no parcel; its fault."""
+class PacketError(Exception):
+    """The client sent what is no packet; its fault."""
 
 
-class Parcel(NamedTuple):
+class Packet(NamedTuple):
     """One of them."""
 
     kind: Kind
@@ -60,7 +60,7 @@ class Parcel(NamedTuple):
 
 
 class Header(NamedTuple):
-    """The first bytes of a parcel, checked."""
+    """The first bytes of a packet, checked."""
 
     kind: Kind
     number: int
@@ -69,29 +69,29 @@ class Header(NamedTuple):
     payload_bytes: int
 
 
-def encode(parcel: Parcel) -> bytes:
-    """The bytes of a parcel."""
-    key, milliseconds = parcel.key.encode("ascii"), round(parcel.timeout * 1000)
-    return _HEADER.pack(len(parcel.payload), parcel.kind, len(key), milliseconds, parcel.number) + key + parcel.payload
+def encode_packet(packet: Packet) -> bytes:
+    """The bytes of a packet."""
+    key, milliseconds = packet.key.encode("ascii"), round(packet.timeout * 1000)
+    return _HEADER.pack(len(packet.payload), packet.kind, len(key), milliseconds, packet.number) + key + packet.payload
 
 
 def read_header(data: bytes) -> Header:
-    """The header of a parcel from a client; raises ParcelError."""
+    """The header of a packet from a client; raises PacketError."""
     payload_bytes, kind, key_bytes, milliseconds, number = _HEADER.unpack(data)
     if not Kind.QUERY <= kind <= Kind.WATCH:
-        raise ParcelError(f"kind {kind} is not one that a client sends")
+        raise PacketError(f"kind {kind} is not one that a client sends")
     most = MAX_QUESTION_BYTES if kind == Kind.QUERY else 0
     if payload_bytes > most:
-        raise ParcelError(f"a payload of {payload_bytes} bytes, the limit is {most}")
+        raise PacketError(f"a payload of {payload_bytes} bytes, the limit is {most}")
     return Header(Kind(kind), number, milliseconds / 1000, key_bytes, payload_bytes)
 
 
 def check_key(data: bytes, kind: Kind) -> str:
-    """The key of a parcel from a client; raises ParcelError.
+    """The key of a packet from a client; raises PacketError.
 
     Nothing outside `daedalus/` is reached through a bridge, least of all the routers' own settings.
     """
     key = data.decode("ascii", "replace")
     if not _KEY.fullmatch(key) or ("*" in key and kind not in _PATTERNS):
-        raise ParcelError(f"{kind.name} has no proper key: {key[:64]!r}")
+        raise PacketError(f"{kind.name} has no proper key: {key[:64]!r}")
     return key

@@ -5,7 +5,7 @@ import socket
 import threading
 from collections.abc import Callable
 
-from daedalus.bridge.connection import Client
+from daedalus.bridge.connection import ClientConnection
 from daedalus.transport.interface import Transport
 
 _MOST_CLIENTS = 64  # at once
@@ -22,7 +22,7 @@ class Bridge:
         self._listener = listener
         self._open_transport = open_transport
         self._say = say
-        self._clients: dict[Client, threading.Thread] = {}
+        self._clients: dict[ClientConnection, threading.Thread] = {}
 
     def run(self, stop: threading.Event) -> None:
         """Serves whoever comes until told to stop; then ends them all."""
@@ -45,12 +45,12 @@ class Bridge:
             connection.close()
             self._say(f"turned {name} away: {_MOST_CLIENTS} clients are here already")
             return
-        client = Client(connection, self._open_transport)
+        client = ClientConnection(connection, self._open_transport)
         thread = threading.Thread(target=self._serve, args=(client, name), name="bridge-client", daemon=True)
         self._clients[client] = thread
         thread.start()
 
-    def _serve(self, client: Client, name: str) -> None:
+    def _serve(self, client: ClientConnection, name: str) -> None:
         self._say(f"{name} came")
         reason = client.run()
         self._say(f"{name} was given up: {reason}" if reason else f"{name} went")

@@ -22,11 +22,11 @@ _POLL_SECONDS = 0.05
 _SEEDS = 2**33  # added to the run's: neither training nor the final episodes have these
 
 
-class PlayFailedError(Exception):
+class EvaluationFailedError(Exception):
     """Episodes could not be played, and why was said; or they were to be played no more."""
 
 
-def run_off(
+def select_best(
     directory: Path,
     spec: RunSpec,
     options: list[str],
@@ -35,7 +35,7 @@ def run_off(
 ) -> list[dict[str, Any]]:
     """Scores each candidate anew; what each got, the best first. Nothing, if there are not two to choose from.
 
-    `options` are what `daedalus evaluate` takes. Raises PlayFailedError.
+    `options` are what `daedalus evaluate` takes. Raises EvaluationFailedError.
     """
     finalists = candidates(directory, say)
     if len(finalists) < 2:
@@ -50,7 +50,7 @@ def run_off(
         before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
         say(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
         try:
-            candidate.score_anew(mean)
+            candidate.rescore(mean)
         except OSError as error:
             say(f"  which could not be written down ({error.strerror})")
         scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
@@ -60,7 +60,7 @@ def run_off(
 def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str, Any]]:
     """Runs `daedalus evaluate`, once for each list of words, beside one another; their results.
 
-    Raises PlayFailedError.
+    Raises EvaluationFailedError.
     """
     with ExitStack() as stack:
         outputs = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
@@ -83,7 +83,7 @@ def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str,
             for error in filter(None, [] if stopping.is_set() else failed):
                 error.seek(0)
                 sys.stderr.write(error.read().decode(errors="replace"))
-            raise PlayFailedError
+            raise EvaluationFailedError
         for output in outputs:
             output.seek(0)
         results = [json.load(output) for output in outputs]

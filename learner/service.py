@@ -17,7 +17,7 @@ from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.report import Health, RateMeter, metrics_row, run_status, summary
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import SUMMARY, write_json
-from daedalus.learner.serving.actor_server import Reception
+from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.codec import encode
@@ -67,7 +67,7 @@ class LearnerService:
         self._evaluations = Evaluations(self._epoch)
         self._meter = RateMeter(self._counters, started)
         self._health = Health(started=started, updated=started, attended=started)
-        self._reception = Reception(
+        self._server = ActorServer(
             self._run,
             spec,
             transport,
@@ -84,10 +84,10 @@ class LearnerService:
         Once it has begun to learn, it ends with a checkpoint and a summary, however it ends.
         """
         try:
-            self._reception.open()
+            self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._reception.await_spaces(self._stop, self._progress.say)
+            spaces = self._server.await_spaces(self._stop, self._progress.say)
             if spaces is None:
                 return Outcome(solved=False, finished=False, seconds_to_target=None)
             learner = Learner(self._spec.training, self._spec.policy, spaces)
@@ -101,8 +101,8 @@ class LearnerService:
     def _learn(self, learner: "Learner") -> Outcome:
         """The main loop, and what surrounds it."""
         program = learner.program()
-        self._reception.offer_program(program, learner.state_size)
-        self._reception.publish(learner.policy_version, learner.weights())
+        self._server.offer_program(program, learner.state_size)
+        self._server.publish(learner.policy_version, learner.weights())
         recorder = Recorder(self._directory, self._progress)
         begun, first_env_steps = time.monotonic(), self._counters.env_steps
         self._meter = RateMeter(self._counters, begun)
@@ -151,12 +151,12 @@ class LearnerService:
     def _update(self, learner: "Learner") -> None:
         """One batch, one update, one snapshot; none of them if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
-        rollouts = self._reception.take_batch(learner.policy_version)
+        rollouts = self._server.take_batch(learner.policy_version)
         if not rollouts:
             return
         skipped = learner.updates_skipped
         learner.step(rollouts, progress)
-        self._reception.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
+        self._server.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
         self._health.updated = self._health.attended = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
@@ -166,7 +166,7 @@ class LearnerService:
 
     def _attend_evaluators(self, learner: "Learner", program: bytes) -> None:
         """Gives evaluators the newest policy, a checkpoint of which is kept, and takes in how it played."""
-        for request, message in self._reception.take_evaluations():
+        for request, message in self._server.take_evaluations():
             if isinstance(message, EvaluationReport):
                 answer, news = self._evaluations.report(message)
                 request.reply(encode(answer))
@@ -178,14 +178,14 @@ class LearnerService:
                 request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
                 continue
             version, env_steps = learner.policy_version, self._counters.env_steps
-            if version != self._reception.published_version:
-                self._reception.publish(version, learner.weights())
+            if version != self._server.published_version:
+                self._server.publish(version, learner.weights())
             self._evaluations.begin(message.evaluator, directory, version, env_steps)
-            request.reply(self._reception.newest_snapshot())
+            request.reply(self._server.newest_snapshot())
 
     def _leave(self) -> None:
         stopped = self._stop.is_set()
-        self._reception.close("the learner was stopped" if stopped else "the learner has finished")
+        self._server.close("the learner was stopped" if stopped else "the learner has finished")
 
     # --------------------------------------------------------------------------------------- what it tells
 
@@ -193,10 +193,10 @@ class LearnerService:
         return self._counters.wall_seconds + now - self._started
 
     def _row(self, learner: "Learner", now: float) -> dict[str, float]:
-        with self._reception.lock:
+        with self._server.lock:
             progress = self._counters.env_steps / self._spec.training.env_steps
-            rates = self._meter.look(self._counters, self._reception.fleet, now)
-            if self._reception.fleet.live:
+            rates = self._meter.look(self._counters, self._server.fleet, now)
+            if self._server.fleet.live:
                 self._health.attended = now
             learning = {
                 **learner.take_metrics(),
@@ -204,16 +204,16 @@ class LearnerService:
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
             }
-            return metrics_row(self._counters, self._reception.fleet, rates, learning, self._wall_seconds(now))
+            return metrics_row(self._counters, self._server.fleet, rates, learning, self._wall_seconds(now))
 
     def _details(self, learner: "Learner") -> Details:
-        with self._reception.lock:
+        with self._server.lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(
             returns=returns,
             lengths=lengths,
             action_counts=learner.take_action_counts(),
-            picture=learner.take_picture(),
+            picture=learner.take_observation_image(),
         )
 
     def _status(self, fleet: Fleet) -> RunStatus:
@@ -225,7 +225,7 @@ class LearnerService:
             fleet,
             self._meter.rates,
             self._health,
-            self._reception.queue_bytes,
+            self._server.queue_bytes,
             time.monotonic(),
         )
 
@@ -233,9 +233,9 @@ class LearnerService:
         """Saves a checkpoint and says where; a disk that refuses costs a warning."""
         from daedalus.learner.training.checkpoint import save_checkpoint
 
-        spaces = self._reception.fleet.spaces
+        spaces = self._server.fleet.spaces
         assert spaces is not None
-        with self._reception.lock:
+        with self._server.lock:
             counters = self._counters.state(self._wall_seconds(time.monotonic()))
         try:
             directory = save_checkpoint(

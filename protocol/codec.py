@@ -32,7 +32,7 @@ from pydantic import ValidationError
 from daedalus.protocol import schema
 from daedalus.protocol.messages import CompactSnapshot, Message, Program, Rollout
 
-PROTOCOL_VERSION = 4
+PROTOCOL_VERSION = 5
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")

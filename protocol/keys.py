@@ -46,7 +46,7 @@ def presence(run: str, actor: str, incarnation: int | str) -> str:
     return f"daedalus/{run}/actors/{actor}/{incarnation}"
 
 
-def who_is_present(key: str) -> tuple[str, int] | None:
+def parse_presence(key: str) -> tuple[str, int] | None:
     """The actor's name and incarnation in a presence key; None if it is not one that an actor of ours has."""
     actor, incarnation = key.split("/")[-2:]
     return (actor, int(incarnation)) if re.fullmatch(r"[0-9]{1,19}", incarnation) else None

@@ -229,7 +229,7 @@ class EvaluationReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Farewell:
+class RunEnded:
     """The run is over: learner -> actors, on `snapshots`. Actors leave."""
 
     learner_epoch: int
@@ -256,6 +256,6 @@ Message = (
     | CompactSnapshot
     | EvaluationRequest
     | EvaluationReport
-    | Farewell
+    | RunEnded
     | StatusReport
 )

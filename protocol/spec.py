@@ -45,10 +45,10 @@ class ArraySpace(Specification):
         return f"{self.dtype} array of shape {self.shape}{stacked}"
 
 
-class ChoiceSpace(Specification):
+class DiscreteSpace(Specification):
     """One of `count` choices, numbered from 0 (gymnasium's Discrete, its `start` taken away)."""
 
-    kind: Literal["choice"] = "choice"
+    kind: Literal["discrete"] = "discrete"
     count: Annotated[int, Field(ge=1, le=65_536)]
 
     def __str__(self) -> str:
@@ -59,7 +59,7 @@ class Spaces(Specification):
     """What an environment shows and what it can be told; the actor finds them, the learner holds all to them."""
 
     observation: ArraySpace
-    action: ChoiceSpace
+    action: DiscreteSpace
 
     def __str__(self) -> str:
         return f"observation: {self.observation}; action: {self.action}"
@@ -68,7 +68,7 @@ class Spaces(Specification):
 # ------------------------------------------------------------------------------------------ the run
 
 
-Backend = Literal["gymnasium", "envpool", "ale", "sketch"]  # sketch: gymnasium's CarRacing, cheaply drawn
+Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # sketch: gymnasium's CarRacing, cheaply drawn
 
 
 class EnvironmentSpec(Specification):
@@ -86,7 +86,7 @@ class EnvironmentSpec(Specification):
 
     action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
-    patience: PositiveInt | None = None  # an episode is cut after so many env_steps without a positive reward
+    no_reward_limit: PositiveInt | None = None  # an episode is cut after so many env_steps without a positive reward
 
     crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None  # pixels off top, bottom, left, right
     grey: bool = False
@@ -96,11 +96,11 @@ class EnvironmentSpec(Specification):
     # Learning sees these rewards and ends; logs and evaluations show the true ones.
     reward_clip: Annotated[float, Field(gt=0.0)] | None = None  # to +- this
     reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
-    continuing: bool = False  # a terminated episode counts as cut: where its end is no loss, and cannot be foreseen
+    bootstrap_terminations: bool = False  # at terminations, as if they were truncations
 
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
         """The same environment for a score: episodes are played to their true end, on another backend if named."""
-        return self.model_copy(update={"patience": None, "backend": backend or self.backend})
+        return self.model_copy(update={"no_reward_limit": None, "backend": backend or self.backend})
 
 
 class PolicySpec(Specification):
@@ -248,7 +248,7 @@ class ActorStatus(Specification):
     rollouts_missed: int  # sequence numbers that never came
     busy_answers: int  # how often it was told to come again later
     policy_lag: int  # of its newest rollout
-    slow_link: bool  # it asks for snapshots that fit its link; to all others every one is pushed
+    compact_snapshots: bool  # it asks for snapshots that fit its link; to all others every one is pushed
     bytes_up_per_hour: float  # rollouts, at the rate of the last seconds
     bytes_down_per_hour: float  # snapshots
 

@@ -9,11 +9,11 @@ import torch
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces, TrainingSpec
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces, TrainingSpec
 
 EPOCH = 77
 ROWS, ENVIRONMENTS = 6, 3
-SPACES = Spaces(observation=ArraySpace(shape=(3,), dtype="float32"), action=ChoiceSpace(count=4))
+SPACES = Spaces(observation=ArraySpace(shape=(3,), dtype="float32"), action=DiscreteSpace(count=4))
 POLICY = PolicySpec(hidden=(8,))
 RECURRENT = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.actor.session.learner_link import LearnerLink
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
-CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 ANSWER_SECONDS = 60.0
 
 
@@ -157,10 +157,10 @@ class Sender:
     def __init__(self, address: str, name: str, environments: int = 2) -> None:
         self.transport = connect([address])
         self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
-        self._link = LearnerLink(self.transport, lambda text: None)
+        self._link = LearnerQueries(self.transport, lambda text: None)
         join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
         self.welcome: Welcome = self._link.find(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
-        self.transport.announce(keys.presence(self.welcome.run, name, self.incarnation))
+        self.transport.declare_presence(keys.presence(self.welcome.run, name, self.incarnation))
         self.key = keys.rollouts(self.welcome.run, name)
 
     def version(self) -> int:
@@ -199,7 +199,7 @@ class Sender:
 
     def send(self, payload: bytes) -> Acknowledgement:
         """Sends bytes as a rollout and waits for what becomes of them."""
-        (answer,) = self.transport.ask(self.key, payload, timeout=ANSWER_SECONDS)
+        (answer,) = self.transport.query(self.key, payload, timeout=ANSWER_SECONDS)
         message = decode(answer, Limits())
         assert isinstance(message, Acknowledgement)
         return message

@@ -7,12 +7,12 @@ import sys
 import threading
 
 from daedalus.cli.commands.status import ask
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import TransportError
 
 if __name__ == "__main__":
     never = threading.Event()
-    transport = connect_when_there([sys.argv[1]], never, lambda text: None)
+    transport = connect_with_retry([sys.argv[1]], never, lambda text: None)
     assert transport is not None
     while not never.wait(0.2):
         try:

@@ -11,7 +11,7 @@ from daedalus.transport.zenoh_transport import connect
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts
 
 
-def connect_when_there(
+def connect_with_retry(
     endpoints: list[str],
     stop: threading.Event,
     say: Callable[[str], None],

@@ -76,7 +76,7 @@ def read_names(directory: Path) -> dict[str, list[str]]:
     return names
 
 
-def why_unreachable(endpoint: str, credentials: Credentials | None) -> tuple[str, bool]:
+def diagnose_connection(endpoint: str, credentials: Credentials | None) -> tuple[str, bool]:
     """Why no connection to PROTOCOL/HOST:PORT came about, and whether that is for good: no waiting mends it."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:

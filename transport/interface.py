@@ -1,8 +1,8 @@
 """What the two sides need of a transport, and MemoryTransport, the one for a single process.
 
-    serve / ask / send   queries: a payload goes to whoever serves the key, answers come back
-    publish / follow     the newest value of a key, pushed; only the newest is kept
-    announce / watch     presence: who is there, and who has gone
+    serve / query / query_async           a payload goes to whoever serves the key, answers come back
+    publish / subscribe                   the newest value of a key, pushed; only the newest is kept
+    declare_presence / watch_presence     who is there, and who has gone
 
 A transport moves bytes. It knows no message, and its callbacks must only hand over: they run on
 threads that carry everybody else's traffic too.
@@ -12,6 +12,8 @@ import threading
 import time
 from collections.abc import Callable
 from typing import Protocol
+
+OnAnswer = Callable[[bytes | None], None]  # takes the answer to a query, or None without one
 
 
 class TransportError(Exception):
@@ -68,11 +70,11 @@ class Transport(Protocol):
         """Hands every query for `key` (`*` matches one chunk) to `handler`."""
         ...
 
-    def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+    def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """Every answer to a query within `timeout` seconds; empty if nobody serves the key."""
         ...
 
-    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         """Queries without waiting; `on_answer` gets the first answer, or None, exactly once."""
         ...
 
@@ -80,15 +82,15 @@ class Transport(Protocol):
         """Pushes a value to all that follow the key; those too slow for it get a later one."""
         ...
 
-    def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
+    def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """Follows a key; `on_news` is called when the inbox may have something new."""
         ...
 
-    def announce(self, key: str) -> None:
+    def declare_presence(self, key: str) -> None:
         """Declares presence under `key` until this end closes or dies."""
         ...
 
-    def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+    def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """Calls `on_change(key, present)` for all present now and for every change."""
         ...
 
@@ -172,7 +174,7 @@ class MemoryTransport:
         """See Transport."""
         self._served[key] = handler
 
-    def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+    def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
         answers: list[bytes] = []
         answered = threading.Semaphore(0)
@@ -190,7 +192,7 @@ class MemoryTransport:
             answered.acquire(timeout=max(deadline - time.monotonic(), 0.0))
         return list(answers)
 
-    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         """See Transport. Within a process no answer is lost, so no timer is kept for one."""
         handlers = self._handlers(key)
         if not handlers:
@@ -213,18 +215,18 @@ class MemoryTransport:
                 if _matches(inbox.key, key):
                     inbox.put(payload)
 
-    def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
+    def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """See Transport."""
         inbox = _MemoryInbox(key, on_news)
         self._inboxes.append(inbox)
         return inbox
 
-    def announce(self, key: str) -> None:
+    def declare_presence(self, key: str) -> None:
         """See Transport."""
         self._announced.add(key)
         self._tell(key, True)
 
-    def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+    def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
         self._watches.append((key, on_change))
         for end in self._ends():

@@ -35,7 +35,7 @@ def session_settings(
     }
 
 
-def as_file(settings: dict[str, Any]) -> dict[str, Any]:
+def as_config_file(settings: dict[str, Any]) -> dict[str, Any]:
     """The same as a configuration file holds it: a map for each part of a path."""
     root: dict[str, Any] = {}
     for path, value in settings.items():

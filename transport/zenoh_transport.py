@@ -18,8 +18,16 @@ from typing import Any, Literal
 
 import zenoh
 
-from daedalus.transport.credentials import Credentials, why_unreachable
-from daedalus.transport.interface import AddressInUseError, Inbox, RefusedError, Request, Transport, TransportError
+from daedalus.transport.credentials import Credentials, diagnose_connection
+from daedalus.transport.interface import (
+    AddressInUseError,
+    Inbox,
+    OnAnswer,
+    RefusedError,
+    Request,
+    Transport,
+    TransportError,
+)
 from daedalus.transport.zenoh_settings import session_settings
 
 _PROBE_SECONDS = 2.0  # for a look from outside
@@ -73,7 +81,7 @@ def _opening_error(
             "stop what listens there, or choose another with --listen"
         )
     if connect_to:
-        reasons = [why_unreachable(endpoint, credentials) for endpoint in connect_to]
+        reasons = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]
         for_good = all(final for _, final in reasons)
         return (RefusedError if for_good else TransportError)("; ".join(reason for reason, _ in reasons))
     return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
@@ -200,12 +208,12 @@ class ZenohTransport:
     def _declare(self, declaration: Callable[[zenoh.Session], object]) -> None:
         self._declared[declaration] = declaration(self._session)
 
-    def ask(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+    def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
         with _as_transport_error(f"ask {key}"):
             return _answers(self._session, key, payload, timeout)
 
-    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         """See Transport."""
         first: list[bytes] = []
 
@@ -245,7 +253,7 @@ class ZenohTransport:
                 self._publishers[key] = publisher
             return publisher
 
-    def follow(self, key: str, on_news: Callable[[], None]) -> Inbox:
+    def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """See Transport."""
         inbox = _ZenohInbox()
 
@@ -267,12 +275,12 @@ class ZenohTransport:
             with contextlib.suppress(zenoh.ZError):  # its session was closed: nothing comes any more anyway
                 subscriber.undeclare()
 
-    def announce(self, key: str) -> None:
+    def declare_presence(self, key: str) -> None:
         """See Transport."""
         with _as_transport_error(f"announce {key}"):
             self._declare(lambda session: session.liveliness().declare_token(key))
 
-    def watch(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+    def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
         present: set[str] = set()
 

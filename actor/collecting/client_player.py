@@ -13,7 +13,7 @@ import numpy as np
 from daedalus.actor.collecting.player import Wait
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.make import Transforms
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spec import RunSpec, Spaces
@@ -104,7 +104,7 @@ class ClientPlayer:
             self._record(frame)
         self._acted = True
         assert self._transforms is not None
-        return self._transforms.own_actions(self._choose(writer))[0]
+        return self._transforms.env_actions(self._choose(writer))[0]
 
     def reward(self, value: float) -> None:
         """Adds to what the last action earned."""

@@ -16,7 +16,7 @@ class Player(Protocol):
     """Plays for one learner after the other. Its methods are for the service's thread."""
 
     def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
-        """Makes ready for a run; what is shown and can be told, and E. Raises UnplayableError."""
+        """Makes ready for a run; what is shown and can be told, and E. Raises EnvironmentSetupError."""
         ...
 
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:

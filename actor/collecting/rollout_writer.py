@@ -72,7 +72,7 @@ class RolloutWriter:
         observation, action = spaces.observation, spaces.action
         self._runtime = runtime
         self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
-        self._continuing = spec.continuing
+        self._bootstrap_terminations = spec.bootstrap_terminations
         self._random = random
         self._episodes = EpisodeCounter(count)
         self._stack = FrameStack(observation, count)
@@ -136,7 +136,7 @@ class RolloutWriter:
         if self._reward_clip is not None:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
         self._rewards *= self._reward_scale
-        if self._continuing:
+        if self._bootstrap_terminations:
             self._truncated |= self._terminated
             self._terminated[:] = False
         finished = self._episodes.take_finished()

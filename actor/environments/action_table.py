@@ -3,31 +3,31 @@
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 
 
-def own_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> np.ndarray:
+def env_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> np.ndarray:
     """[count, *action_shape] the environment's own action for each choice.
 
     Args:
       table: a row for each choice, over a Box; None where the environment has choices of its own.
       space: of one environment's actions.
 
-    Raises UnplayableError if the two do not fit.
+    Raises EnvironmentSetupError if the two do not fit.
     """
     if isinstance(space, gymnasium.spaces.Discrete):
         if table is not None:
-            raise UnplayableError(
+            raise EnvironmentSetupError(
                 f"environment.action_table has {len(table)} rows, but action space {space} has choices of its own: "
                 "leave the table out"
             )
         return np.arange(space.start, space.start + space.n)
     if not isinstance(space, gymnasium.spaces.Box):
-        raise UnplayableError(
+        raise EnvironmentSetupError(
             f"action space {space} is not supported: it must be Discrete, or a Box with an environment.action_table"
         )
     if table is None:
-        raise UnplayableError(
+        raise EnvironmentSetupError(
             f"action space {space} is not supported by itself: it must be Discrete; "
             f"name the actions to choose from in environment.action_table, {_size(space)} numbers each"
         )
@@ -37,13 +37,13 @@ def own_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Sp
 def _checked(table: tuple[tuple[float, ...], ...], space: gymnasium.spaces.Box) -> np.ndarray:
     for number, row in enumerate(table):
         if len(row) != _size(space):
-            raise UnplayableError(
+            raise EnvironmentSetupError(
                 f"environment.action_table row {number} has {len(row)} numbers, "
                 f"but an action of space {space} has {_size(space)}"
             )
         action = np.asarray(row, space.dtype)
         if not ((action >= space.low.ravel()) & (action <= space.high.ravel())).all():
-            raise UnplayableError(f"environment.action_table row {number} is {row}, outside action space {space}")
+            raise EnvironmentSetupError(f"environment.action_table row {number} is {row}, outside action space {space}")
     return np.asarray(table, space.dtype).reshape(len(table), *space.shape)
 
 

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import (
-    UnplayableError,
+    EnvironmentSetupError,
     first_line,
     import_extra,
     unknown_environment,
@@ -19,7 +19,7 @@ _PURPOSE = "environment.backend=ale"
 
 
 class AleEnvironments:
-    """An AtariVectorEnv with stacks of one frame, as a BareEnvironment."""
+    """An AtariVectorEnv with stacks of one frame, as a BackendEnvironments."""
 
     def __init__(self, environment: Any) -> None:
         self._environment = environment
@@ -29,28 +29,28 @@ class AleEnvironments:
         self.action_space: gymnasium.Space = environment.single_action_space
 
     def reset(self, seed: int) -> np.ndarray:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         observations, _ = self._environment.reset(seed=seed % (2**31 - self.count))  # environment e gets int32 seed + e
         return observations[:, 0]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         observations, rewards, terminated, truncated, _ = self._environment.step(actions)
         return observations[:, 0], rewards, terminated, truncated
 
     def close(self) -> None:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         self._environment.close()
 
 
 def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, EnvironmentSpec]:
     """The games, and the specification with what is left to do: ALE repeats, greys and resizes by itself.
 
-    Raises UnplayableError with one line that says what is wrong and what to do.
+    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
     """
-    for field in ("action_table", "patience", "crop"):
+    for field in ("action_table", "no_reward_limit", "crop"):
         if getattr(spec, field) is not None:
-            raise UnplayableError(
+            raise EnvironmentSetupError(
                 f"environment.backend=ale does not do environment.{field}: "
                 "leave it out, or play gymnasium's (--set environment.backend=gymnasium)"
             )
@@ -76,7 +76,7 @@ def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, Enviro
             **spec.kwargs,
         )
     except Exception as error:  # whatever ALE says of its options
-        raise UnplayableError(f"environment {spec.id} of ale cannot be made: {first_line(error)}") from None
+        raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be made: {first_line(error)}") from None
     return AleEnvironments(environment), spec.model_copy(update={"action_repeat": 1, "grey": False, "resize": None})
 
 

@@ -19,7 +19,7 @@ _PATCHES = _GRASS + car_racing.GRASS_DIM * _CORNERS  # [4, 400, xy]
 _FIELD = car_racing.PLAYFIELD * (2 * _CORNERS - 1)  # [4, 1, xy]
 
 
-class UndrawnCarRacing(car_racing.CarRacing):
+class LateRenderedCarRacing(car_racing.CarRacing):
     """Steps show nothing (None) until `draw` is called, which shows what gymnasium's own would have."""
 
     _score = 0.0  # that the frame tells, which is the one before this step's reward
@@ -41,7 +41,7 @@ class UndrawnCarRacing(car_racing.CarRacing):
         return frame
 
 
-class SketchedCarRacing(UndrawnCarRacing):
+class FastCarRacing(LateRenderedCarRacing):
     """Draws on a smaller canvas, leaves out what is out of sight and the number that tells the score."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -84,7 +84,7 @@ class SketchedCarRacing(UndrawnCarRacing):
             draw.polygon(self._canvas, colour, polygons[:, index].tolist())
 
 
-class Drawn(gymnasium.ObservationWrapper):
+class RenderObservation(gymnasium.ObservationWrapper):
     """Shows the frame of an environment that is not drawn by itself; the outermost wrapper, after all repeats."""
 
     def observation(self, observation: Any) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
@@ -26,11 +26,11 @@ class EnvironmentProcesses(AsyncVectorEnv):
         self._answered = True
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """See gymnasium's. Raises UnplayableError if a process has ended by itself."""
+        """See gymnasium's. Raises EnvironmentSetupError if a process has ended by itself."""
         return self._ask(lambda: super(EnvironmentProcesses, self).reset(seed=seed, options=options))
 
     def step(self, actions: Any) -> Any:
-        """See gymnasium's. Raises UnplayableError if a process has ended by itself."""
+        """See gymnasium's. Raises EnvironmentSetupError if a process has ended by itself."""
         return self._ask(lambda: super(EnvironmentProcesses, self).step(actions))
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
@@ -53,7 +53,7 @@ class EnvironmentProcesses(AsyncVectorEnv):
         except (EOFError, ConnectionError):
             if None in self.parent_pipes:  # the environment's own error, which its process has sent
                 raise
-            raise UnplayableError("the process of an environment has ended by itself: was it killed?") from None
+            raise EnvironmentSetupError("the process of an environment has ended by itself: was it killed?") from None
         self._answered = True
         return answer
 

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import (
-    UnplayableError,
+    EnvironmentSetupError,
     first_line,
     import_extra,
     unknown_environment,
@@ -26,7 +26,7 @@ Arrange = Callable[[np.ndarray], np.ndarray]
 
 
 class EnvpoolEnvironments:
-    """A pool as a BareEnvironment. Ended episodes are reset by name, which is what the pool's own autoreset does."""
+    """An envpool pool. Ended episodes are reset by index, which is what the pool's own autoreset does."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class EnvpoolEnvironments:
         options: dict[str, Any],
         *,
         repeat: int = 1,
-        patience: int | None = None,
+        no_reward_limit: int | None = None,
         arrange: Arrange = np.asarray,
     ) -> None:
         """`arrange` makes frames [E, *frame_shape] of the pool's observations."""
@@ -49,12 +49,12 @@ class EnvpoolEnvironments:
         self._shape = (self.count, *(self.observation_space.shape or ()))
         self._arrange = arrange
         self._repeat = repeat
-        self._patience = patience
+        self._no_reward_limit = no_reward_limit
         self._ended = np.zeros(self.count, np.bool_)
         self._unrewarded = np.zeros(self.count, np.int64)  # steps in a row
 
     def reset(self, seed: int) -> np.ndarray:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         self.close()
         with _quiet():
             self._pool = self._make_pool(seed=seed % (2**31 - self.count))  # environment e gets the int32 seed + e
@@ -64,7 +64,7 @@ class EnvpoolEnvironments:
         return self._arrange(observations)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         frames = np.empty(self._shape, self.observation_space.dtype)
         rewards = np.zeros(self.count)
         terminated, truncated = np.zeros((2, self.count), np.bool_)
@@ -80,14 +80,14 @@ class EnvpoolEnvironments:
             last = (over | cut) if repeats_left else np.ones(len(live), np.bool_)
             frames[live[last]] = self._arrange(shown[last])
             live = live[~last]
-        if self._patience is not None:
+        if self._no_reward_limit is not None:
             self._unrewarded = np.where((rewards > 0.0) | self._ended, 0, self._unrewarded + 1)
-            truncated |= (self._unrewarded >= self._patience) & ~terminated
+            truncated |= (self._unrewarded >= self._no_reward_limit) & ~terminated
         self._ended = terminated | truncated
         return frames, rewards, terminated, truncated
 
     def close(self) -> None:
-        """See BareEnvironment."""
+        """See BackendEnvironments."""
         if self._pool is not None:
             self._pool.close()
             self._pool = None
@@ -96,7 +96,7 @@ class EnvpoolEnvironments:
 def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
     """The pool, and the specification with what is left to do: Atari games are repeated, greyed and resized in it.
 
-    Raises UnplayableError with one line that says what is wrong and what to do.
+    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
     """
     with _quiet():
         envpool = import_extra("envpool", "envpool", "environment.backend=envpool")
@@ -110,12 +110,14 @@ def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments
             return _make_atari(envpool, spec, count)
         limit = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
         options = _options(spec, count, limit)
-        bare = EnvpoolEnvironments(envpool, spec.id, options, repeat=spec.action_repeat, patience=spec.patience)
+        bare = EnvpoolEnvironments(
+            envpool, spec.id, options, repeat=spec.action_repeat, no_reward_limit=spec.no_reward_limit
+        )
         return bare, spec
-    except UnplayableError:
+    except EnvironmentSetupError:
         raise
     except Exception as error:  # whatever envpool says of its options
-        raise UnplayableError(f"environment {spec.id} of envpool cannot be made: {first_line(error)}") from None
+        raise EnvironmentSetupError(f"environment {spec.id} of envpool cannot be made: {first_line(error)}") from None
 
 
 def _make_atari(envpool: Any, spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
@@ -135,7 +137,7 @@ def _make_atari(envpool: Any, spec: EnvironmentSpec, count: int) -> tuple[Envpoo
         },
     )
     bare = EnvpoolEnvironments(
-        envpool, spec.id, options, patience=spec.patience, arrange=_grey if spec.grey else _colour
+        envpool, spec.id, options, no_reward_limit=spec.no_reward_limit, arrange=_grey if spec.grey else _colour
     )
     left = {"action_repeat": 1, "grey": False, "resize": spec.resize if cropped else None}
     return bare, spec.model_copy(update=left)
@@ -160,7 +162,7 @@ def _options(spec: EnvironmentSpec, count: int, ours: dict[str, Any]) -> dict[st
     """A pool's options: the user's, and those that are decided elsewhere."""
     ours = {**ours, "num_envs": count, "batch_size": count, "num_threads": 1}
     if twice := sorted(ours.keys() & spec.kwargs.keys()):
-        raise UnplayableError(
+        raise EnvironmentSetupError(
             f"environment.kwargs of envpool's {spec.id} names {' and '.join(twice)}, "
             "which the rest of the specification decides: leave it out of kwargs"
         )

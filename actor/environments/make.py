@@ -10,12 +10,12 @@ from typing import Protocol
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.action_table import own_actions
-from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.action_table import env_actions
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.pixels import Pixels
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, Spaces
 
-__all__ = ["Transforms", "UnplayableError", "VectorEnvironment", "make_environments"]
+__all__ = ["EnvironmentSetupError", "Transforms", "VectorEnvironment", "make_environments"]
 
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -50,7 +50,7 @@ class VectorEnvironment(Protocol):
         ...
 
 
-class BareEnvironment(Protocol):
+class BackendEnvironments(Protocol):
     """What a backend makes: steps, repeats and cuts episodes as the specification says, with its own spaces."""
 
     @property
@@ -87,24 +87,24 @@ class Transforms:
     def __init__(
         self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
     ) -> None:
-        """Raises UnplayableError if they do not fit."""
+        """Raises EnvironmentSetupError if they do not fit."""
         if not isinstance(observation_space, gymnasium.spaces.Box) or not 1 <= len(observation_space.shape) <= 4:
-            raise UnplayableError(
+            raise EnvironmentSetupError(
                 f"observation space {observation_space} is not supported: it must be a Box of one to four dimensions"
             )
-        self._actions = own_actions(spec.action_table, action_space)
+        self._actions = env_actions(spec.action_table, action_space)
         self._pixels = Pixels(spec, observation_space)
         dtype = "uint8" if observation_space.dtype == np.uint8 else "float32"
         self.spaces = Spaces(
             observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
-            action=ChoiceSpace(count=len(self._actions)),
+            action=DiscreteSpace(count=len(self._actions)),
         )
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
         """[E, *the environment's shape] as the run has them: [E, *frame_shape]."""
         return self._pixels(frames)
 
-    def own_actions(self, choices: np.ndarray) -> np.ndarray:
+    def env_actions(self, choices: np.ndarray) -> np.ndarray:
         """[E] choices as the environment takes them: [E, *action_shape]."""
         return self._actions[choices]
 
@@ -112,8 +112,8 @@ class Transforms:
 class TransformedEnvironment:
     """A bare environment seen through a specification's transforms."""
 
-    def __init__(self, bare: BareEnvironment, spec: EnvironmentSpec) -> None:
-        """Raises UnplayableError if the two do not fit."""
+    def __init__(self, bare: BackendEnvironments, spec: EnvironmentSpec) -> None:
+        """Raises EnvironmentSetupError if the two do not fit."""
         self._bare = bare
         self._transforms = Transforms(spec, bare.observation_space, bare.action_space)
 
@@ -133,7 +133,7 @@ class TransformedEnvironment:
 
     def step(self, actions: np.ndarray) -> Step:
         """See VectorEnvironment."""
-        frames, rewards, terminated, truncated = self._bare.step(self._transforms.own_actions(actions))
+        frames, rewards, terminated, truncated = self._bare.step(self._transforms.env_actions(actions))
         return self._transforms.frames(frames), rewards, terminated, truncated
 
     def close(self) -> None:
@@ -161,14 +161,14 @@ def make_environments(
 
     The last three are for the gymnasium backend only.
 
-    Raises UnplayableError with one line that says what is wrong and what to do.
+    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
     """
     if spec.backend != "gymnasium":
         _refuse_what_only_gymnasium_does(spec, {"wrap": wrap, "render_mode": render_mode, "camera": camera})
     bare, rest = _make_bare(spec, count, wrap, render_mode, camera)
     try:
         return TransformedEnvironment(bare, rest)
-    except UnplayableError:
+    except EnvironmentSetupError:
         bare.close()
         raise
 
@@ -179,7 +179,7 @@ def _make_bare(
     wrap: str | None,
     render_mode: str | None,
     camera: Callable[[np.ndarray], None] | None,
-) -> tuple[BareEnvironment, EnvironmentSpec]:
+) -> tuple[BackendEnvironments, EnvironmentSpec]:
     """The backend's environments, and the specification with the transforms that are left to do."""
     match spec.backend:
         case "envpool":
@@ -192,7 +192,7 @@ def _make_bare(
             from daedalus.actor.environments.ale_backend import make_ale
 
             return make_ale(spec, count)
-        case "gymnasium" | "sketch":
+        case "gymnasium" | "fast":
             from daedalus.actor.environments.gymnasium_backend import make_gymnasium
 
             return make_gymnasium(spec, count, wrap=wrap, render_mode=render_mode, camera=camera), spec
@@ -201,7 +201,7 @@ def _make_bare(
 def _refuse_what_only_gymnasium_does(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
     names = [name for name, value in asked.items() if value is not None]
     if names:
-        raise UnplayableError(
+        raise EnvironmentSetupError(
             f"environment.backend={spec.backend} does not do {' and '.join(names)}: "
             "leave it out, or play gymnasium's (--set environment.backend=gymnasium)"
         )

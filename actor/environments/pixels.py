@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.protocol.spec import EnvironmentSpec
 
 _GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0.299, 0.587, 0.114
@@ -16,7 +16,7 @@ class Pixels:
     """A specification's transforms of frames, in its order; none of them leaves frames as they are."""
 
     def __init__(self, spec: EnvironmentSpec, space: gymnasium.spaces.Box) -> None:
-        """Raises UnplayableError if a transform does not fit the space."""
+        """Raises EnvironmentSetupError if a transform does not fit the space."""
         asked: list[tuple[str, Callable[[np.ndarray], np.ndarray]]] = []
         if spec.crop is not None:
             asked.append((f"crop={spec.crop}", partial(crop, margins=spec.crop)))
@@ -32,7 +32,9 @@ class Pixels:
                     raise ValueError("frames must be uint8 images of shape (H, W) or (H, W, C)")
                 frames = transform(frames)
             except ValueError as error:
-                raise UnplayableError(f"environment.{name} does not fit observation space {space}: {error}") from None
+                raise EnvironmentSetupError(
+                    f"environment.{name} does not fit observation space {space}: {error}"
+                ) from None
         self.shape: tuple[int, ...] = frames.shape[1:]  # of one frame that comes out
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:

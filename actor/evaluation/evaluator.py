@@ -11,7 +11,7 @@ import numpy as np
 
 from daedalus.actor.environments.make import VectorEnvironment, make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
-from daedalus.actor.session.learner_link import LearnerLink, OverError
+from daedalus.actor.session.learner_queries import LearnerQueries, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
@@ -29,19 +29,19 @@ class Evaluator:
         self._config = config
         self._stop = stop
         self._say = say
-        self._link = LearnerLink(transport, say, config.hint)
+        self._link = LearnerQueries(transport, say, config.hint)
 
     def run(self) -> None:
         """Evaluates until stopped or until the run is over.
 
-        Raises ActorError if it is refused, UnplayableError if the environment cannot be made here, PolicyError if the
-        policy cannot be played.
+        Raises ActorError if it is refused, EnvironmentSetupError if the environment cannot be made here, PolicyError if
+        the policy cannot be played.
         """
         join = Join(actor=self._config.name, incarnation=self._config.incarnation)
         try:
             while True:
                 self._attend(self._link.find(self._config.run, join, self._config.timeout, self._stop))
-        except OverError as error:
+        except RunOverError as error:
             self._say(str(error))
 
     def _attend(self, welcome: Welcome) -> None:
@@ -57,7 +57,7 @@ class Evaluator:
             due = time.monotonic() + interval
             for number in itertools.count():
                 if self._stop.wait(max(due - time.monotonic(), 0.0)):
-                    raise OverError("stopped")
+                    raise RunOverError("stopped")
                 due = time.monotonic() + interval
                 # Actors' seeds are one number, these three: no episode of training is played here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])
@@ -68,7 +68,7 @@ class Evaluator:
 
     def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
         """One evaluation, from the request to the report; False if the learner is not there any more."""
-        snapshot = self._link.policy_to_evaluate(welcome.run, self._config.name, self._stop)
+        snapshot = self._link.evaluation_snapshot(welcome.run, self._config.name, self._stop)
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
         program = self._link.program(welcome.run, snapshot.program)
@@ -97,4 +97,4 @@ class Evaluator:
     def _continue(self, _finished: int, _mean: float) -> None:
         """Called after every step: a request to stop ends it in the middle of an episode."""
         if self._stop.is_set():
-            raise OverError("stopped")
+            raise RunOverError("stopped")

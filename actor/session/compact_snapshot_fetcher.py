@@ -22,7 +22,7 @@ _WHOLE_LIMITS = Limits(max_bytes=1 << 30)
 _RETRY_SECONDS = 1.0  # after a fetch that failed
 
 
-class SlowLink:
+class CompactSnapshotFetcher:
     """One actor's fetches from one life of a learner."""
 
     def __init__(self, transport: Transport, run: str, actor: str, on_news: Callable[[], None]) -> None:
@@ -68,7 +68,7 @@ class SlowLink:
         held = None if self._held is None else self._held[0]
         request = SnapshotRequest(actor=self._actor, held_version=held, policy_version=version, part=part)
         try:
-            self._transport.send(
+            self._transport.query_async(
                 self._key,
                 encode(request),
                 timeout=_ANSWER_SECONDS,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from daedalus.actor.collecting.player import EnvironmentPlayer, Player
-from daedalus.actor.session.learner_link import LearnerLink, LearnerLostError, OverError
+from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries, RunOverError
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
-from daedalus.actor.session.upload_session import Conversation
+from daedalus.actor.session.upload_session import UploadSession
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -62,10 +62,10 @@ class ActorService:
         self._transport = transport
         self._stop = stop
         self._say = say
-        self._link = LearnerLink(transport, say, config.hint)
-        self._conversation = Conversation(transport, self._link, stop)
+        self._link = LearnerQueries(transport, say, config.hint)
+        self._upload_session = UploadSession(transport, self._link, stop)
         self._player = player or EnvironmentPlayer(config.environments, config.wrap)
-        self._feed = SnapshotFeed(transport, self._link, config.name, self._conversation.hear)
+        self._feed = SnapshotFeed(transport, self._link, config.name, self._upload_session.hear)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._runs: set[str] = set()  # in which it is announced
         self._learner_epoch = -1
@@ -76,7 +76,7 @@ class ActorService:
         """Plays until stopped or until the learner says that the run is over.
 
         Raises ActorError if the actor is refused, quarantined, or finds no learner within its timeout, and
-        UnplayableError if the environment cannot be made here.
+        EnvironmentSetupError if the environment cannot be made here.
         """
         try:
             while True:
@@ -84,20 +84,20 @@ class ActorService:
                     self._take_part(self._find_learner())
                 except LearnerLostError:
                     self._say("the learner went away; looking for it again")
-        except OverError as error:
+        except RunOverError as error:
             self._say(str(error))
         finally:
             self._player.close()
 
     def wake(self) -> None:
         """Has a wait look again at what it waits for. From any thread."""
-        self._conversation.wake()
+        self._upload_session.wake()
 
     # ----------------------------------------------------------------------------------------- playing
 
     def _find_learner(self) -> Welcome:
         welcome = self._link.find(self._config.run, self._join, self._config.timeout, self._stop)
-        self._conversation.found()
+        self._upload_session.found()
         return welcome
 
     def _take_part(self, welcome: Welcome) -> None:
@@ -110,12 +110,12 @@ class ActorService:
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         if welcome.learner_epoch == self._learner_epoch:  # the network failed, and not the learner
-            self._conversation.resume()
+            self._upload_session.resume()
         else:
-            self._conversation.begin(welcome.run, self._join, welcome.spec.collection.window)
+            self._upload_session.begin(welcome.run, self._join, welcome.spec.collection.window)
             self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         if self._config.link == "wan" and not welcome.spec.synchronous:
-            self._feed.spare_the_link()
+            self._feed.use_compact_snapshots()
         self._say(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
         self._play(confirmed, spaces)
 
@@ -123,8 +123,8 @@ class ActorService:
         if run in self._runs:
             return
         self._runs.add(run)
-        self._transport.watch(keys.learner(run), self._conversation.on_learner)
-        self._transport.announce(keys.presence(run, self._config.name, self._config.incarnation))
+        self._transport.watch_presence(keys.learner(run), self._upload_session.on_learner)
+        self._transport.declare_presence(keys.presence(run, self._config.name, self._config.incarnation))
 
     def _play(self, welcome: Welcome, spaces: Spaces) -> None:
         player = self._player
@@ -133,7 +133,7 @@ class ActorService:
         snapshot = self._await_snapshot(newer_than=-1)
         loaded = -1
         while True:
-            self._conversation.await_room()  # before playing: what is played now is of the newest policy
+            self._upload_session.await_room()  # before playing: what is played now is of the newest policy
             self._tell_if_in_vain()
             if not welcome.spec.synchronous:
                 snapshot = self._newest_snapshot()
@@ -147,11 +147,11 @@ class ActorService:
                 learner_epoch=welcome.learner_epoch,
             )
             began = time.monotonic()
-            payload = encode(player.collect(identity, self._conversation.wait, self._newest_snapshot))
-            if self._feed.spares_the_link:
+            payload = encode(player.collect(identity, self._upload_session.wait, self._newest_snapshot))
+            if self._feed.uses_compact_snapshots:
                 window = welcome.spec.collection.window
-                self._conversation.fit_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
-            self._conversation.send(self._sequence, payload)
+                self._upload_session.fit_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
+            self._upload_session.send(self._sequence, payload)
             self._sequence += 1
             if welcome.spec.synchronous:
                 snapshot = self._await_snapshot(newer_than=loaded)
@@ -172,7 +172,7 @@ class ActorService:
             if program is not None:
                 break
             self._feed.follow()  # nothing is pushed yet: the first snapshot tells that the program is there too
-            self._conversation.await_word(pause)
+            self._upload_session.await_word(pause)
             self._feed.read()
             pause = min(2 * pause, _DOUBT_SECONDS)
         if self._config.link == "auto" and not welcome.spec.synchronous:
@@ -190,11 +190,11 @@ class ActorService:
             seconds = time.monotonic() - began
         if seconds > allowed:
             self._say(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
-            self._feed.spare_the_link()
+            self._feed.use_compact_snapshots()
 
     def _tell_if_in_vain(self) -> None:
         """Says once that nothing is taken; an actor that sends what is unfit is quarantined long before."""
-        refused, reason = self._conversation.refusals
+        refused, reason = self._upload_session.refusals
         if refused >= _IN_VAIN and not self._told_in_vain:
             self._told_in_vain = True
             self._say(
@@ -216,7 +216,7 @@ class ActorService:
             return self._feed.newest is not None and self._feed.newest.policy_version > newer_than
 
         pause = _FIRST_DOUBT_SECONDS if first else _DOUBT_SECONDS
-        talk = self._conversation
+        talk = self._upload_session
         while not talk.wait(lambda: arrived() or (talk.must_replace and not first), pause):
             pause = min(2 * pause, _DOUBT_SECONDS)
             self._feed.ask()
@@ -227,7 +227,7 @@ class ActorService:
     def _newest_snapshot(self) -> Snapshot:
         """What has come by now; asks for what answers tell of and did not come."""
         self._feed.read()
-        self._conversation.check()
-        self._feed.keep_up(self._conversation.newest_version)
+        self._upload_session.check()
+        self._feed.keep_up(self._upload_session.newest_version)
         assert self._feed.newest is not None
         return self._feed.newest

@@ -3,10 +3,10 @@
 import time
 from collections.abc import Callable
 
-from daedalus.actor.session.compact_snapshot_fetcher import SlowLink
-from daedalus.actor.session.learner_link import LearnerLink, LearnerLostError, OverError
+from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
+from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries, RunOverError
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Farewell, Message, Snapshot, Welcome
+from daedalus.protocol.messages import Message, RunEnded, Snapshot, Welcome
 from daedalus.transport.interface import Inbox, Transport
 
 _DOUBT_SECONDS = 1.0  # this long without a snapshot that answers told of, it is asked for
@@ -15,10 +15,10 @@ _DOUBT_SECONDS = 1.0  # this long without a snapshot that answers told of, it is
 class SnapshotFeed:
     """What comes from one learner after the other. Its methods but `on_news` are for one thread."""
 
-    def __init__(self, transport: Transport, link: LearnerLink, actor: str, on_news: Callable[[], None]) -> None:
+    def __init__(self, transport: Transport, link: LearnerQueries, actor: str, on_news: Callable[[], None]) -> None:
         self._transport, self._link, self._actor, self._on_news = transport, link, actor, on_news
         self._inboxes: dict[str, Inbox] = {}  # by run
-        self._slow: SlowLink | None = None
+        self._slow: CompactSnapshotFetcher | None = None
         self._run, self._learner_epoch = "", -1
         self._came_at = 0.0
         self.newest: Snapshot | None = None  # of this learner epoch
@@ -31,22 +31,22 @@ class SnapshotFeed:
     def follow(self) -> None:
         """Has every snapshot pushed from now on, unless the link is spared."""
         if self._slow is None and self._run not in self._inboxes:
-            self._inboxes[self._run] = self._transport.follow(keys.snapshots(self._run), self._on_news)
+            self._inboxes[self._run] = self._transport.subscribe(keys.snapshots(self._run), self._on_news)
 
-    def spare_the_link(self) -> None:
+    def use_compact_snapshots(self) -> None:
         """From now on nothing is pushed: compact snapshots are fetched."""
         for inbox in self._inboxes.values():
             inbox.close()
         self._inboxes.clear()
-        self._slow = SlowLink(self._transport, self._run, self._actor, self._on_news)
+        self._slow = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
 
     @property
-    def spares_the_link(self) -> bool:
+    def uses_compact_snapshots(self) -> bool:
         """Whether snapshots are fetched."""
         return self._slow is not None
 
     def read(self) -> None:
-        """Takes in what has come. Raises OverError after a farewell, LearnerLostError if another learner speaks."""
+        """Takes in what has come. Raises RunOverError after a run_ended, LearnerLostError if another learner speaks."""
         if self._slow is not None:
             news = self._slow.take()
         else:
@@ -72,8 +72,8 @@ class SnapshotFeed:
             self.ask()
 
     def _take(self, news: Message) -> None:
-        if isinstance(news, Farewell) and news.learner_epoch == self._learner_epoch:
-            raise OverError(f"the run is over: {news.reason}")
+        if isinstance(news, RunEnded) and news.learner_epoch == self._learner_epoch:
+            raise RunOverError(f"the run is over: {news.reason}")
         if not isinstance(news, Snapshot):
             return
         if news.learner_epoch != self._learner_epoch:

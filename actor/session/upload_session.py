@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from daedalus.actor.session.learner_link import ActorError, LearnerLink, LearnerLostError, OverError
+from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
 from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, ProtocolError, decode
@@ -20,10 +20,10 @@ _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
 
 
-class Conversation:
+class UploadSession:
     """With one learner after the other."""
 
-    def __init__(self, transport: Transport, link: LearnerLink, stop: threading.Event) -> None:
+    def __init__(self, transport: Transport, link: LearnerQueries, stop: threading.Event) -> None:
         self._transport, self._link, self._stop = transport, link, stop
         self._changed = threading.Condition()  # guards what the transport's threads touch: the next three
         self._uploader = Uploader(window=1)
@@ -112,15 +112,15 @@ class Conversation:
                 self._changed.wait(max(until - now, 0.0))
 
     def check(self) -> None:
-        """Raises if there is a reason to stop playing: OverError, ActorError in quarantine, LearnerLostError."""
+        """Raises if there is a reason to stop playing: RunOverError, ActorError in quarantine, LearnerLostError."""
         if self._stop.is_set():
-            raise OverError("stopped")
+            raise RunOverError("stopped")
         if self._uploader.over == "quarantined":
             raise ActorError(
                 f"the learner takes nothing more of this actor: {self._uploader.reason}; mend that and start it again"
             )
         if self._uploader.over == "finished":
-            raise OverError("the run is over")
+            raise RunOverError("the run is over")
         if self._learner_left or self._uploader.over == "fenced":
             raise LearnerLostError
 
@@ -138,7 +138,7 @@ class Conversation:
             due = uploader.due(time.monotonic())
         for sequence, payload in due:
             try:
-                self._transport.send(
+                self._transport.query_async(
                     keys.rollouts(self._run, self._join.actor),
                     payload,
                     timeout=_ACKNOWLEDGE_SECONDS,

@@ -10,18 +10,20 @@ from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import Limits, decode
 from daedalus.protocol.messages import Acknowledgement, Rollout
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import Transport
 
 
 class JournalTransport:
-    """A transport that keeps a journal of `send`; a line is in the file before the next thing happens."""
+    """A transport that keeps a journal of `query_async`; a line is in the file before the next thing happens."""
 
     def __init__(self, transport: Transport, path: str) -> None:
         self._transport = transport
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
-    def send(self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]) -> None:
+    def query_async(
+        self, key: str, payload: bytes, *, timeout: float, on_answer: Callable[[bytes | None], None]
+    ) -> None:
         """See Transport."""
         rollout = decode(payload, Limits())
         assert isinstance(rollout, Rollout)
@@ -35,7 +37,7 @@ class JournalTransport:
                 os.write(self._file, f"answered {name} {message.verdict}\n".encode())
             on_answer(answer)
 
-        self._transport.send(key, payload, timeout=timeout, on_answer=answered)
+        self._transport.query_async(key, payload, timeout=timeout, on_answer=answered)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
@@ -43,7 +45,7 @@ class JournalTransport:
 
 if __name__ == "__main__":
     stop = stop_on_signals()
-    transport = connect_when_there([sys.argv[1]], stop, print)
+    transport = connect_with_retry([sys.argv[1]], stop, print)
     if transport is None:
         raise SystemExit(0)
     try:

@@ -16,7 +16,7 @@ from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scen
 from daedalus.learner.training.checkpoint import load_newest, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
 
 
 def kills(count: int) -> list[tuple[str, str]]:
@@ -117,7 +117,7 @@ def stops(count: int) -> list[tuple[str, str]]:
 def damaged(count: int) -> list[tuple[str, str]]:
     """Checkpoints whose files are cut, flipped or missing: none is accepted, the one before it is."""
     choose = random.Random(4)
-    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"), policy=PolicySpec(hidden=(64, 64)))
     learner = Learner(spec.training, spec.policy, spaces)
     kinds, accepted = Counter[str](), 0

@@ -69,7 +69,7 @@ class Scene:
         try:
             if self._transport is None:
                 self._transport = connect([self.address])
-            answers = self._transport.ask(keys.status("*"), timeout=2.0)
+            answers = self._transport.query(keys.status("*"), timeout=2.0)
             report = decode(answers[0], Limits()) if answers else None
         except (TransportError, ProtocolError):
             return None

@@ -45,7 +45,7 @@ class _Flood:
             if self._windowed and not self._room.acquire(timeout=0.1):
                 continue
             payload = self._sender.rollout(self.sent, self.version)
-            self._sender.transport.send(self._sender.key, payload, timeout=60.0, on_answer=self._on_answer)
+            self._sender.transport.query_async(self._sender.key, payload, timeout=60.0, on_answer=self._on_answer)
             self.sent += 1
             due += 1.0 / self._rate
             self._stop.wait(max(due - time.monotonic(), 0.0))

@@ -18,15 +18,15 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
-from daedalus.actor.session.learner_link import LearnerLink
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
-from daedalus.transport.connecting import connect_when_there
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.transport.connecting import connect_with_retry
 
-SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 ENVIRONMENTS = 16
 _LIMITS = Limits()
 _WAIT_SECONDS = 120.0
@@ -56,10 +56,10 @@ class Simulated:
     """One actor, as far as the learner and the router can tell."""
 
     def __init__(self, address: str, name: str) -> None:
-        transport = connect_when_there([address], threading.Event(), lambda text: None, _WAIT_SECONDS)
+        transport = connect_with_retry([address], threading.Event(), lambda text: None, _WAIT_SECONDS)
         assert transport is not None  # nobody tells it to stop
         self._transport = transport
-        self._link = LearnerLink(self._transport, lambda text: None)
+        self._link = LearnerQueries(self._transport, lambda text: None)
         self._changed = threading.Condition()
         self._uploader = Uploader(window=1)
         self._sequence, self._version = 0, -1
@@ -70,8 +70,8 @@ class Simulated:
         join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
         self._welcome = self._link.find(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
         run = self._welcome.run
-        self._inbox = self._transport.follow(keys.snapshots(run), self._on_news)
-        self._transport.announce(keys.presence(run, name, incarnation))
+        self._inbox = self._transport.subscribe(keys.snapshots(run), self._on_news)
+        self._transport.declare_presence(keys.presence(run, name, incarnation))
         self._key = keys.rollouts(run, name)
         self._rollout = replace(
             recorded(self._welcome.spec.collection.rollout_length),
@@ -122,7 +122,7 @@ class Simulated:
                 self._changed.wait(max((wanted or 0.0) - time.monotonic(), 0.0)) if wanted else None
                 ready = self._uploader.due(time.monotonic())
             for sequence, payload in ready:
-                self._transport.send(
+                self._transport.query_async(
                     self._key,
                     payload,
                     timeout=30.0,

@@ -5,14 +5,14 @@ Exit status: 0 the run is over, 1 failed, 2 bad usage.
 
 import sys
 
-from daedalus.actor.environments.make import UnplayableError
+from daedalus.actor.environments.make import EnvironmentSetupError
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.processes import exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
@@ -35,7 +35,7 @@ def main() -> int:
             print(f"actor {config.name}: {text}", flush=True)
 
     try:
-        transport = connect_when_there(arguments.connect, stop, say, config.timeout, credentials)
+        transport = connect_with_retry(arguments.connect, stop, say, config.timeout, credentials)
         if transport is None:
             return 0
         try:
@@ -43,7 +43,7 @@ def main() -> int:
             role(config, transport, stop, say).run()
         finally:
             transport.close()
-    except (ActorError, UnplayableError, PolicyError, TransportError) as error:
+    except (ActorError, EnvironmentSetupError, PolicyError, TransportError) as error:
         print(f"daedalus actor: {error}", file=sys.stderr)
         return 1
     return 0

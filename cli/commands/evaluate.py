@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.commands.evaluate_arguments import check, parser
@@ -47,7 +47,7 @@ def main(words: Sequence[str] | None = None, stop: threading.Event | None = None
         exit_with_parent(stop)
     try:
         result = _evaluate(arguments, stop)
-    except (_StoppedError, DamagedError, NoPolicyError, UnplayableError, PolicyError, VideoError) as error:
+    except (_StoppedError, DamagedError, NoPolicyError, EnvironmentSetupError, PolicyError, VideoError) as error:
         # The signal may have gone to the environments' processes as well; that they have ended is no news then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
@@ -120,7 +120,7 @@ def _play(
         if video is not None:
             video.frames_per_second = _frames_per_second(spec)
         if environments.spaces != policy.spaces:
-            raise UnplayableError(
+            raise EnvironmentSetupError(
                 f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
                 "choose another --backend, or install the version that the run used (versions.json)"
             )

@@ -11,7 +11,7 @@ from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.commands.status import ask
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import ProtocolError
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -122,7 +122,7 @@ def _follow(
     def say(text: str) -> None:
         print(f"exporter: {text}", flush=True)
 
-    transport = connect_when_there(endpoints, stop, say, credentials=credentials)
+    transport = connect_with_retry(endpoints, stop, say, credentials=credentials)
     if transport is None:
         return
     collector.transport = transport

@@ -20,7 +20,7 @@ from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.connecting import connect_when_there
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import CredentialsError
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
@@ -56,7 +56,7 @@ def main() -> int:
         if arguments.resume and begun:
             restored = _newest_checkpoint(directory, progress)
         if arguments.connect:
-            transport = connect_when_there(arguments.connect, stop, progress.say, credentials=credentials)
+            transport = connect_with_retry(arguments.connect, stop, progress.say, credentials=credentials)
         else:
             transport = listen(addresses, credentials=credentials)
         if transport is None:

@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
 
 def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
     """What the learners behind a transport tell, within 5 s. Raises TransportError or ProtocolError."""
-    answers = transport.ask(keys.status(run), timeout=5.0)
+    answers = transport.query(keys.status(run), timeout=5.0)
     reports = [decode(answer, Limits()) for answer in answers]
     return [report.status for report in reports if isinstance(report, StatusReport)]
 
@@ -105,7 +105,7 @@ def _line(actor: ActorStatus) -> str:
     state = "quarantined" if actor.quarantined else "alive" if actor.alive else "gone"
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
-    down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.slow_link else ''}"
+    down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.compact_snapshots else ''}"
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
         f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"

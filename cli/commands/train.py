@@ -11,7 +11,7 @@ from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.processes import process_started, stop_on_signals
-from daedalus.cli.select_best import PlayFailedError, play, run_off
+from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.settings_arguments import add_settings, resolve
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
@@ -195,14 +195,14 @@ def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: thread
     began = time.monotonic()
     options = ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
     try:
-        chosen = run_off(directory, spec, options, stopping, lambda text: print(text, flush=True))
+        chosen = select_best(directory, spec, options, stopping, lambda text: print(text, flush=True))
         (evaluation,) = play([[str(directory), *options]], stopping)
-    except PlayFailedError:
+    except EvaluationFailedError:
         return False
     summary = run_directory.read_json(directory / run_directory.SUMMARY)
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
-    summary["evaluation"] = {**evaluation, "run_off": chosen, "seconds": time.monotonic() - began}
+    summary["evaluation"] = {**evaluation, "select_best": chosen, "seconds": time.monotonic() - began}
     run_directory.write_json(directory / run_directory.SUMMARY, summary)
     return True
 

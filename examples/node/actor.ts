@@ -5,7 +5,7 @@ import { Bridge, BridgeError } from "./bridge.ts";
 import { CartPoles, ID, SPACES } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
 import * as link from "./link.ts";
-import { type EnvironmentSpec, LearnerLostError, NameTakenError, OverError, RefusedError, type Welcome } from "./link.ts";
+import { type EnvironmentSpec, LearnerLostError, NameTakenError, RunOverError, RefusedError, type Welcome } from "./link.ts";
 import { Policy } from "./policy.ts";
 import { seeded } from "./random.ts";
 import { type Acknowledgement, Uploader } from "./uploader.ts";
@@ -53,7 +53,7 @@ export class Actor {
       try {
         await this.#takePart(() => (told = ""));
       } catch (error) {
-        if (error instanceof OverError) return this.#say(error.message);
+        if (error instanceof RunOverError) return this.#say(error.message);
         const passing = error instanceof LearnerLostError || error instanceof BridgeError;
         if (passing) takenUntil = performance.now() + TAKEN_MILLISECONDS;
         else if (!(error instanceof NameTakenError && performance.now() < takenUntil)) throw error;
@@ -67,7 +67,7 @@ export class Actor {
   /** Ends `run` soon. */
   stop(): void {
     this.#stopped = true;
-    this.#end(new OverError("stopped"));
+    this.#end(new RunOverError("stopped"));
   }
 
   /** Over a connection of its own: asks what to play, is counted in, and plays until there is a reason to stop. */
@@ -76,7 +76,7 @@ export class Actor {
     const bridge = await Bridge.open(host, port);
     try {
       this.#snapshot = undefined;
-      this.#reason = this.#stopped ? new OverError("stopped") : undefined;
+      this.#reason = this.#stopped ? new RunOverError("stopped") : undefined;
       bridge.onClosed = (error) => this.#end(error);
       const asked = { actor: name, incarnation, spaces: null, environments: 0 };
       const { run, spec, learner_epoch } = await link.join(bridge, this.#config.run, asked);
@@ -114,9 +114,9 @@ export class Actor {
     const hash = String(this.#snapshot!.fields.program);
     const policy = await Policy.load(await link.program(bridge, run, hash), hash);
     const random = seeded(seed);
-    const { reward_clip, reward_scale, continuing, max_episode_steps } = spec.environment;
+    const { reward_clip, reward_scale, bootstrap_terminations, max_episode_steps } = spec.environment;
     const carts = new CartPoles(environments, random, max_episode_steps ?? undefined);
-    const shaping = { clip: reward_clip, scale: reward_scale, continuing };
+    const shaping = { clip: reward_clip, scale: reward_scale, bootstrap_terminations };
     const collector = new Collector(carts, policy, shaping, spec.collection.rollout_length, random);
     const synchronous = spec.training.algorithm === "a2c"; // it takes one rollout of each version
     for (let loaded = -1; ; ) {
@@ -147,7 +147,7 @@ export class Actor {
       });
       this.#toldVersion = Math.max(this.#toldVersion, answer.policy_version);
       this.#rejected = answer.verdict === "rejected";
-      if (answer.verdict === "finished") this.#end(new OverError("the run is over"));
+      if (answer.verdict === "finished") this.#end(new RunOverError("the run is over"));
       if (answer.verdict === "fenced") this.#end(new LearnerLostError("the learner lives another life"));
       if (answer.verdict === "quarantined") {
         this.#end(new RefusedError(`the learner takes nothing more of this actor: ${answer.reason}`));
@@ -167,9 +167,9 @@ export class Actor {
   #takeNews(bytes: Uint8Array): void {
     try {
       const news = decodeWhole(bytes);
-      if (!news || (news.kind !== "Farewell" && news.kind !== "Snapshot")) return;
+      if (!news || (news.kind !== "RunEnded" && news.kind !== "Snapshot")) return;
       if (news.fields.learner_epoch !== this.#uploader.learnerEpoch) throw new LearnerLostError("another learner is here");
-      if (news.kind === "Farewell") throw new OverError(`the run is over: ${news.fields.reason}`);
+      if (news.kind === "RunEnded") throw new RunOverError(`the run is over: ${news.fields.reason}`);
       if (Number(news.fields.policy_version) > this.#version) this.#snapshot = news;
       this.#heardAt = this.#newsAt = performance.now();
       this.#wake();
@@ -219,8 +219,8 @@ export class Actor {
 
 /** Throws RefusedError unless the run asks for CartPole as it is: nothing here changes pixels or actions. */
 function checkPlayable(spec: EnvironmentSpec): void {
-  const { id, kwargs, action_table, action_repeat, patience, crop, grey, resize, frame_stack } = spec;
-  const plain = !(action_table || patience || crop || grey || resize || Object.keys(kwargs).length);
+  const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+  const plain = !(action_table || no_reward_limit || crop || grey || resize || Object.keys(kwargs).length);
   if (id !== ID || !plain || action_repeat !== 1 || frame_stack !== 1) {
     throw new RefusedError(`the run asks for ${id}, or for more than this actor can do to it: it plays ${ID} as it is`);
   }

@@ -94,7 +94,7 @@ export class Bridge {
     this.#received.push(data);
     this.#receivedBytes += data.length;
     while (!this.#failure && this.#receivedBytes >= this.#awaitedBytes) {
-      // Joined only when a whole parcel is there, so a large one is copied once.
+      // Joined only when a whole packet is there, so a large one is copied once.
       const bytes = this.#received.length === 1 ? this.#received[0] : Buffer.concat(this.#received);
       const used = this.#take(bytes);
       this.#received = [bytes.subarray(used)];
@@ -131,7 +131,7 @@ export class Bridge {
       const question = this.#questions.get(number);
       this.#questions.delete(number);
       question?.resolve(question.answers);
-    } else this.#fail(`a parcel of kind ${kind}`);
+    } else this.#fail(`a packet of kind ${kind}`);
   }
 
   #fail(reason: string): void {

@@ -8,7 +8,7 @@
 export const ID = "CartPole-v1";
 export const SPACES = {
   observation: { kind: "array", shape: [4], dtype: "float32", frames: 1 },
-  action: { kind: "choice", count: 2 },
+  action: { kind: "discrete", count: 2 },
 };
 export const SIZE = 4; // numbers in an observation: position, velocity, angle, angular velocity
 

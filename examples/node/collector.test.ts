@@ -7,7 +7,7 @@ import { Collector } from "./collector.ts";
 import { type Acting, sample } from "./policy.ts";
 import { seeded } from "./random.ts";
 
-const AS_IT_IS = { clip: null, scale: 1, continuing: false };
+const AS_IT_IS = { clip: null, scale: 1, bootstrap_terminations: false };
 
 /** Always pushes right, and remembers how many rows of its episode it has seen. */
 const pusher: Acting = {
@@ -70,7 +70,7 @@ test("the row after an episode's end only resets, and nothing is remembered beyo
 });
 
 test("learning's rewards and ends are not the true ones where the run says so", async () => {
-  const shaping = { clip: 0.5, scale: 0.5, continuing: true };
+  const shaping = { clip: 0.5, scale: 0.5, bootstrap_terminations: true };
   const collector = new Collector(new CartPoles(2, seeded(1)), pusher, shaping, 64, seeded(2));
   const { arrays } = await collector.collect({}, 0);
   assert.deepEqual(new Set(arrays.rewards.data as Float32Array), new Set([0.25, 0]));

@@ -8,7 +8,7 @@ import type { Message } from "./wire.ts";
 export interface Shaping {
   clip: number | null;
   scale: number;
-  continuing: boolean; // a terminated episode counts as cut
+  bootstrap_terminations: boolean; // a terminated episode counts as cut
 }
 
 export class Collector {
@@ -59,9 +59,9 @@ export class Collector {
       actions.set(acted.actions, at);
       logProbs.set(acted.logProbs, at);
       rewards.set(step.rewards.map((reward) => this.#shape(reward)), at);
-      const { continuing } = this.#shaping; // then no end is a loss
-      terminated.set(continuing ? new Uint8Array(count) : step.terminated, at);
-      truncated.set(continuing ? this.#ended : step.truncated, at);
+      const { bootstrap_terminations } = this.#shaping; // then no end is a loss
+      terminated.set(bootstrap_terminations ? new Uint8Array(count) : step.terminated, at);
+      truncated.set(bootstrap_terminations ? this.#ended : step.truncated, at);
       // The row after one that only reset is the first of its episode: nothing before it is remembered.
       const size = this.#policy.stateSize;
       this.#state = acted.state.map((number, i) => number * valid[at + Math.floor(i / size)]);

@@ -9,14 +9,14 @@ export interface EnvironmentSpec {
   max_episode_steps: number | null;
   action_table: unknown;
   action_repeat: number;
-  patience: number | null;
+  no_reward_limit: number | null;
   crop: unknown;
   grey: boolean;
   resize: unknown;
   frame_stack: number;
   reward_clip: number | null;
   reward_scale: number;
-  continuing: boolean;
+  bootstrap_terminations: boolean;
 }
 
 /** What the answer to a Join holds, as far as this actor needs it. */
@@ -38,7 +38,7 @@ export class RefusedError extends Error {}
 export class NameTakenError extends RefusedError {}
 
 /** The run is over, or the actor was told to stop; the message says which. */
-export class OverError extends Error {}
+export class RunOverError extends Error {}
 
 /** The learner went away, or lives another life; join again. */
 export class LearnerLostError extends Error {}
@@ -50,7 +50,7 @@ export async function join(bridge: Bridge, run: string, fields: Message["fields"
   if (welcomes.length > 1) throw new RefusedError("several learners answer here: choose one with --run");
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
   const refusal = answers.find((answer) => answer.kind === "Refusal")?.fields;
-  if (refusal?.code === "finished") throw new OverError("the run is over");
+  if (refusal?.code === "finished") throw new RunOverError("the run is over");
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);
   throw new LearnerLostError("no learner answers");

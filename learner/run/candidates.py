@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, is_best, score_anew
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, is_best, rescore
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
 
@@ -17,9 +17,9 @@ class Candidate:
     policy_version: int
     score: float | None
 
-    def score_anew(self, score: float) -> None:
+    def rescore(self, score: float) -> None:
         """Keeps it under another score. Raises OSError if the disk refuses."""
-        score_anew(self.directory, score, self.policy_version)
+        rescore(self.directory, score, self.policy_version)
 
 
 def candidates(run_directory: Path, warn: Callable[[str], None]) -> list[Candidate]:

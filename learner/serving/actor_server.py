@@ -20,9 +20,9 @@ import numpy as np
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
-from daedalus.learner.serving.query_responses import FrontDesk
+from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.request_queue import RequestQueue
-from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, Taken
+from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.snapshot_publisher import Publisher
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
@@ -45,7 +45,7 @@ _RIVAL_SECONDS = 2.0  # for another learner of this run to say that it is there
 _HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
 
 
-class Reception:
+class ActorServer:
     """Serves one run's actors from `open` to `close`."""
 
     def __init__(
@@ -69,10 +69,10 @@ class Reception:
         self._over = False
         self._buffer = _buffer(spec)
         self._intake = Intake(spec, learner_epoch, self.fleet)
-        self._desk = FrontDesk(run, spec, learner_epoch, start_version, self.fleet, self.lock)
+        self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         self._requests = _queue(spec)
         self._publisher = Publisher(
-            run, spec, learner_epoch, start_version, transport, self._desk, self.fleet, self._on_small_answer
+            run, spec, learner_epoch, start_version, transport, self._responses, self.fleet, self._on_small_answer
         )
         self._judging = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
         self._ended = threading.Event()
@@ -82,23 +82,25 @@ class Reception:
 
     def open(self) -> None:
         """Lets actors in. Raises TransportError if another learner serves a run of this name."""
-        transport, run, desk = self._transport, self._run, self._desk
-        if transport.ask(keys.status(run), timeout=_RIVAL_SECONDS):
+        transport, run, responses = self._transport, self._run, self._responses
+        if transport.query(keys.status(run), timeout=_RIVAL_SECONDS):
             raise TransportError(
                 f"another learner serves run {run!r} there already: stop it, "
                 "or name this one otherwise (the last part of --run-dir)"
             )
         self._judging.start()
         self._publisher.open()
-        transport.watch(keys.presence(run, "*", "*"), self._on_presence)
+        transport.watch_presence(keys.presence(run, "*", "*"), self._on_presence)
         self._serve(keys.rollouts(run, "*"), self._on_rollout)
         self._serve(keys.snapshots(run), self._publisher.answer)
-        self._serve(keys.program(run, "*"), lambda request: request.reply(desk.program(keys.last_chunk(request.key))))
+        self._serve(
+            keys.program(run, "*"), lambda request: request.reply(responses.program(keys.last_chunk(request.key)))
+        )
         self._serve(keys.status(run), self._on_status)
         self._serve(keys.evaluations(run, "*"), self._on_evaluation)
-        transport.announce(keys.learner(run))
+        transport.declare_presence(keys.learner(run))
         # Last: who is let in finds all else there.
-        self._serve(keys.join(run), lambda request: request.reply(desk.join(request.payload, time.monotonic())))
+        self._serve(keys.join(run), lambda request: request.reply(responses.join(request.payload, time.monotonic())))
         self._watching.start()
 
     def _serve(self, key: str, handler: Callable[[Request], None]) -> None:
@@ -160,7 +162,7 @@ class Reception:
             self.lock.notify_all()
         return taken.rollouts
 
-    def _take(self, version: int) -> Taken:
+    def _take(self, version: int) -> TakenRollouts:
         return self._buffer.take(self.fleet.live, version)
 
     def take_evaluations(self) -> list[tuple[Request, EvaluationRequest | EvaluationReport]]:
@@ -182,7 +184,7 @@ class Reception:
 
     def newest_snapshot(self) -> bytes:
         """The snapshot that was published last, encoded."""
-        return self._desk.snapshot()
+        return self._responses.snapshot()
 
     def offer_program(self, model: bytes, state_size: int) -> None:
         """Has the policy program ready for those who ask; rollouts come with `state_size` numbers of memory."""
@@ -204,7 +206,7 @@ class Reception:
     # ----------------------------------------------------------------------------- the transport's threads
 
     def _on_presence(self, key: str, present: bool) -> None:
-        life = keys.who_is_present(key)
+        life = keys.parse_presence(key)
         if life is not None:
             with self.lock:
                 self.fleet.set_present(*life, present)
@@ -249,7 +251,7 @@ class Reception:
         with self.lock:
             actor = self.fleet.actors.get(name)
             if actor is not None:
-                actor.slow_link, actor.answered_bytes = True, actor.answered_bytes + size
+                actor.compact_snapshots, actor.answered_bytes = True, actor.answered_bytes + size
 
     # --------------------------------------------------------------------------------- the watchdog thread
 

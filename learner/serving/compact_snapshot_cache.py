@@ -27,7 +27,7 @@ class _Prepared:
     encoded: bytes
 
 
-class CompactDesk:
+class CompactSnapshotCache:
     """Answers SnapshotRequests in one life of a learner."""
 
     def __init__(self, learner_epoch: int) -> None:

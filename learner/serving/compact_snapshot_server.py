@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from daedalus.learner.serving.compact_snapshot_cache import CompactDesk
+from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
 from daedalus.protocol.messages import Refusal, SnapshotRequest
@@ -14,12 +14,12 @@ _WAITING_BYTES, _WAITING = 256 << 10, 4096
 _LEAVING_SECONDS = 0.5  # for an answer under way; its reader may be frozen, and others wait to leave as well
 
 
-class SlowLinks:
+class CompactSnapshotServer:
     """Takes SnapshotRequests from `open` to `close`."""
 
     def __init__(self, learner_epoch: int, newest: Callable[[], bytes], on_answer: Callable[[str, int], None]) -> None:
         """`newest` gives the encoded snapshot; `on_answer` is told who was sent how many bytes."""
-        self._desk = CompactDesk(learner_epoch)
+        self._cache = CompactSnapshotCache(learner_epoch)
         self._newest, self._on_answer = newest, on_answer
         self._requests = RequestQueue(_WAITING_BYTES, _WAITING)
         self._thread = threading.Thread(target=self._work, name="slow links", daemon=True)
@@ -49,6 +49,6 @@ class SlowLinks:
             if not isinstance(message, SnapshotRequest):
                 request.reply(encode(Refusal(code="malformed", reason="only those who want a snapshot belong here")))
                 continue
-            answer = self._desk.answer(message, self._newest())
+            answer = self._cache.answer(message, self._newest())
             request.reply(answer)
             self._on_answer(message.actor, len(answer))

@@ -62,7 +62,7 @@ class Actor:
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of its newest rollout
-    slow_link: bool = False  # it asks for snapshots that fit its link; to all others they are pushed
+    compact_snapshots: bool = False  # it asks for snapshots that fit its link; to all others they are pushed
     received_bytes: int = 0  # rollouts, whatever became of them
     answered_bytes: int = 0  # snapshots that it asked for
     bytes_up_per_hour: float = 0.0
@@ -94,7 +94,7 @@ class Actor:
         """
         self.incarnation = incarnation
         self.lives += 1
-        self.unfit, self.quarantined, self.slow_link = 0, "", False
+        self.unfit, self.quarantined, self.compact_snapshots = 0, "", False
         self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
         while len(self.windows) > _REMEMBERED_LIVES:
             del self.windows[next(iter(self.windows))]
@@ -212,7 +212,7 @@ class Fleet:
                 rollouts_missed=actor.missed,
                 busy_answers=actor.busy,
                 policy_lag=actor.policy_lag,
-                slow_link=actor.slow_link,
+                compact_snapshots=actor.compact_snapshots,
                 bytes_up_per_hour=actor.bytes_up_per_hour,
                 bytes_down_per_hour=actor.bytes_down_per_hour,
             )

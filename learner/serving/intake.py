@@ -55,7 +55,7 @@ class Intake:
             return Rejected(verdict="rejected", cause="malformed", reason=str(error))
         if not isinstance(rollout, Rollout):
             return Rejected(verdict="rejected", cause="malformed", reason="not a rollout")
-        stranger = self._stranger(sender, rollout)
+        stranger = self._check_identity(sender, rollout)
         if stranger is not None:
             return stranger
         fault = self._fault(rollout, spaces, actor)
@@ -80,7 +80,7 @@ class Intake:
         return verdict
 
     def _judge(self, sender: str, rollout: Rollout, policy_version: int) -> Rollout | Rejected:
-        stranger = self._stranger(sender, rollout)
+        stranger = self._check_identity(sender, rollout)
         if stranger is not None:
             return stranger
         identity, actor = rollout.identity, self._fleet.actors[sender]
@@ -98,7 +98,7 @@ class Intake:
             )
         return rollout
 
-    def _stranger(self, sender: str, rollout: Rollout) -> Rejected | None:
+    def _check_identity(self, sender: str, rollout: Rollout) -> Rejected | None:
         """Why a rollout is from or for another life than those that run now, or None."""
         identity = rollout.identity
         if identity.learner_epoch != self._epoch:

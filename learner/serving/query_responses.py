@@ -14,7 +14,7 @@ from daedalus.protocol.spec import RunSpec
 _JOIN_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
 
 
-class FrontDesk:
+class QueryResponses:
     """Answers, as bytes, to the queries that are not rollouts. The lock that it is given guards the fleet."""
 
     def __init__(
@@ -69,10 +69,10 @@ class FrontDesk:
         """Has the newest snapshot ready, as the bytes that were published."""
         self._snapshot = encoded
 
-    def close(self, farewell: bytes) -> None:
-        """Lets nobody in any more, and answers with a farewell where there were snapshots."""
+    def close(self, run_ended: bytes) -> None:
+        """Lets nobody in any more, and answers with a run_ended where there were snapshots."""
         self._over = True
-        self._snapshot = farewell
+        self._snapshot = run_ended
 
     def snapshot(self) -> bytes:
         """The answer to a query for the newest snapshot."""

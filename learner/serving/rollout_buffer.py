@@ -9,7 +9,7 @@ from daedalus.protocol.messages import Rollout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Taken:
+class TakenRollouts:
     """One batch's rollouts, and those that grew too old while they waited."""
 
     rollouts: list[Rollout]
@@ -27,7 +27,7 @@ class RolloutBuffer(Protocol):
         """Takes in a rollout."""
         ...
 
-    def take(self, live: Set[str], policy_version: int) -> Taken:
+    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
         """The next batch if it is complete, else no rollouts. `live` are the actors that take part."""
         ...
 
@@ -52,16 +52,16 @@ class BarrierBuffer:
         """See RolloutBuffer."""
         self._waiting[rollout.identity.actor] = rollout
 
-    def take(self, live: Set[str], policy_version: int) -> Taken:
+    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
         """See RolloutBuffer."""
         if not self._started and len(live) < self._first:
-            return Taken(rollouts=[], stale=[])
+            return TakenRollouts(rollouts=[], stale=[])
         if not self._waiting or live - self._waiting.keys():
-            return Taken(rollouts=[], stale=[])
+            return TakenRollouts(rollouts=[], stale=[])
         self._started = True
         rollouts = [self._waiting[actor] for actor in sorted(self._waiting)]
         self._waiting.clear()
-        return Taken(rollouts=rollouts, stale=[])
+        return TakenRollouts(rollouts=rollouts, stale=[])
 
 
 class StreamBuffer:
@@ -84,12 +84,12 @@ class StreamBuffer:
         """See RolloutBuffer."""
         self._waiting.append(rollout)
 
-    def take(self, live: Set[str], policy_version: int) -> Taken:
+    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
         """See RolloutBuffer."""
         oldest = policy_version - self._max_policy_lag
         stale = [rollout for rollout in self._waiting if rollout.policy_version < oldest]
         if stale:
             self._waiting = deque(rollout for rollout in self._waiting if rollout.policy_version >= oldest)
         if len(self._waiting) < self._batch_rollouts:
-            return Taken(rollouts=[], stale=stale)
-        return Taken(rollouts=[self._waiting.popleft() for _ in range(self._batch_rollouts)], stale=stale)
+            return TakenRollouts(rollouts=[], stale=stale)
+        return TakenRollouts(rollouts=[self._waiting.popleft() for _ in range(self._batch_rollouts)], stale=stale)

@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from daedalus.learner.serving.compact_snapshot_server import SlowLinks
+from daedalus.learner.serving.compact_snapshot_server import CompactSnapshotServer
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import FrontDesk
+from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Farewell, Program, Snapshot
+from daedalus.protocol.messages import Program, RunEnded, Snapshot
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
 
@@ -26,40 +26,40 @@ class Publisher:
         learner_epoch: int,
         start_version: int,
         transport: Transport,
-        desk: FrontDesk,
+        responses: QueryResponses,
         fleet: Fleet,
         on_small_answer: Callable[[str, int], None],
     ) -> None:
         """`on_small_answer` is told which actor on a slow link was sent how many bytes."""
         self._key, self._spec, self._epoch = keys.snapshots(run), spec, learner_epoch
-        self._transport, self._desk, self._fleet = transport, desk, fleet
-        self._slow_links = SlowLinks(learner_epoch, desk.snapshot, on_small_answer)
+        self._transport, self._responses, self._fleet = transport, responses, fleet
+        self._compact_snapshots = CompactSnapshotServer(learner_epoch, responses.snapshot, on_small_answer)
         self._unpublished = 0  # rollouts that were learned from since
         self.program_hash = ""  # empty before there is one
         self.version = start_version  # the newest that actors can have
 
     def open(self) -> None:
         """Starts to answer."""
-        self._slow_links.open()
+        self._compact_snapshots.open()
 
     def close(self, reason: str) -> None:
-        """Says farewell in place of snapshots."""
-        farewell = encode(Farewell(learner_epoch=self._epoch, reason=reason))
-        self._desk.close(farewell)
-        self._push(farewell)
-        self._slow_links.close()
+        """Says run_ended in place of snapshots."""
+        run_ended = encode(RunEnded(learner_epoch=self._epoch, reason=reason))
+        self._responses.close(run_ended)
+        self._push(run_ended)
+        self._compact_snapshots.close()
 
     def answer(self, request: Request) -> None:
         """Answers a query on `snapshots`, now or soon. Never waits."""
         if request.size:
-            self._slow_links.offer(request)
+            self._compact_snapshots.offer(request)
         else:
-            request.reply(self._desk.snapshot())
+            request.reply(self._responses.snapshot())
 
     def offer_program(self, model: bytes) -> None:
         """Has the policy program ready for those who ask."""
         self.program_hash = program_hash(model)
-        self._desk.offer_program(Program(hash=self.program_hash, model=np.frombuffer(model, np.uint8)))
+        self._responses.offer_program(Program(hash=self.program_hash, model=np.frombuffer(model, np.uint8)))
 
     def is_due(self, policy_version: int, rollouts: int, live: int) -> bool:
         """Whether to publish a version that was made of so many rollouts, while so many actors take part.
@@ -82,7 +82,7 @@ class Publisher:
                 weights=weights,
             )
         )
-        self._desk.offer_snapshot(snapshot)
+        self._responses.offer_snapshot(snapshot)
         self.version, self._unpublished = policy_version, 0
         self._push(snapshot)
         self._fleet.pushed_bytes += len(snapshot)

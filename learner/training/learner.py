@@ -18,7 +18,7 @@ from daedalus.algorithms.losses import (
     policy_gradient_loss,
     value_loss,
 )
-from daedalus.algorithms.minibatches import Sample, minibatches
+from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.returns import Targets, actor_critic_targets, vtrace_targets
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.optimizers import Adam, FlatParameters, Optimizer, RmsProp
@@ -122,9 +122,9 @@ class Learner:
             targets = self._targets(batch, log_probs, values)
         for _ in range(self._spec.passes):
             for sample in minibatches(batch, log_probs, targets, self._spec.minibatches):
-                self._learn_sample(sample, progress)
+                self._learn_minibatch(sample, progress)
 
-    def _learn_sample(self, sample: Sample, progress: float) -> None:
+    def _learn_minibatch(self, sample: Minibatch, progress: float) -> None:
         if not sample.actions.numel():  # fewer rows than minibatches
             self.policy_version += 1
             return
@@ -214,7 +214,7 @@ class Learner:
         self._action_counts.zero_()
         return counts
 
-    def take_picture(self) -> np.ndarray | None:
+    def take_observation_image(self) -> np.ndarray | None:
         """What the network saw at a row of the newest batch, its stack side by side: uint8 [H, W] or [H, W, 3].
 
         None where observations are no images, or there was no batch since the last call.

@@ -16,7 +16,7 @@ _VARINT, _BYTES = 0, 2  # protobuf's wire types
 _IR_VERSION = 3
 
 
-def with_constants(model: bytes, weights: dict[str, np.ndarray]) -> bytes:
+def with_initializers(model: bytes, weights: dict[str, np.ndarray]) -> bytes:
     """The program with these of its inputs set for good: float32 arrays of the inputs' shapes.
 
     Two serialized protobuf messages in a row are their merger: repeated fields add up, of others the last one counts.

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import onnxruntime
 
-from daedalus.policy.acting.onnx_initializers import with_constants
+from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.sampling import greedy_categorical, sample_categorical
 
 OBSERVATIONS, STATE = "observations", "state"
@@ -106,7 +106,7 @@ class OnnxRuntime:
                 )
         bound = {name: weights[name] for name in self._shapes}
         if self._convolutional:
-            self._session = _session(with_constants(self._model, bound))
+            self._session = _session(with_initializers(self._model, bound))
         else:
             self._feed = bound
 

@@ -53,7 +53,7 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
     return place == 0
 
 
-def score_anew(checkpoint: Path, score: float, policy_version: int) -> Path:
+def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
     """Gives a checkpoint another score; where it lies then. Raises OSError if the disk refuses."""
     target = checkpoint.with_name(best_name(score, policy_version))
     if target != checkpoint:

@@ -19,7 +19,7 @@ from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_s
 from daedalus.protocol.spec import RunSpec, Spaces
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
-PRETRAINED = Path(__file__).parent / "pretrained"
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
 class NoPolicyError(Exception):

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 pytest.importorskip("ale_py.vector_env")
@@ -70,18 +70,21 @@ def test_rewards_are_true() -> None:
         (_spec("Ponk"), "unknown environment 'Ponk': did you mean Pong"),
         (_spec("Pong", kwargs={"no_such_option": 1}), "cannot be made.*no_such_option"),
         (_spec("Pong", kwargs={"stack_num": 4}), "cannot be made.*stack_num"),
-        (_spec("Pong", patience=3), "does not do environment.patience: .*--set environment.backend=gymnasium"),
+        (
+            _spec("Pong", no_reward_limit=3),
+            "does not do environment.no_reward_limit: .*--set environment.backend=gymnasium",
+        ),
         (_spec("Pong", crop=(1, 1, 1, 1)), "does not do environment.crop"),
         (_spec("Pong", action_table=((1.0,), (2.0,))), "does not do environment.action_table"),
     ],
 )
 def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:
-    with pytest.raises(UnplayableError, match=reason) as caught:
+    with pytest.raises(EnvironmentSetupError, match=reason) as caught:
         make_environments(spec, 2)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_ale_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ale_py.roms", None)
-    with pytest.raises(UnplayableError, match=r'"daedalus-rl\[atari\]".*--set environment.backend=gymnasium'):
+    with pytest.raises(EnvironmentSetupError, match=r'"daedalus-rl\[atari\]".*--set environment.backend=gymnasium'):
         make_environments(_spec("Pong"), 1)

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.8), (-0.4, 0.3, 0.0), (0.4, 0.3, 0.0))
@@ -62,7 +62,7 @@ def test_gymnasiums_own_is_the_same_though_drawn_late(drive: tuple[int, list[int
 
 
 def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tuple[int, list[int], int]) -> None:
-    original, ours = _original(*drive), _ours("sketch", *drive)
+    original, ours = _original(*drive), _ours("fast", *drive)
     assert [row[1:] for row in ours] == [row[1:] for row in original]
     different = [np.abs(one[0][ROAD].astype(int) - other[0][ROAD]) for one, other in zip(ours, original, strict=True)]
     assert max(difference.mean() for difference in different) < 3.0
@@ -74,11 +74,11 @@ def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tupl
 
 
 def test_the_sketch_is_of_car_racing_only() -> None:
-    with pytest.raises(UnplayableError, match=r"sketch draws CarRacing-v3 only, not CartPole-v1"):
-        make_environments(EnvironmentSpec(id="CartPole-v1", backend="sketch"), 1)
+    with pytest.raises(EnvironmentSetupError, match=r"sketch draws CarRacing-v3 only, not CartPole-v1"):
+        make_environments(EnvironmentSpec(id="CartPole-v1", backend="fast"), 1)
 
 
-@pytest.mark.parametrize("backend", ["gymnasium", "sketch"])
+@pytest.mark.parametrize("backend", ["gymnasium", "fast"])
 def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [
         name
@@ -88,7 +88,7 @@ def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.M
         monkeypatch.delitem(sys.modules, name)
     for name in ("Box2D", "pygame"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(UnplayableError, match=r'needs a package .* pip install "daedalus-rl\[box2d\]"'):
+    with pytest.raises(EnvironmentSetupError, match=r'needs a package .* pip install "daedalus-rl\[box2d\]"'):
         make_environments(_spec(backend=backend), 1)
 
 

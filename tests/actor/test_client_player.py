@@ -15,7 +15,7 @@ from processes import LIMIT, until
 from daedalus.actor.collecting.client_player import _HELD_ROLLOUTS, ClientPlayer
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -91,8 +91,8 @@ def begun(played: Played) -> tuple[ClientPlayer, Robot]:
 
 @pytest.mark.parametrize(
     "environment",
-    [{}, {"frame_stack": 3}, {"reward_scale": 0.25, "reward_clip": 1.0}, {"continuing": True}],
-    ids=["plain", "stacked", "scaled", "continuing"],
+    [{}, {"frame_stack": 3}, {"reward_scale": 0.25, "reward_clip": 1.0}, {"bootstrap_terminations": True}],
+    ids=["plain", "stacked", "scaled", "bootstrap_terminations"],
 )
 def test_its_rollouts_are_those_of_the_collector(environment: dict[str, Any]) -> None:
     played = Played(run_spec(**environment))

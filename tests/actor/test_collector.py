@@ -136,14 +136,17 @@ def test_a_continuing_task_has_no_ends_but_cuts() -> None:
         collector = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=4, seed=1)
         return [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
 
-    episodic, continuing = collect(COUNTING), collect(COUNTING.model_copy(update={"continuing": True}))
+    episodic, bootstrap_terminations = (
+        collect(COUNTING),
+        collect(COUNTING.model_copy(update={"bootstrap_terminations": True})),
+    )
     terminated, truncated = rows(episodic, "terminated"), rows(episodic, "truncated")
     assert terminated.any()
     assert truncated.any()
-    assert not rows(continuing, "terminated").any()
-    np.testing.assert_array_equal(rows(continuing, "truncated"), terminated | truncated)
+    assert not rows(bootstrap_terminations, "terminated").any()
+    np.testing.assert_array_equal(rows(bootstrap_terminations, "truncated"), terminated | truncated)
     for name in ("valid", "rewards", "episode_returns", "episode_lengths"):
-        for ours, plain in zip(continuing, episodic, strict=True):
+        for ours, plain in zip(bootstrap_terminations, episodic, strict=True):
             np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
 
 

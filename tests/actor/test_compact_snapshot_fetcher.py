@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from processes import LIMIT
 
-from daedalus.actor.session import compact_snapshot_fetcher as slow_link
-from daedalus.actor.session.compact_snapshot_fetcher import SlowLink
-from daedalus.learner.serving.compact_snapshot_cache import CompactDesk
+from daedalus.actor.session import compact_snapshot_fetcher as compact_snapshots
+from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
+from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.compact import bfloat16, float32
-from daedalus.protocol.messages import Farewell, Message, Snapshot, SnapshotPart, SnapshotRequest
+from daedalus.protocol.messages import Message, RunEnded, Snapshot, SnapshotPart, SnapshotRequest
 from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request
 
 FIRST = {"w": np.random.default_rng(1).normal(size=(500, 800)).astype(np.float32)}
@@ -25,7 +25,7 @@ class Learner:
         self.transport = MemoryTransport(network)
         self.requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self.transport.serve(keys.snapshots("r"), self.requests.put)
-        self.desk = CompactDesk(5)
+        self.cache = CompactSnapshotCache(5)
         self.version = 1
 
     @property
@@ -41,7 +41,7 @@ class Learner:
             assert isinstance(message, SnapshotRequest)
             asked.append(message)
             newest = Snapshot(learner_epoch=5, policy_version=self.version, program="p", weights=self.weights)
-            request.reply(self.desk.answer(message, encode(newest)))
+            request.reply(self.cache.answer(message, encode(newest)))
             del request
             if taking:
                 self.link.take_into(self.taken)
@@ -51,7 +51,7 @@ class Learner:
     taken: list[Message]
 
 
-class Link(SlowLink):
+class Link(CompactSnapshotFetcher):
     def take_into(self, taken: list[Message]) -> None:
         message = self.take()
         if message is not None:
@@ -60,14 +60,14 @@ class Link(SlowLink):
 
 @pytest.fixture
 def ends(monkeypatch: pytest.MonkeyPatch) -> tuple[Learner, Link]:
-    monkeypatch.setattr(slow_link, "_RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(compact_snapshots, "_RETRY_SECONDS", 0.0)
     network = MemoryNetwork()
     learner = Learner(network)
     learner.link, learner.taken = Link(MemoryTransport(network), "r", "a", lambda: None), []
     return learner, learner.link
 
 
-def rested(link: SlowLink) -> None:
+def rested(link: CompactSnapshotFetcher) -> None:
     link._next_at = 0.0
 
 
@@ -97,13 +97,13 @@ def test_a_few_parts_are_asked_for_at_once_and_no_more(ends: tuple[Learner, Link
     assert learner.requests.qsize() == 1
     for _ in range(3):
         learner.answer(1)
-        assert learner.requests.qsize() == slow_link._AT_ONCE
+        assert learner.requests.qsize() == compact_snapshots._AT_ONCE
 
 
 def test_a_fetch_goes_on_while_the_actor_plays(ends: tuple[Learner, Link]) -> None:
     learner, link = ends
     link.want()
-    assert len(learner.answer(taking=False)) > slow_link._AT_ONCE
+    assert len(learner.answer(taking=False)) > compact_snapshots._AT_ONCE
     rested(link)
     link.want()  # not before this one was taken: the next is a difference to it
     assert learner.requests.empty()
@@ -114,7 +114,7 @@ def test_a_fetch_goes_on_while_the_actor_plays(ends: tuple[Learner, Link]) -> No
 def test_the_link_rests_for_as_long_as_it_worked(ends: tuple[Learner, Link], monkeypatch: pytest.MonkeyPatch) -> None:
     learner, link = ends
     now = 100.0
-    monkeypatch.setattr(slow_link.time, "monotonic", lambda: now)
+    monkeypatch.setattr(compact_snapshots.time, "monotonic", lambda: now)
     link.want()
     now = 107.0
     learner.answer()
@@ -147,7 +147,7 @@ def only_part(data: bytes, parts: int = 1) -> bytes:
 
 @pytest.mark.parametrize(
     "answer",
-    [b"junk", only_part(b"x", 2**40), only_part(b"x"), only_part(encode(Farewell(learner_epoch=5, reason="")))],
+    [b"junk", only_part(b"x", 2**40), only_part(b"x"), only_part(encode(RunEnded(learner_epoch=5, reason="")))],
     ids=["junk", "too many parts", "a part of nothing", "a part of something else"],
 )
 def test_nonsense_is_given_up_and_asked_for_anew(ends: tuple[Learner, Link], answer: bytes) -> None:
@@ -164,5 +164,5 @@ def test_nonsense_is_given_up_and_asked_for_anew(ends: tuple[Learner, Link], ans
 def test_a_farewell_is_passed_on(ends: tuple[Learner, Link]) -> None:
     learner, link = ends
     link.want()
-    learner.requests.get(timeout=LIMIT).reply(encode(Farewell(learner_epoch=5, reason="over")))
-    assert link.take() == Farewell(learner_epoch=5, reason="over")
+    learner.requests.get(timeout=LIMIT).reply(encode(RunEnded(learner_epoch=5, reason="over")))
+    assert link.take() == RunEnded(learner_epoch=5, reason="over")

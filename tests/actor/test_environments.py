@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -60,18 +60,18 @@ def _needs(backend: str) -> None:
 
 
 def test_an_unknown_environment_is_named_with_near_matches() -> None:
-    with pytest.raises(UnplayableError, match="unknown environment 'CartPoll-v1': did you mean CartPole-v1"):
+    with pytest.raises(EnvironmentSetupError, match="unknown environment 'CartPoll-v1': did you mean CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPoll-v1"), 1)
 
 
 def test_a_module_that_is_not_there_is_named() -> None:
-    with pytest.raises(UnplayableError, match="cannot import no_such_module"):
+    with pytest.raises(EnvironmentSetupError, match="cannot import no_such_module"):
         make_environments(EnvironmentSpec(id="no_such_module:Mine-v0"), 1)
 
 
 def test_continuous_actions_want_a_table() -> None:
     with pytest.raises(
-        UnplayableError, match=r"action space Box.*must be Discrete.*environment.action_table, 1 number"
+        EnvironmentSetupError, match=r"action space Box.*must be Discrete.*environment.action_table, 1 number"
     ):
         make_environments(EnvironmentSpec(id="Pendulum-v1"), 1)
 
@@ -84,12 +84,12 @@ def test_continuous_actions_want_a_table() -> None:
     ],
 )
 def test_a_table_that_does_not_fit_is_told_beside_the_space(table: tuple, reason: str) -> None:
-    with pytest.raises(UnplayableError, match=f"environment.action_table {reason}"):
+    with pytest.raises(EnvironmentSetupError, match=f"environment.action_table {reason}"):
         make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
 
 
 def test_a_table_over_choices_is_refused() -> None:
-    with pytest.raises(UnplayableError, match=r"action_table has 2 rows, but action space Discrete\(2\).*leave"):
+    with pytest.raises(EnvironmentSetupError, match=r"action_table has 2 rows, but action space Discrete\(2\).*leave"):
         make_environments(EnvironmentSpec(id="CartPole-v1", action_table=((0.0,), (1.0,))), 1)
 
 
@@ -105,20 +105,20 @@ def test_a_table_names_the_actions() -> None:
 
 
 def test_observations_that_do_not_travel_are_named() -> None:
-    with pytest.raises(UnplayableError, match=r"observation space Discrete.*must be a Box"):
+    with pytest.raises(EnvironmentSetupError, match=r"observation space Discrete.*must be a Box"):
         make_environments(EnvironmentSpec(id="Taxi-v4"), 1)
 
 
 @pytest.mark.parametrize("backend", ["envpool", "ale"])
 def test_what_only_gymnasium_does_is_refused(backend: Literal["envpool", "ale"]) -> None:
-    with pytest.raises(UnplayableError, match=f"backend={backend} does not do wrap"):
+    with pytest.raises(EnvironmentSetupError, match=f"backend={backend} does not do wrap"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, wrap="module:function")
-    with pytest.raises(UnplayableError, match="does not do render_mode"):
+    with pytest.raises(EnvironmentSetupError, match="does not do render_mode"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, render_mode="human")
 
 
 def test_a_keyword_that_the_environment_does_not_take_is_told() -> None:
-    with pytest.raises(UnplayableError, match=r"cannot be made.*no_such_option"):
+    with pytest.raises(EnvironmentSetupError, match=r"cannot be made.*no_such_option"):
         make_environments(EnvironmentSpec(id="Acrobot-v1", kwargs={"no_such_option": 1}), 1)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments
-from daedalus.actor.environments.make import UnplayableError, make_environments
+from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 with warnings.catch_warnings():
@@ -74,7 +74,7 @@ def test_repeats_are_what_single_steps_are(name: str, table: tuple | None, limit
 
 def test_an_episode_cut_by_patience_starts_anew_at_the_next_step() -> None:
     """MountainCar rewards every step with -1 and starts at rest, between -0.6 and -0.4."""
-    environments = make_environments(_spec("MountainCar-v0", patience=3, action_repeat=2), 2)
+    environments = make_environments(_spec("MountainCar-v0", no_reward_limit=3, action_repeat=2), 2)
     environments.reset(1)
     for row in range(1, 13):
         frames, rewards, terminated, truncated = environments.step(np.array([2, 0]))
@@ -88,7 +88,7 @@ def test_an_episode_cut_by_patience_starts_anew_at_the_next_step() -> None:
 
 def test_patience_is_counted_for_each_environment() -> None:
     """The first drives over tiles, the second stands."""
-    environments = make_environments(_spec("CarRacing-v3", patience=4, action_repeat=4, action_table=GAS), 2)
+    environments = make_environments(_spec("CarRacing-v3", no_reward_limit=4, action_repeat=4, action_table=GAS), 2)
     environments.reset(1)
     cuts = np.stack([environments.step(np.array([0, 1]))[3] for _ in range(6)])
     environments.close()
@@ -115,9 +115,9 @@ class _ThreeSteps:
         return np.full((1, 1), self._steps), np.zeros(1), np.array([self._steps == 3]), np.array([False]), {}
 
 
-@pytest.mark.parametrize(("patience", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [], [1])])
-def test_an_end_of_the_environments_own_stays_one(patience: int, terminates: list, truncates: list) -> None:
-    environments = EnvpoolEnvironments(_ThreeSteps(), "x", {"num_envs": 1}, patience=patience)
+@pytest.mark.parametrize(("no_reward_limit", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [], [1])])
+def test_an_end_of_the_environments_own_stays_one(no_reward_limit: int, terminates: list, truncates: list) -> None:
+    environments = EnvpoolEnvironments(_ThreeSteps(), "x", {"num_envs": 1}, no_reward_limit=no_reward_limit)
     environments.reset(1)
     rows = [environments.step(np.zeros(1, np.int64)) for _ in range(3)]
     assert [row for row, (_, _, terminated, _) in enumerate(rows) if terminated[0]] == terminates
@@ -205,12 +205,12 @@ def test_every_seed_is_taken_and_tells_episodes_apart() -> None:
     ],
 )
 def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:
-    with pytest.raises(UnplayableError, match=reason) as caught:
+    with pytest.raises(EnvironmentSetupError, match=reason) as caught:
         make_environments(spec, 2)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_envpool_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "envpool", None)
-    with pytest.raises(UnplayableError, match=r'"daedalus-rl\[envpool\]".*--set environment.backend=gymnasium'):
+    with pytest.raises(EnvironmentSetupError, match=r'"daedalus-rl\[envpool\]".*--set environment.backend=gymnasium'):
         make_environments(_spec("CartPole-v1"), 1)

@@ -11,7 +11,7 @@ import pytest
 from processes import LIMIT
 
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
@@ -22,15 +22,15 @@ from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
     Join,
     Message,
     Program,
     Refusal,
+    RunEnded,
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, RunSpec, Spaces
 from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request
 
 
@@ -43,7 +43,7 @@ def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
     )
 
 
-SPACES = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=ChoiceSpace(count=4))
+SPACES = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=DiscreteSpace(count=4))
 NETWORK = ActorCritic(PolicySpec(hidden=()), SPACES)
 MODEL = export_program(NETWORK, SPACES.observation)
 
@@ -59,7 +59,7 @@ class ScriptedLearner:
         self.present: list[str] = []
         self.transport.serve(keys.evaluations("r", "*"), self.told.put)
         self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.watch(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
+        self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
         self.transport.serve(keys.join("r"), self._join)
 
     def _join(self, request: Request) -> None:
@@ -266,7 +266,7 @@ def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
 
 
 @pytest.mark.parametrize(
-    "answer", [Farewell(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
+    "answer", [RunEnded(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
 )
 def test_it_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message) -> None:
     learner.give(answer)

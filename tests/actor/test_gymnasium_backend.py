@@ -1,4 +1,4 @@
-"""gymnasium's environments: repeats, patience, wrappers, cameras and processes."""
+"""gymnasium's environments: repeats, no_reward_limit, wrappers, cameras and processes."""
 
 import os
 import signal
@@ -12,8 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.gymnasium_backend import MakeOne, RepeatedSteps
-from daedalus.actor.environments.make import UnplayableError, VectorEnvironment, make_environments
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps
+from daedalus.actor.environments.make import EnvironmentSetupError, VectorEnvironment, make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5
@@ -67,7 +67,7 @@ def test_the_limit_is_in_the_environments_own_steps() -> None:
 
 
 def test_patience_cuts_an_episode_after_steps_without_a_positive_reward() -> None:
-    environments = make_environments(_picture(patience=2, kwargs={"end": 100}), 1)
+    environments = make_environments(_picture(no_reward_limit=2, kwargs={"end": 100}), 1)
     environments.reset(1)
     bad, nothing, good = 0, 1, 2
     rows = _rows(environments, [bad, good, nothing, bad, good, nothing, nothing, good])
@@ -78,17 +78,19 @@ def test_patience_cuts_an_episode_after_steps_without_a_positive_reward() -> Non
 
 
 def test_patience_counts_rows_and_starts_anew_with_each_episode() -> None:
-    """Episodes of 3 own steps repeated twice are 2 rows: a patience of 2 runs out just where they end by themselves."""
-    for patience, cut in ((3, False), (2, False), (1, True)):
-        environments = make_environments(_picture(patience=patience, action_repeat=2, kwargs={"end": 3}), 1)
+    """Episodes of 3 steps repeated twice are 2 rows: a no_reward_limit of 2 is reached just where they end."""
+    for no_reward_limit, cut in ((3, False), (2, False), (1, True)):
+        environments = make_environments(
+            _picture(no_reward_limit=no_reward_limit, action_repeat=2, kwargs={"end": 3}), 1
+        )
         environments.reset(1)
         rows = _rows(environments, [0] * 9)
-        assert any(row[3] for row in rows) == cut, patience
+        assert any(row[3] for row in rows) == cut, no_reward_limit
         assert any(row[2] for row in rows) != cut, "an end of the environment's own stays one"
 
 
 def test_a_second_reset_starts_everything_anew() -> None:
-    environments = make_environments(_picture(patience=3, kwargs={"end": 4}), 2)
+    environments = make_environments(_picture(no_reward_limit=3, kwargs={"end": 4}), 2)
     first = [environments.reset(7)]
     first += [environments.step(np.array([0, 2]))[0] for _ in range(2)]
     again = [environments.reset(7)]
@@ -121,7 +123,7 @@ def test_a_wrapper_comes_before_the_repeats() -> None:
     ],
 )
 def test_a_wrapper_that_is_none_is_told(wrap: str, reason: str) -> None:
-    with pytest.raises(UnplayableError, match=f"wrap {wrap}.*{reason}"):
+    with pytest.raises(EnvironmentSetupError, match=f"wrap {wrap}.*{reason}"):
         make_environments(_picture(), 1, wrap=wrap)
 
 
@@ -145,15 +147,15 @@ def test_what_shows_no_picture_cannot_be_filmed() -> None:
         def render(self) -> None:  # type: ignore[override] - what is wrong with it
             return None
 
-    with pytest.raises(UnplayableError, match="renders no picture, but NoneType"):
-        RepeatedSteps(Dark(), repeat=1, patience=None, camera=lambda _: None).reset()
+    with pytest.raises(EnvironmentSetupError, match="renders no picture, but NoneType"):
+        RepeatedSteps(Dark(), repeat=1, no_reward_limit=None, camera=lambda _: None).reset()
 
 
 # ------------------------------------------------------------------------------------------------- processes
 
 
 def test_processes_play_what_one_process_plays() -> None:
-    spec = _picture(action_repeat=2, patience=2, grey=True, crop=(1, 0, 0, 1), kwargs={"end": 9})
+    spec = _picture(action_repeat=2, no_reward_limit=2, grey=True, crop=(1, 0, 0, 1), kwargs={"end": 9})
     actions = np.random.default_rng(3).integers(0, 3, (25, 3))
     played = []
     for processes in (False, True):
@@ -169,7 +171,7 @@ def test_processes_play_what_one_process_plays() -> None:
 
 
 def _processes(**fields) -> EnvironmentProcesses:
-    return EnvironmentProcesses([MakeOne(spec=_counting(**fields))] * 2)
+    return EnvironmentProcesses([EnvironmentFactory(spec=_counting(**fields))] * 2)
 
 
 def test_closing_ends_the_processes() -> None:
@@ -201,7 +203,7 @@ def test_a_process_that_was_killed_is_told_and_the_others_end() -> None:
     environments.reset(seed=1)
     environments.processes[0].kill()
     environments.processes[0].join()
-    with pytest.raises(UnplayableError, match="has ended by itself"):
+    with pytest.raises(EnvironmentSetupError, match="has ended by itself"):
         environments.step(np.zeros(2, np.int64))
     environments.close()
     assert not any(process.is_alive() for process in environments.processes)
@@ -229,10 +231,10 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch: p
         raise gymnasium.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
 
     monkeypatch.setitem(gymnasium.registry, "Fails-v0", EnvSpec("Fails-v0", fails))
-    with pytest.raises(UnplayableError, match=r'pip install "daedalus-rl\[box2d\]"'):
+    with pytest.raises(EnvironmentSetupError, match=r'pip install "daedalus-rl\[box2d\]"'):
         make_environments(EnvironmentSpec(id="Fails-v0"), 1)
     monkeypatch.setitem(sys.modules, "ale_py", None)
-    with pytest.raises(UnplayableError, match=r'ALE/Pong-v5.*pip install "daedalus-rl\[atari\]"'):
+    with pytest.raises(EnvironmentSetupError, match=r'ALE/Pong-v5.*pip install "daedalus-rl\[atari\]"'):
         make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
 
 

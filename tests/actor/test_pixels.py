@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from daedalus.actor.environments.environment_errors import UnplayableError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.pixels import Pixels, crop, grey, resize
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -109,5 +109,5 @@ def test_a_transform_that_does_not_fit_is_named_beside_the_space(
     transform: dict, space: gymnasium.spaces.Box, reason: str
 ) -> None:
     name = next(iter(transform))
-    with pytest.raises(UnplayableError, match=rf"environment\.{name}.* observation space Box.*: .*{reason}"):
+    with pytest.raises(EnvironmentSetupError, match=rf"environment\.{name}.* observation space Box.*: .*{reason}"):
         Pixels(EnvironmentSpec(id="x", **transform), space)

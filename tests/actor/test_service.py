@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from processes import LIMIT, until
 
-from daedalus.actor.session import learner_link, service
+from daedalus.actor.session import learner_queries, service
 from daedalus.actor.session import upload_session as conversation
-from daedalus.actor.session.learner_link import ActorError
+from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
-from daedalus.learner.serving.compact_snapshot_cache import CompactDesk
+from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -21,23 +21,23 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.messages import (
     Acknowledgement,
-    Farewell,
     Join,
     Message,
     Program,
     Refusal,
     Rollout,
+    RunEnded,
     Snapshot,
     SnapshotRequest,
     Welcome,
 )
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, RunSpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, RunSpec, Spaces
 from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request, TransportError
 
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
 )
-SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ScriptedLearner:
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
-        self.transport.announce(keys.learner("r"))
+        self.transport.declare_presence(keys.learner("r"))
         self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
         self.transport.serve(keys.snapshots("r"), self._newest)
         self.transport.serve(keys.program("r", "*"), self._program)
@@ -85,7 +85,7 @@ class ScriptedLearner:
             return
         message = decode(request.payload, Limits())
         assert isinstance(message, SnapshotRequest)
-        request.reply(CompactDesk(self.epoch).answer(message, self.snapshot))
+        request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
 
     def _program(self, request: Request) -> None:
         model = self.policy.model
@@ -326,13 +326,13 @@ def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, acto
     assert any("went away" in text for text in actor.said)
 
 
-@pytest.mark.parametrize("how", ["farewell", "finished"])
+@pytest.mark.parametrize("how", ["run_ended", "finished"])
 def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
-    if how == "farewell":
-        learner.transport.publish(keys.snapshots("r"), encode(Farewell(learner_epoch=1, reason="solved")))
+    if how == "run_ended":
+        learner.transport.publish(keys.snapshots("r"), encode(RunEnded(learner_epoch=1, reason="solved")))
         acknowledge(request, "accepted")
     else:
         acknowledge(request, "finished")
@@ -428,7 +428,7 @@ def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to
 
 
 def test_while_nobody_answers_it_tries_other_sessions(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learner_link, "_REOPEN_SECONDS", 0.0)
+    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
     reopened = threading.Semaphore(0)
 
     def reopen(transport: MemoryTransport) -> bool:

@@ -8,7 +8,7 @@ from building import ENVIRONMENTS, ROWS, join, make_rollouts
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.minibatches import Sample, minibatches
+from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.returns import Targets
 
 WIDTH = 2 * ENVIRONMENTS
@@ -22,10 +22,10 @@ class Numbered:
     numbers: Tensor  # [T, B]
     targets: Targets
 
-    def pass_of(self, count: int) -> list[Sample]:
+    def pass_of(self, count: int) -> list[Minibatch]:
         return list(minibatches(self.batch, self.numbers, self.targets, count))
 
-    def assert_holds(self, sample: Sample) -> None:
+    def assert_holds(self, sample: Minibatch) -> None:
         """Every row of a sample is the batch's row of that number."""
         for row, column in torch.cartesian_prod(*map(torch.arange, sample.log_probs.shape)).tolist():
             t, b = divmod(int(sample.log_probs[row, column]), WIDTH)

@@ -11,7 +11,7 @@ from processes import LIMIT, until
 
 from daedalus.bridge import connection as client_module
 from daedalus.bridge import service as service_module
-from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Parcel, encode
+from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Packet, encode_packet
 from daedalus.bridge.service import Bridge
 from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Transport, TransportError
 
@@ -143,8 +143,8 @@ def test_a_client_that_reads_late_gets_the_newest_news_and_no_pile(scene: Scene)
 
 def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> None:
     present: dict[str, bool] = {}
-    scene.end.watch("daedalus/r/actors/*", present.__setitem__)
-    scene.end.announce("daedalus/r/learner")
+    scene.end.watch_presence("daedalus/r/actors/*", present.__setitem__)
+    scene.end.declare_presence("daedalus/r/learner")
     caller = scene.call()
     caller.send(Kind.WATCH, 1, "daedalus/r/learner")
     assert caller.next() == (Kind.PRESENT, 1, "daedalus/r/learner", b"")
@@ -153,14 +153,14 @@ def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> No
     scene.end.close()
     assert caller.next() == (Kind.ABSENT, 1, "daedalus/r/learner", b"")
     watcher = MemoryTransport(scene.network)
-    watcher.watch("daedalus/r/actors/*", present.__setitem__)
+    watcher.watch_presence("daedalus/r/actors/*", present.__setitem__)
     caller.socket.close()
     until(lambda: present.get("daedalus/r/actors/wing") is False)
     until(lambda: len(scene.network.ends) == 1)
 
 
 @pytest.mark.parametrize(
-    ("parcel", "complaint"),
+    ("packet", "complaint"),
     [
         (HEADER.pack(0, 9, 0, 0, 1), "kind 9"),
         (HEADER.pack(MAX_QUESTION_BYTES + 1, Kind.QUERY, 16, 0, 1), "the limit is"),
@@ -173,9 +173,9 @@ def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> No
     ],
     ids=str,
 )
-def test_what_is_no_parcel_is_named_and_ends_the_connection(scene: Scene, parcel: bytes, complaint: str) -> None:
+def test_what_is_no_parcel_is_named_and_ends_the_connection(scene: Scene, packet: bytes, complaint: str) -> None:
     caller = scene.call()
-    caller.socket.sendall(parcel)
+    caller.socket.sendall(packet)
     kind, _, _, reason = caller.next()
     assert kind == Kind.ERROR
     assert complaint in reason.decode()
@@ -197,7 +197,7 @@ def test_who_stops_within_a_parcel_is_given_up(scene: Scene, monkeypatch: pytest
     caller = scene.call()
     caller.send(Kind.QUERY, 1, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
-    threading.Event().wait(0.3)  # silence between two parcels is no fault
+    threading.Event().wait(0.3)  # silence between two packets is no fault
     caller.send(Kind.QUERY, 2, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
     caller.socket.sendall(HEADER.pack(1000, Kind.QUERY, 17, 0, 1))
@@ -269,5 +269,5 @@ def test_told_to_stop_it_ends_its_clients_and_their_presence(scene: Scene) -> No
 
 
 def test_a_parcel_is_its_header_key_and_payload() -> None:
-    parcel = Parcel(Kind.QUERY, 258, "daedalus/r/join", timeout=5.0, payload=b"abc")
-    assert encode(parcel) == bytes.fromhex("03000000 01 0f 8813 02010000") + b"daedalus/r/joinabc"
+    packet = Packet(Kind.QUERY, 258, "daedalus/r/join", timeout=5.0, payload=b"abc")
+    assert encode_packet(packet) == bytes.fromhex("03000000 01 0f 8813 02010000") + b"daedalus/r/joinabc"

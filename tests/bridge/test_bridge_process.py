@@ -8,7 +8,7 @@ import pytest
 from certificates import make_certificates
 from processes import LIMIT, Running, until
 
-from daedalus.bridge.packets import GREETING, Kind, Parcel, encode
+from daedalus.bridge.packets import GREETING, Kind, Packet, encode_packet
 from daedalus.transport.credentials import load
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import listen
@@ -33,12 +33,12 @@ def test_told_to_stop_it_ends_with_a_question_open_and_leaves_no_presence(
 ) -> None:
     present: dict[str, bool] = {}
     held = []
-    router.watch("daedalus/r/actors/*/*", present.__setitem__)
+    router.watch_presence("daedalus/r/actors/*/*", present.__setitem__)
     router.serve("daedalus/r/status", held.append)
     bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
     with client_of(bridge) as client:
-        client.sendall(GREETING + encode(Parcel(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing/7")))
-        client.sendall(encode(Parcel(Kind.QUERY, 2, "daedalus/r/status", timeout=60.0)))
+        client.sendall(GREETING + encode_packet(Packet(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing/7")))
+        client.sendall(encode_packet(Packet(Kind.QUERY, 2, "daedalus/r/status", timeout=60.0)))
         until(lambda: held and present.get("daedalus/r/actors/wing/7"))
         bridge.process.terminate()
         assert bridge.wait() == 0, bridge.output
@@ -47,10 +47,10 @@ def test_told_to_stop_it_ends_with_a_question_open_and_leaves_no_presence(
 
 def test_a_client_that_is_killed_is_absent(start: Start, address: str, router: Transport) -> None:
     present: dict[str, bool] = {}
-    router.watch("daedalus/r/actors/*/*", present.__setitem__)
+    router.watch_presence("daedalus/r/actors/*/*", present.__setitem__)
     bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
     with client_of(bridge) as client:
-        client.sendall(GREETING + encode(Parcel(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing/7")))
+        client.sendall(GREETING + encode_packet(Packet(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing/7")))
         until(lambda: present.get("daedalus/r/actors/wing/7"))
     until(lambda: present["daedalus/r/actors/wing/7"] is False)
     bridge.expect(" went")
@@ -77,20 +77,24 @@ def test_over_tls_a_client_is_who_the_certificate_says(start: Start, address: st
     router = listen([tls], credentials=load(certificates / "router", "router"))
     try:
         present: dict[str, bool] = {}
-        router.watch("daedalus/r/actors/*/*", present.__setitem__)
+        router.watch_presence("daedalus/r/actors/*/*", present.__setitem__)
         router.serve("daedalus/r/rollouts/*", lambda request: request.reply(b"accepted"))
         identity = ("--tls", certificates / "actor-arm")
         bridge = start("bridge", "--connect", tls, *identity, "--listen", "tcp/127.0.0.1:0")
         with client_of(bridge) as client:
             client.sendall(GREETING)
             for number, name in enumerate(("box", "arm.1")):
-                client.sendall(encode(Parcel(Kind.ANNOUNCE, number, f"daedalus/r/actors/{name}/7")))
-                client.sendall(encode(Parcel(Kind.QUERY, number, f"daedalus/r/rollouts/{name}", timeout=5.0)))
-            expected = (GREETING, encode(Parcel(Kind.ANSWER, 1, payload=b"accepted")), encode(Parcel(Kind.END, 1)))
+                client.sendall(encode_packet(Packet(Kind.ANNOUNCE, number, f"daedalus/r/actors/{name}/7")))
+                client.sendall(encode_packet(Packet(Kind.QUERY, number, f"daedalus/r/rollouts/{name}", timeout=5.0)))
+            expected = (
+                GREETING,
+                encode_packet(Packet(Kind.ANSWER, 1, payload=b"accepted")),
+                encode_packet(Packet(Kind.END, 1)),
+            )
             received = b""
             while not all(part in received for part in expected):
                 received += client.recv(4096)
-            assert encode(Parcel(Kind.ANSWER, 0, payload=b"accepted")) not in received
+            assert encode_packet(Packet(Kind.ANSWER, 0, payload=b"accepted")) not in received
             until(lambda: present.get("daedalus/r/actors/arm.1/7"))
             assert "daedalus/r/actors/box/7" not in present
     finally:

@@ -20,7 +20,7 @@ def actor_status(name: str, **changes: Any) -> ActorStatus:
         "rollouts_missed": 0,
         "busy_answers": 0,
         "policy_lag": 1,
-        "slow_link": False,
+        "compact_snapshots": False,
         "bytes_up_per_hour": 7200.0,
         "bytes_down_per_hour": 3600.0,
     }

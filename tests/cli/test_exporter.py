@@ -57,7 +57,7 @@ def test_a_failing_transport_is_no_learner(collector: StatusCollector, monkeypat
     def fail(*_arguments: object, **_options: object) -> list[bytes]:
         raise TransportError("closed")
 
-    monkeypatch.setattr(collector.transport, "ask", fail)
+    monkeypatch.setattr(collector.transport, "query", fail)
     assert up(collector) == 0.0
 
 

@@ -25,7 +25,7 @@ from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
-from daedalus.protocol.spec import ChoiceSpace, EnvironmentSpec, RunSpec
+from daedalus.protocol.spec import DiscreteSpace, EnvironmentSpec, RunSpec
 
 Start = Callable[..., Running]
 
@@ -147,7 +147,7 @@ def test_another_backend_can_be_played(tmp_path: Path, evaluate: Callable[..., d
 
 
 def test_spaces_that_differ_from_the_policys_are_named(tmp_path: Path, refused: Callable[..., str]) -> None:
-    spaces = make_environments(CARTPOLE, 1).spaces.model_copy(update={"action": ChoiceSpace(count=3)})
+    spaces = make_environments(CARTPOLE, 1).spaces.model_copy(update={"action": DiscreteSpace(count=3)})
     run = save(tmp_path / "run", CARTPOLE, 1, spaces=spaces)
     line = refused(1, run, "--episodes", 1)
     assert "gymnasium's CartPole-v1 has observation: float32 array of shape (4,); action: 2 choices" in line
@@ -246,7 +246,7 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
 
 
 def test_the_car_that_ships_drives(evaluate: Callable[..., dict]) -> None:
-    result = evaluate("--pretrained", "car_racing", "--backend", "sketch", "--episodes", 4)
+    result = evaluate("--pretrained", "car_racing", "--backend", "fast", "--episodes", 4)
     assert result["return_mean"] > 600  # 905 over 100; one that stands still has -100
 
 
@@ -267,7 +267,7 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
     assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
-    assert evaluation["run_off"] == []
+    assert evaluation["select_best"] == []
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
     train_command._report(run, spec)
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in capsys.readouterr().out
@@ -285,7 +285,7 @@ def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, eval
     assert train_command._evaluate(run, spec, None, threading.Event())
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
-    scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["run_off"]]
+    scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
     assert [version for version, _ in scores] == [newest, worst]
     assert evaluate(run, "--episodes", 1)["policy_version"] == newest
     assert not (run / "checkpoints" / f"best_499.0_{worst:010d}").exists()

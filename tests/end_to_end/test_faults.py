@@ -294,9 +294,9 @@ def test_bytes_of_any_kind_on_any_key_change_nothing(
                 keys.snapshots(run),
                 keys.status(run),
             ):
-                assert len(sender.transport.ask(key, payload, timeout=LIMIT)) == 1
+                assert len(sender.transport.query(key, payload, timeout=LIMIT)) == 1
             sender.transport.publish(keys.snapshots(run), payload)
-        sender.transport.announce(keys.presence(run, "nobody-ever-joined", 1))
+        sender.transport.declare_presence(keys.presence(run, "nobody-ever-joined", 1))
         plays_on(status, "good")
     finally:
         sender.close()
@@ -322,7 +322,7 @@ def test_more_than_the_learner_can_take_is_answered_busy_and_nothing_accepted_is
         version = sender.version()
         for sequence in range(200):
             payload = sender.rollout(sequence, version)
-            sender.transport.send(sender.key, payload, timeout=LIMIT, on_answer=verdicts.append)
+            sender.transport.query_async(sender.key, payload, timeout=LIMIT, on_answer=verdicts.append)
         until(lambda: len(verdicts) == 200)
         assert None not in verdicts
         told = actor_status(status(), "flood")

@@ -9,11 +9,11 @@ from processes import Running, until
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
 from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect, listen
 
-CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2))
+CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 Start = Callable[..., Running]
 
 
@@ -24,7 +24,7 @@ def stranger(start: Start, address: str) -> Iterator[Transport]:
     learner.expect("actors join with")
     transport = connect([address])
     try:
-        until(lambda: transport.ask(keys.join("run"), timeout=30.0))  # the last key that is served
+        until(lambda: transport.query(keys.join("run"), timeout=30.0))  # the last key that is served
         yield transport
         assert learner.process.poll() is None, learner.output
     finally:
@@ -32,7 +32,7 @@ def stranger(start: Start, address: str) -> Iterator[Transport]:
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
-    (answer,) = transport.ask(key, payload, timeout=30.0)
+    (answer,) = transport.query(key, payload, timeout=30.0)
     return decode(answer, Limits())
 
 
@@ -53,7 +53,7 @@ def test_another_protocol_version_is_refused_with_both_named(stranger: Transport
 def test_mismatching_spaces_are_refused_with_both_named(stranger: Transport) -> None:
     first = ask(stranger, keys.join("*"), join(spaces=CARTPOLE, environments=2))
     assert isinstance(first, Welcome)
-    other = CARTPOLE.model_copy(update={"action": ChoiceSpace(count=3)})
+    other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
     answer = ask(stranger, keys.join("run"), join(spaces=other, environments=2))
     assert isinstance(answer, Refusal)
     assert "3 choices" in answer.reason
@@ -101,7 +101,7 @@ def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address:
     try:
         first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
         first.expect("actors join with")
-        until(lambda: router.ask(keys.join("run"), timeout=30.0))
+        until(lambda: router.query(keys.join("run"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
         assert second.wait() == 1
         second.expect("another learner serves run 'run' there already: stop it, or name this one otherwise")
@@ -111,7 +111,7 @@ def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address:
 
 
 def test_a_refused_actor_says_why_and_ends(start: Start, stranger: Transport, address: str) -> None:
-    other = CARTPOLE.model_copy(update={"action": ChoiceSpace(count=3)})
+    other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
     ask(stranger, keys.join("run"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1

@@ -12,7 +12,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime, program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
-from daedalus.protocol.messages import Acknowledgement, Farewell, Join, Program, Refusal, Rollout, Snapshot, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Program, Refusal, Rollout, RunEnded, Snapshot, Welcome
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
 from daedalus.transport.interface import MemoryTransport, Request
 
@@ -37,8 +37,8 @@ class CloseLook:
         self.present: dict[tuple[str, int] | None, bool] = {}
         self._transport = transport
         self.model, self.weights = b"", {}
-        transport.announce(keys.learner("r"))
-        transport.watch(keys.presence("r", "*", "*"), self._on_presence)
+        transport.declare_presence(keys.learner("r"))
+        transport.watch_presence(keys.presence("r", "*", "*"), self._on_presence)
         transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot()))
         transport.serve(keys.program("r", "*"), lambda request: request.reply(self._program()))
         transport.serve(keys.rollouts("r", "*"), self._on_rollout)
@@ -61,13 +61,13 @@ class CloseLook:
         self._transport.publish(keys.snapshots("r"), news)
 
     def bid_farewell(self) -> None:
-        self.push(encode(Farewell(learner_epoch=self.epoch, reason="enough")))
+        self.push(encode(RunEnded(learner_epoch=self.epoch, reason="enough")))
 
     def _program(self) -> bytes:
         return encode(Program(hash=program_hash(self.model), model=np.frombuffer(self.model, np.uint8)))
 
     def _on_presence(self, key: str, present: bool) -> None:
-        self.present[keys.who_is_present(key)] = present
+        self.present[keys.parse_presence(key)] = present
 
     def _on_join(self, request: Request) -> None:
         join = decode(request.payload, Limits())

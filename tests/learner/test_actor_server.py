@@ -11,7 +11,7 @@ from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_sp
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.actor_server import Reception
+from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol import keys
 from daedalus.protocol.codec import Limits, decode, encode
@@ -19,10 +19,10 @@ from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
     Join,
     Message,
     Refusal,
+    RunEnded,
     Snapshot,
 )
 from daedalus.protocol.spec import RunSpec, RunStatus
@@ -41,14 +41,12 @@ def no_status(fleet: Fleet) -> RunStatus:
     raise AssertionError("nobody asked for it")
 
 
-def made(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> Reception:
+def made(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> ActorServer:
     """One that is open."""
     transport = MemoryTransport(network)
-    reception = Reception(
-        "r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
-    )
-    reception.open()
-    return reception
+    server = ActorServer("r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
+    server.open()
+    return server
 
 
 @pytest.fixture
@@ -57,7 +55,7 @@ def network() -> MemoryNetwork:
 
 
 @pytest.fixture
-def reception(network: MemoryNetwork) -> Iterator[Reception]:
+def server(network: MemoryNetwork) -> Iterator[ActorServer]:
     opened = made(network, run_spec(), RunCounters(10))
     yield opened
     opened.close("the test is over")
@@ -70,27 +68,27 @@ def test_rollouts_of_the_version_that_a_batch_makes_are_welcome_as_soon_as_it_is
     """The snapshot of that version may be played before the next batch is complete."""
     counters = RunCounters(10)
     spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
-    reception = made(network, spec, counters)
+    server = made(network, spec, counters)
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
 
     def verdict(sequence: int, version: int) -> str:
         rollout = make_rollout(identity("a", sequence), version=version)
-        (answer,) = actor.ask(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        (answer,) = actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         acknowledgement = decode(answer, Limits())
         assert isinstance(acknowledgement, Acknowledgement)
         return acknowledgement.verdict
 
     try:
-        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
         assert verdict(0, version=1) == "rejected"
         assert verdict(1, version=0) == "accepted"
-        assert len(reception.take_batch(0)) == 1
+        assert len(server.take_batch(0)) == 1
         assert verdict(2, version=updates + 1) == "rejected"
         assert verdict(3, version=updates) == "accepted"
-        assert len(reception.take_batch(updates)) == 1
+        assert len(server.take_batch(updates)) == 1
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
     assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
 
 
@@ -106,52 +104,52 @@ class Asker:
             if answer is not None:  # None: the test took it and forgot it
                 self.answers.append(decode(answer, Limits()))
 
-        self._transport.send(keys.evaluations("r", evaluator), payload, timeout=1.0, on_answer=on_answer)
+        self._transport.query_async(keys.evaluations("r", evaluator), payload, timeout=1.0, on_answer=on_answer)
 
 
 @pytest.fixture
-def asker(network: MemoryNetwork, reception: Reception) -> Asker:
+def asker(network: MemoryNetwork, server: ActorServer) -> Asker:
     return Asker(network)
 
 
-def offer_policy(reception: Reception) -> None:
-    reception.offer_program(b"program", 0)
-    reception.publish(3, {"w": np.zeros(2, np.float32)})
+def offer_policy(server: ActorServer) -> None:
+    server.offer_program(b"program", 0)
+    server.publish(3, {"w": np.zeros(2, np.float32)})
 
 
 def codes(asker: Asker) -> list[str]:
     return [answer.code for answer in asker.answers if isinstance(answer, Refusal)]
 
 
-def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(reception: Reception, asker: Asker) -> None:
-    offer_policy(reception)
+def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(server: ActorServer, asker: Asker) -> None:
+    offer_policy(server)
     asker.send(encode(EvaluationRequest(evaluator="e")))
     asker.send(encode(REPORT))
     assert asker.answers == []
-    (first, asked), (_, told) = reception.take_evaluations()
+    (first, asked), (_, told) = server.take_evaluations()
     assert asked == EvaluationRequest(evaluator="e")
     assert isinstance(told, EvaluationReport)
-    assert reception.take_evaluations() == []
-    first.reply(reception.newest_snapshot())
+    assert server.take_evaluations() == []
+    first.reply(server.newest_snapshot())
     (answer,) = asker.answers
     assert isinstance(answer, Snapshot)
     assert answer.policy_version == 3
 
 
-def test_before_there_is_a_policy_nothing_can_be_evaluated(reception: Reception, asker: Asker) -> None:
+def test_before_there_is_a_policy_nothing_can_be_evaluated(server: ActorServer, asker: Asker) -> None:
     asker.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(asker) == ["not_ready"]
-    assert reception.take_evaluations() == []
+    assert server.take_evaluations() == []
 
 
-def test_evaluators_beyond_measure_are_told_to_ask_later(reception: Reception, asker: Asker) -> None:
-    offer_policy(reception)
+def test_evaluators_beyond_measure_are_told_to_ask_later(server: ActorServer, asker: Asker) -> None:
+    offer_policy(server)
     for _ in range(64):
         asker.send(encode(EvaluationRequest(evaluator="e")))
     assert asker.answers == []
     asker.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(asker) == ["not_ready"]
-    assert len(reception.take_evaluations()) == 64
+    assert len(server.take_evaluations()) == 64
 
 
 @pytest.mark.parametrize(
@@ -159,23 +157,21 @@ def test_evaluators_beyond_measure_are_told_to_ask_later(reception: Reception, a
     [
         b"",
         b"\xff" * 100,
-        encode(Farewell(learner_epoch=EPOCH, reason="")),
+        encode(RunEnded(learner_epoch=EPOCH, reason="")),
         encode(EvaluationRequest(evaluator="f")),
         encode(EvaluationRequest(evaluator="")),
     ],
     ids=["empty", "noise", "another message", "another's name", "no name"],
 )
-def test_what_is_no_question_of_an_evaluators_own_is_refused(
-    reception: Reception, asker: Asker, payload: bytes
-) -> None:
-    offer_policy(reception)
+def test_what_is_no_question_of_an_evaluators_own_is_refused(server: ActorServer, asker: Asker, payload: bytes) -> None:
+    offer_policy(server)
     asker.send(payload)
     assert codes(asker) == ["malformed"]
-    assert reception.take_evaluations() == []
+    assert server.take_evaluations() == []
 
 
-def test_a_report_beyond_measure_is_refused(reception: Reception, asker: Asker) -> None:
-    offer_policy(reception)
+def test_a_report_beyond_measure_is_refused(server: ActorServer, asker: Asker) -> None:
+    offer_policy(server)
     many = 200_000
     asker.send(
         encode(
@@ -191,16 +187,16 @@ def test_a_report_beyond_measure_is_refused(reception: Reception, asker: Asker) 
     assert codes(asker) == ["malformed"]
 
 
-def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(reception: Reception, asker: Asker) -> None:
-    offer_policy(reception)
+def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(server: ActorServer, asker: Asker) -> None:
+    offer_policy(server)
     asker.send(encode(EvaluationRequest(evaluator="e")))
-    reception.close("solved")
+    server.close("solved")
     asker.send(encode(REPORT))
     assert codes(asker) == ["finished", "finished"]
 
 
-def test_many_at_once_are_all_held(reception: Reception, network: MemoryNetwork) -> None:
-    offer_policy(reception)
+def test_many_at_once_are_all_held(server: ActorServer, network: MemoryNetwork) -> None:
+    offer_policy(server)
     askers = [Asker(network) for _ in range(16)]
     threads = [
         threading.Thread(target=asker.send, args=(encode(EvaluationRequest(evaluator=f"e{number}")), f"e{number}"))
@@ -210,7 +206,7 @@ def test_many_at_once_are_all_held(reception: Reception, network: MemoryNetwork)
         thread.start()
     for thread in threads:
         thread.join()
-    taken = {message.evaluator for _, message in reception.take_evaluations()}
+    taken = {message.evaluator for _, message in server.take_evaluations()}
     assert taken == {f"e{number}" for number in range(16)}
 
 
@@ -231,44 +227,44 @@ def test_a_reception_that_hears_nobody_has_its_session_reopened(
 ) -> None:
     monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 0.02)
     transport, counters = Silent(network), RunCounters(10)
-    reception = Reception(
+    server = ActorServer(
         "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
     )
-    reception.open()
+    server.open()
     try:
         for _ in range(3):
             assert transport.reopened.get(timeout=LIMIT) == keys.status("r")
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
 
 
 def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 1000.0)
-    reception = made(network, run_spec(), RunCounters(10))
+    server = made(network, run_spec(), RunCounters(10))
     try:
-        before = reception._heard_at
-        MemoryTransport(network).ask(keys.snapshots("r"), timeout=LIMIT)
-        assert reception._heard_at > before
+        before = server._heard_at
+        MemoryTransport(network).query(keys.snapshots("r"), timeout=LIMIT)
+        assert server._heard_at > before
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
 
 
 def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(network: MemoryNetwork) -> None:
     counters = RunCounters(10)
-    reception = made(network, run_spec(actors=2, max_policy_lag=0), counters)
+    server = made(network, run_spec(actors=2, max_policy_lag=0), counters)
     actor = MemoryTransport(network)
     try:
-        actor.ask(
+        actor.query(
             keys.join("r"),
             encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)),
             timeout=LIMIT,
         )
-        actor.ask(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
-        del reception.fleet.actors["a"]
-        assert reception.take_batch(5) == []
+        actor.query(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
+        del server.fleet.actors["a"]
+        assert server.take_batch(5) == []
         assert counters.rollouts_rejected == {"stale": 1}
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
 
 
 @pytest.mark.parametrize(
@@ -286,39 +282,39 @@ def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
     """The buffer holds a batch, one is being judged, and the queue what can still be learned from after them."""
     counters = RunCounters(10)
     spec = run_spec(actors=2, **training)
-    reception = made(network, spec, counters)
+    server = made(network, spec, counters)
     actor = MemoryTransport(network)
     answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
         join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actor.ask(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
         held = max(spec.training.batch_rollouts or 2, 2)
         for sequence in range(held + 1):
             payload = encode(make_rollout(identity("a", sequence)))
-            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
-        until(lambda: counters.rollouts_accepted == held and reception.queue_bytes == 0)
+            actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+        until(lambda: counters.rollouts_accepted == held and server.queue_bytes == 0)
         for sequence in range(held + 1, held + most + 3):
             payload = encode(make_rollout(identity("a", sequence)))
-            actor.send(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
+            actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
         told = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
         verdicts = [message.verdict for message in told if isinstance(message, Acknowledgement)]
         assert verdicts == ["accepted"] * held + ["busy"] * 2
         assert answers.empty()
-        assert reception.fleet.actors["a"].busy == 2
+        assert server.fleet.actors["a"].busy == 2
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
 
 
 # ------------------------------------------------------------------------------------- how often it publishes
 
 
-def with_fleet(network: MemoryNetwork, reception: Reception, count: int) -> MemoryTransport:
+def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> MemoryTransport:
     """So many actors that take part."""
     actors = MemoryTransport(network)
     for number in range(count):
         join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actors.ask(keys.join("r"), encode(join), timeout=LIMIT)
-        actors.announce(keys.presence("r", f"a{number}", 1))
+        actors.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actors.declare_presence(keys.presence("r", f"a{number}", 1))
     return actors
 
 
@@ -327,46 +323,46 @@ def with_fleet(network: MemoryNetwork, reception: Reception, count: int) -> Memo
     [(1, [1, 2, 3, 4, 5, 6]), (4, [1, 2, 3, 4, 5, 6]), (8, [2, 4, 6]), (12, [3, 6]), (40, [])],
 )
 def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
-    network: MemoryNetwork, reception: Reception, count: int, published: list[int]
+    network: MemoryNetwork, server: ActorServer, count: int, published: list[int]
 ) -> None:
-    actors = with_fleet(network, reception, count)
+    actors = with_fleet(network, server, count)
     news: list[int] = []
-    inbox = actors.follow(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
+    inbox = actors.subscribe(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
     for version in range(1, 7):
-        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
     assert news == published
-    assert reception.published_version == (published or [0])[-1]
+    assert server.published_version == (published or [0])[-1]
 
 
 def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
-    network: MemoryNetwork, reception: Reception
+    network: MemoryNetwork, server: ActorServer
 ) -> None:
-    with_fleet(network, reception, 400)
+    with_fleet(network, server, 400)
     published = set()
     for version in range(1, 41):  # of 32 batches at most
-        reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
-        published.add(reception.published_version)
+        server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        published.add(server.published_version)
     assert published == {0, 8, 16, 24, 32, 40}
 
 
 def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> None:
-    reception = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
+    server = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
     try:
-        with_fleet(network, reception, 40)
+        with_fleet(network, server, 40)
         for version in (1, 2):
-            reception.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
-            assert reception.published_version == version
+            server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            assert server.published_version == version
     finally:
-        reception.close("the test is over")
+        server.close("the test is over")
 
 
-def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, reception: Reception) -> None:
+def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, server: ActorServer) -> None:
     """Of one that is not published an actor would ask for in vain."""
-    offer_policy(reception)
-    actors = with_fleet(network, reception, 40)
-    reception.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    offer_policy(server)
+    actors = with_fleet(network, server, 40)
+    server.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
     rollout = make_rollout(identity("a0", 0), version=0)
-    (answer,) = actors.ask(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
+    (answer,) = actors.query(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
     acknowledgement = decode(answer, Limits())
     assert isinstance(acknowledgement, Acknowledgement)
     assert (acknowledgement.verdict, acknowledgement.policy_version) == ("accepted", 3)

@@ -167,7 +167,7 @@ def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
             raise OSError(errno.ENOSPC, "No space left on device")
         fsync(descriptor)
 
-    monkeypatch.setattr("policy.sealed.os.fsync", filling)
+    monkeypatch.setattr("daedalus.policy.saving.sealed.os.fsync", filling)
     with pytest.raises(OSError, match="No space left"):
         save(tmp_path, version, keep=1, counters={})
     monkeypatch.undo()
@@ -189,7 +189,7 @@ def test_a_rename_that_fails_leaves_the_last_good_one_and_nothing_else(
             raise OSError(errno.EIO, "Input/output error")
         rename(source, target)
 
-    monkeypatch.setattr("policy.sealed.os.replace", refusing)
+    monkeypatch.setattr("daedalus.policy.saving.sealed.os.replace", refusing)
     with pytest.raises(OSError, match="Input/output"):
         save(tmp_path, version, keep=1, counters={})
     monkeypatch.undo()

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from daedalus.learner.serving import compact_snapshot_cache as compact_desk
-from daedalus.learner.serving.compact_snapshot_cache import PART_BYTES, CompactDesk
+from daedalus.learner.serving import compact_snapshot_cache as compact_cache
+from daedalus.learner.serving.compact_snapshot_cache import PART_BYTES, CompactSnapshotCache
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.compact import bfloat16, bits_of, float32
 from daedalus.protocol.messages import (
     CompactSnapshot,
-    Farewell,
     Message,
     Refusal,
+    RunEnded,
     Snapshot,
     SnapshotPart,
     SnapshotRequest,
@@ -33,18 +33,18 @@ def weights_of(encoded: bytes) -> dict[str, np.ndarray]:
     return message.weights
 
 
-def ask(desk: CompactDesk, newest: bytes, actor: str = "a", **fields: int | None) -> Message:
+def ask(cache: CompactSnapshotCache, newest: bytes, actor: str = "a", **fields: int | None) -> Message:
     request = SnapshotRequest(actor=actor, **{"held_version": None, **fields})  # type: ignore[arg-type] - its fields
-    return decode(desk.answer(request, newest), Limits())
+    return decode(cache.answer(request, newest), Limits())
 
 
-def fetch(desk: CompactDesk, newest: bytes, held: int | None = None, actor: str = "a") -> CompactSnapshot:
+def fetch(cache: CompactSnapshotCache, newest: bytes, held: int | None = None, actor: str = "a") -> CompactSnapshot:
     """All parts, put together."""
-    first = ask(desk, newest, actor, held_version=held)
+    first = ask(cache, newest, actor, held_version=held)
     assert isinstance(first, SnapshotPart)
     parts = [first]
     for number in range(1, first.parts):
-        part = ask(desk, b"not looked at", actor, held_version=held, policy_version=first.policy_version, part=number)
+        part = ask(cache, b"not looked at", actor, held_version=held, policy_version=first.policy_version, part=number)
         assert isinstance(part, SnapshotPart)
         assert (part.part, part.parts, part.policy_version) == (number, first.parts, first.policy_version)
         parts.append(part)
@@ -55,17 +55,17 @@ def fetch(desk: CompactDesk, newest: bytes, held: int | None = None, actor: str 
 
 
 def test_who_holds_nothing_gets_the_whole_in_bfloat16() -> None:
-    compact = fetch(CompactDesk(5), snapshot(3))
+    compact = fetch(CompactSnapshotCache(5), snapshot(3))
     assert (compact.learner_epoch, compact.policy_version, compact.program, compact.base_version) == (5, 3, "p", None)
     for name, array in float32(bits_of(compact.weights, None)).items():
         np.testing.assert_allclose(array, weights_of(snapshot(3))[name], rtol=2**-8)
 
 
 def test_who_holds_a_version_gets_the_difference_to_it_and_that_is_small() -> None:
-    desk = CompactDesk(5)
-    whole = fetch(desk, snapshot(3))
+    cache = CompactSnapshotCache(5)
+    whole = fetch(cache, snapshot(3))
     held = bits_of(whole.weights, None)
-    change = fetch(desk, snapshot(4), held=3)
+    change = fetch(cache, snapshot(4), held=3)
     assert change.base_version == 3
     expected = bfloat16(weights_of(snapshot(4)))
     for name, array in bits_of(change.weights, held).items():
@@ -75,64 +75,64 @@ def test_who_holds_a_version_gets_the_difference_to_it_and_that_is_small() -> No
 
 @pytest.mark.parametrize("held", [2, 99])
 def test_a_version_that_nobody_was_given_here_is_no_base(held: int) -> None:
-    desk = CompactDesk(5)
-    fetch(desk, snapshot(3))
-    assert fetch(desk, snapshot(4), held=held).base_version is None
+    cache = CompactSnapshotCache(5)
+    fetch(cache, snapshot(3))
+    assert fetch(cache, snapshot(4), held=held).base_version is None
 
 
 def test_a_difference_larger_than_the_whole_is_not_sent() -> None:
-    desk = CompactDesk(5)
-    fetch(desk, snapshot(3))
+    cache = CompactSnapshotCache(5)
+    fetch(cache, snapshot(3))
     noise = {name: RANDOM.normal(size=array.shape).astype(np.float32) for name, array in FIRST.items()}
     other = encode(Snapshot(learner_epoch=5, policy_version=4, program="p", weights=noise))
-    compact = fetch(desk, other, held=3)
+    compact = fetch(cache, other, held=3)
     assert compact.base_version is None
     np.testing.assert_array_equal(bits_of(compact.weights, None)["w"], bfloat16(noise)["w"])
 
 
 def test_two_who_hold_the_same_have_it_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    desk, made = CompactDesk(5), []
-    encoded = compact_desk._encoded
-    monkeypatch.setattr(compact_desk, "_encoded", lambda *arguments: made.append(1) or encoded(*arguments))
+    cache, made = CompactSnapshotCache(5), []
+    encoded = compact_cache._encoded
+    monkeypatch.setattr(compact_cache, "_encoded", lambda *arguments: made.append(1) or encoded(*arguments))
     for actor in "abc":
-        fetch(desk, snapshot(3), actor=actor)
+        fetch(cache, snapshot(3), actor=actor)
     assert len(made) == 1
-    fetch(desk, snapshot(4), held=3)
+    fetch(cache, snapshot(4), held=3)
     assert len(made) == 2
 
 
 def test_parts_stay_those_of_one_version_while_newer_ones_come() -> None:
-    desk = CompactDesk(5)
-    first = ask(desk, snapshot(3))
+    cache = CompactSnapshotCache(5)
+    first = ask(cache, snapshot(3))
     assert isinstance(first, SnapshotPart)
     assert first.parts > 2
-    ask(desk, snapshot(4), "b")
-    second = ask(desk, snapshot(4), policy_version=3, part=1)
+    ask(cache, snapshot(4), "b")
+    second = ask(cache, snapshot(4), policy_version=3, part=1)
     assert isinstance(second, SnapshotPart)
     assert second.policy_version == 3
 
 
 @pytest.mark.parametrize(("version", "part"), [(4, 1), (3, 10**6)])
 def test_what_is_not_there_any_more_is_refused(version: int, part: int) -> None:
-    desk = CompactDesk(5)
-    ask(desk, snapshot(3))
-    answer = ask(desk, snapshot(3), policy_version=version, part=part)
+    cache = CompactSnapshotCache(5)
+    ask(cache, snapshot(3))
+    answer = ask(cache, snapshot(3), policy_version=version, part=part)
     assert isinstance(answer, Refusal)
     assert answer.code == "unknown"
 
 
 @pytest.mark.parametrize(
-    "instead", [Refusal(code="not_ready", reason="no policy yet"), Farewell(learner_epoch=5, reason="over")]
+    "instead", [Refusal(code="not_ready", reason="no policy yet"), RunEnded(learner_epoch=5, reason="over")]
 )
 def test_what_is_said_instead_of_a_snapshot_is_passed_on(instead: Message) -> None:
-    assert ask(CompactDesk(5), encode(instead)) == instead
+    assert ask(CompactSnapshotCache(5), encode(instead)) == instead
 
 
 def test_what_it_keeps_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compact_desk, "_HELD_BYTES", 4 * 2 * (60_000 + 7))
-    monkeypatch.setattr(compact_desk, "_MOST_READERS", 3)
-    desk = CompactDesk(5)
+    monkeypatch.setattr(compact_cache, "_HELD_BYTES", 4 * 2 * (60_000 + 7))
+    monkeypatch.setattr(compact_cache, "_MOST_READERS", 3)
+    cache = CompactSnapshotCache(5)
     for version in range(10):
-        fetch(desk, snapshot(version), actor=f"a{version}")
-    assert list(desk._held) == [6, 7, 8, 9]
-    assert list(desk._prepared) == ["a7", "a8", "a9"]
+        fetch(cache, snapshot(version), actor=f"a{version}")
+    assert list(cache._held) == [6, 7, 8, 9]
+    assert list(cache._prepared) == ["a7", "a8", "a9"]

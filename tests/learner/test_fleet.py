@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from daedalus.learner.serving.fleet import Fleet, SequenceWindow
 from daedalus.protocol.messages import Join, Refusal
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
 
 WINDOW = 1024
 HUGE = 2**62
@@ -74,7 +74,7 @@ def test_a_huge_jump_gives_up_all_that_was_passed() -> None:
 
 # --------------------------------------------------------------------------------------------- joining
 
-OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=ChoiceSpace(count=2))
+OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=DiscreteSpace(count=2))
 
 
 def test_who_comes_without_spaces_only_asks_what_is_played() -> None:

@@ -13,13 +13,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Farewell, Join, Rollout
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, Spaces
+from daedalus.protocol.messages import Join, Rollout, RunEnded
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
 
 
-class Desk:
+class Harness:
     """An intake with its fleet of `a` and `b`, at one policy version."""
 
     def __init__(self, **training: Any) -> None:
@@ -36,25 +36,25 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def harness() -> Harness:
+    return Harness()
 
 
 def good(**replaced: Any) -> Rollout:
     return make_rollout(**{"version": VERSION, **replaced})
 
 
-def assert_rejected(desk: Desk, data: bytes, cause: str, reason: str = "", sender: str = "a") -> Rejected:
+def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "", sender: str = "a") -> Rejected:
     """Rejected for that cause and counted under it, with no other trace; the right rollout is welcome after it."""
-    before = desk.memory()
-    verdict = desk.receive(data, sender)
+    before = harness.memory()
+    verdict = harness.receive(data, sender)
     assert isinstance(verdict, Rejected)
     assert verdict.cause == cause
     assert reason in verdict.reason
-    assert desk.memory() == before
-    if sender in desk.fleet.actors:
-        assert desk.fleet.actors[sender].rejected == {cause: 1}
-    assert isinstance(desk.receive(encode(good(who=identity(sequence=1000)))), Rollout)
+    assert harness.memory() == before
+    if sender in harness.fleet.actors:
+        assert harness.fleet.actors[sender].rejected == {cause: 1}
+    assert isinstance(harness.receive(encode(good(who=identity(sequence=1000)))), Rollout)
     return verdict
 
 
@@ -68,29 +68,29 @@ def with_value(name: str, value: float) -> Rollout:
 # ------------------------------------------------------------------------------------------- acceptance
 
 
-def test_a_good_rollout_is_accepted_as_it_was_sent(desk: Desk) -> None:
+def test_a_good_rollout_is_accepted_as_it_was_sent(harness: Harness) -> None:
     rollout = good(version=VERSION - 2)
-    verdict = desk.receive(encode(rollout), now=5.0)
+    verdict = harness.receive(encode(rollout), now=5.0)
     assert isinstance(verdict, Rollout)
     assert verdict.identity == rollout.identity
     np.testing.assert_array_equal(verdict.frames, rollout.frames)
-    actor = desk.fleet.actors["a"]
+    actor = harness.fleet.actors["a"]
     assert (actor.accepted, actor.policy_lag, actor.last_seen) == (1, 2, 5.0)
     assert not actor.rejected
     assert acknowledgement(verdict, VERSION).verdict == "accepted"
     assert acknowledgement(verdict, VERSION).policy_version == VERSION
 
 
-def test_actors_count_their_sequences_apart(desk: Desk) -> None:
+def test_actors_count_their_sequences_apart(harness: Harness) -> None:
     for actor in ("a", "b"):
-        assert isinstance(desk.receive(encode(good(who=identity(actor))), actor), Rollout)
+        assert isinstance(harness.receive(encode(good(who=identity(actor))), actor), Rollout)
 
 
-def test_a_lag_up_to_the_bound_is_accepted(desk: Desk) -> None:
-    assert isinstance(desk.receive(encode(good(version=VERSION - MAX_LAG))), Rollout)
+def test_a_lag_up_to_the_bound_is_accepted(harness: Harness) -> None:
+    assert isinstance(harness.receive(encode(good(version=VERSION - MAX_LAG))), Rollout)
 
 
-def test_the_sender_is_told_the_reason_and_not_a_novel(desk: Desk) -> None:
+def test_the_sender_is_told_the_reason_and_not_a_novel(harness: Harness) -> None:
     verdict = Rejected(verdict="fenced", cause="epoch", reason="x" * 9000)
     answer = acknowledgement(verdict, VERSION)
     assert (answer.verdict, answer.reason, answer.policy_version) == ("fenced", "x" * 500, VERSION)
@@ -104,12 +104,12 @@ def test_the_sender_is_told_the_reason_and_not_a_novel(desk: Desk) -> None:
     [b"", b"DAED", b"nonsense of some length, no message", encode(good())[:-1], encode(good()) + b"\0"],
     ids=["empty", "too short", "nonsense", "cut", "too long"],
 )
-def test_what_is_no_message_is_malformed(desk: Desk, data: bytes) -> None:
-    assert assert_rejected(desk, data, "malformed").verdict == "rejected"
+def test_what_is_no_message_is_malformed(harness: Harness, data: bytes) -> None:
+    assert assert_rejected(harness, data, "malformed").verdict == "rejected"
 
 
-def test_another_message_is_no_rollout(desk: Desk) -> None:
-    assert_rejected(desk, encode(Farewell(learner_epoch=EPOCH, reason="")), "malformed", "not a rollout")
+def test_another_message_is_no_rollout(harness: Harness) -> None:
+    assert_rejected(harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "not a rollout")
 
 
 @pytest.mark.parametrize(
@@ -123,9 +123,9 @@ def test_another_message_is_no_rollout(desk: Desk) -> None:
     ],
     ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
-def test_other_numbers_of_rows_and_environments_are_malformed(desk: Desk, rollout: Rollout) -> None:
+def test_other_numbers_of_rows_and_environments_are_malformed(harness: Harness, rollout: Rollout) -> None:
     reason = f"it has {rollout.rows} rows of {rollout.environments} environments, this run has {ROWS} of"
-    assert_rejected(desk, encode(rollout), "unfit", reason)
+    assert_rejected(harness, encode(rollout), "unfit", reason)
 
 
 @pytest.mark.parametrize(
@@ -139,63 +139,65 @@ def test_other_numbers_of_rows_and_environments_are_malformed(desk: Desk, rollou
     ],
     ids=["larger", "smaller", "more dimensions", "a stack", "dtype"],
 )
-def test_other_frames_are_malformed_and_both_are_named(desk: Desk, rollout: Rollout) -> None:
+def test_other_frames_are_malformed_and_both_are_named(harness: Harness, rollout: Rollout) -> None:
     theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
-    verdict = assert_rejected(desk, encode(rollout), "unfit", theirs)
+    verdict = assert_rejected(harness, encode(rollout), "unfit", theirs)
     assert f"this run has float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
 
-def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(desk: Desk) -> None:
+def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(harness: Harness) -> None:
     bomb = good(rows=4000, environments=500, frames=np.zeros((4001, 500, 3), np.float32))
-    assert_rejected(desk, encode(bomb), "malformed", "the limit is")
+    assert_rejected(harness, encode(bomb), "malformed", "the limit is")
 
 
 @pytest.mark.parametrize("action", [-1, SPACES.action.count, 2**31 - 1])
-def test_an_action_out_of_range_is_malformed(desk: Desk, action: int) -> None:
+def test_an_action_out_of_range_is_malformed(harness: Harness, action: int) -> None:
     actions = good().actions.astype(np.int32)
     actions[-1, -1] = action
-    assert_rejected(desk, encode(good(actions=actions)), "unfit", "action")
+    assert_rejected(harness, encode(good(actions=actions)), "unfit", "action")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["frames", "behaviour_log_probs", "rewards", "episode_returns"])
-def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(desk: Desk, name: str, value: float) -> None:
-    assert_rejected(desk, encode(with_value(name, value)), "unfit", name)
+def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(
+    harness: Harness, name: str, value: float
+) -> None:
+    assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
 
 
-def test_a_log_probability_above_0_is_malformed(desk: Desk) -> None:
-    assert_rejected(desk, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
+def test_a_log_probability_above_0_is_malformed(harness: Harness) -> None:
+    assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 
 
-def test_a_log_probability_that_rounding_put_above_0_is_accepted(desk: Desk) -> None:
-    assert isinstance(desk.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
+def test_a_log_probability_that_rounding_put_above_0_is_accepted(harness: Harness) -> None:
+    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
 
 
-def test_a_policy_version_yet_to_come_is_malformed(desk: Desk) -> None:
-    assert_rejected(desk, encode(good(version=VERSION + 1)), "unfit", "yet to come")
+def test_a_policy_version_yet_to_come_is_malformed(harness: Harness) -> None:
+    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "yet to come")
 
 
 @pytest.mark.parametrize("size", [1, 7])
-def test_a_memory_where_the_policy_has_none_is_malformed(desk: Desk, size: int) -> None:
+def test_a_memory_where_the_policy_has_none_is_malformed(harness: Harness, size: int) -> None:
     reason = f"its policy remembers {size} numbers, this run's 0"
-    assert_rejected(desk, encode(good(state_size=size)), "unfit", reason)
+    assert_rejected(harness, encode(good(state_size=size)), "unfit", reason)
 
 
 @pytest.mark.parametrize("size", [0, 4, 6])
-def test_a_memory_of_another_size_is_malformed(desk: Desk, size: int) -> None:
-    desk.intake.state_size = 5
-    verdict = desk.receive(encode(good(state_size=size)))
+def test_a_memory_of_another_size_is_malformed(harness: Harness, size: int) -> None:
+    harness.intake.state_size = 5
+    verdict = harness.receive(encode(good(state_size=size)))
     assert isinstance(verdict, Rejected)
     assert verdict.reason == f"its policy remembers {size} numbers, this run's 5"
-    assert isinstance(desk.receive(encode(good(state_size=5))), Rollout)
+    assert isinstance(harness.receive(encode(good(state_size=5))), Rollout)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_memory_that_is_not_finite_is_malformed(desk: Desk, value: float) -> None:
-    desk.intake.state_size = 5
+def test_a_memory_that_is_not_finite_is_malformed(harness: Harness, value: float) -> None:
+    harness.intake.state_size = 5
     state = np.zeros((ENVIRONMENTS, 5), np.float32)
     state[-1, -1] = value
-    verdict = desk.receive(encode(good(initial_state=state)))
+    verdict = harness.receive(encode(good(initial_state=state)))
     assert isinstance(verdict, Rejected)
     assert verdict.reason == "initial_state has a value that is not finite"
 
@@ -205,12 +207,12 @@ def test_a_memory_that_is_not_finite_is_malformed(desk: Desk, value: float) -> N
 STACKED = ArraySpace(shape=(60, 80, 3), dtype="uint8", frames=4)
 
 
-def stacked_desk(state_size: int = 0) -> Desk:
-    desk = Desk()
-    desk.fleet = joined_fleet("a", spaces=SPACES.model_copy(update={"observation": STACKED}))
-    desk.intake = Intake(run_spec(max_policy_lag=MAX_LAG), EPOCH, desk.fleet)
-    desk.intake.state_size = state_size
-    return desk
+def stacked_harness(state_size: int = 0) -> Harness:
+    harness = Harness()
+    harness.fleet = joined_fleet("a", spaces=SPACES.model_copy(update={"observation": STACKED}))
+    harness.intake = Intake(run_spec(max_policy_lag=MAX_LAG), EPOCH, harness.fleet)
+    harness.intake.state_size = state_size
+    return harness
 
 
 def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np.ndarray:
@@ -220,14 +222,14 @@ def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np
 
 def test_of_a_stack_each_frame_comes_once() -> None:
     rollout = good(frames=pixels())
-    verdict = stacked_desk().receive(encode(rollout))
+    verdict = stacked_harness().receive(encode(rollout))
     assert isinstance(verdict, Rollout)
     np.testing.assert_array_equal(verdict.frames, rollout.frames)
 
 
 def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
     swapped = np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)
-    verdict = stacked_desk().receive(encode(good(frames=swapped)))
+    verdict = stacked_harness().receive(encode(good(frames=swapped)))
     assert isinstance(verdict, Rollout)
     np.testing.assert_array_equal(verdict.frames, pixels())
 
@@ -246,7 +248,7 @@ def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
     ids=["no stack", "a smaller stack", "a larger stack", "turned", "grey", "stacked already", "a line less"],
 )
 def test_frames_of_another_stack_or_size_are_malformed(frames: np.ndarray) -> None:
-    verdict = stacked_desk().receive(encode(good(frames=frames)))
+    verdict = stacked_harness().receive(encode(good(frames=frames)))
     assert isinstance(verdict, Rejected)
     assert ("the limit is" if verdict.cause == "malformed" else "frames are uint8") in verdict.reason
 
@@ -259,9 +261,9 @@ def test_the_limit_lets_the_largest_rollout_of_the_run_through_and_not_much_more
         episode_returns=np.zeros(ROWS * ENVIRONMENTS, np.float32),
         episode_lengths=np.ones(ROWS * ENVIRONMENTS, np.int64),
     )
-    assert isinstance(stacked_desk(40_000).receive(encode(largest)), Rollout)
+    assert isinstance(stacked_harness(40_000).receive(encode(largest)), Rollout)
     too_many = good(frames=pixels(2 * (ROWS + 4)))
-    verdict = stacked_desk().receive(encode(too_many))
+    verdict = stacked_harness().receive(encode(too_many))
     assert isinstance(verdict, Rejected)
     assert "the limit is" in verdict.reason
 
@@ -272,20 +274,20 @@ def test_whatever_is_done_to_its_bytes_there_is_a_verdict(data: st.DataObject) -
     for place in data.draw(st.lists(st.integers(0, len(message) - 1), min_size=1, max_size=4)):
         message[place] = data.draw(st.integers(0, 255))
     cut = data.draw(st.sampled_from([None, None, data.draw(st.integers(0, len(message)))]))
-    assert isinstance(Desk().receive(bytes(message[:cut])), Rollout | Rejected)
+    assert isinstance(Harness().receive(bytes(message[:cut])), Rollout | Rejected)
 
 
 # ------------------------------------------------------------------------- whose it is, and when it was made
 
 
-def test_another_epoch_is_fenced(desk: Desk) -> None:
-    verdict = assert_rejected(desk, encode(good(who=identity(epoch=EPOCH - 1))), "epoch")
+def test_another_epoch_is_fenced(harness: Harness) -> None:
+    verdict = assert_rejected(harness, encode(good(who=identity(epoch=EPOCH - 1))), "epoch")
     assert acknowledgement(verdict, VERSION).verdict == "fenced"
 
 
-def test_a_sender_that_never_joined_is_fenced(desk: Desk) -> None:
-    assert assert_rejected(desk, encode(good(who=identity("z"))), "unknown_actor", sender="z").verdict == "fenced"
-    assert "z" not in desk.fleet.actors
+def test_a_sender_that_never_joined_is_fenced(harness: Harness) -> None:
+    assert assert_rejected(harness, encode(good(who=identity("z"))), "unknown_actor", sender="z").verdict == "fenced"
+    assert "z" not in harness.fleet.actors
 
 
 def test_nobody_is_known_before_there_are_spaces() -> None:
@@ -296,53 +298,53 @@ def test_nobody_is_known_before_there_are_spaces() -> None:
 
 
 @pytest.mark.parametrize("incarnation", [0, 2])
-def test_an_incarnation_that_never_joined_is_fenced(desk: Desk, incarnation: int) -> None:
-    verdict = assert_rejected(desk, encode(good(who=identity(incarnation=incarnation))), "unknown_actor")
+def test_an_incarnation_that_never_joined_is_fenced(harness: Harness, incarnation: int) -> None:
+    verdict = assert_rejected(harness, encode(good(who=identity(incarnation=incarnation))), "unknown_actor")
     assert verdict.verdict == "fenced"
 
 
-def test_a_superseded_incarnation_is_fenced(desk: Desk) -> None:
-    desk.fleet.set_present("a", 1, False)
-    desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    verdict = desk.receive(encode(good()))
+def test_a_superseded_incarnation_is_fenced(harness: Harness) -> None:
+    harness.fleet.set_present("a", 1, False)
+    harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    verdict = harness.receive(encode(good()))
     assert isinstance(verdict, Rejected)
     assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
-    assert isinstance(desk.receive(encode(good(who=identity(incarnation=2)))), Rollout)
+    assert isinstance(harness.receive(encode(good(who=identity(incarnation=2)))), Rollout)
 
 
-def test_a_life_that_joins_again_after_another_has_nothing_taken_twice(desk: Desk) -> None:
+def test_a_life_that_joins_again_after_another_has_nothing_taken_twice(harness: Harness) -> None:
     data = encode(good())
-    assert isinstance(desk.receive(data), Rollout)
+    assert isinstance(harness.receive(data), Rollout)
     for incarnation in (2, 1):
-        desk.fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    assert isinstance(desk.receive(data), Rejected)
+        harness.fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    assert isinstance(harness.receive(data), Rejected)
 
 
-def test_nobody_can_send_in_anothers_name(desk: Desk) -> None:
-    verdict = assert_rejected(desk, encode(good(who=identity("b"))), "unknown_actor", sender="a")
+def test_nobody_can_send_in_anothers_name(harness: Harness) -> None:
+    verdict = assert_rejected(harness, encode(good(who=identity("b"))), "unknown_actor", sender="a")
     assert verdict.verdict == "fenced"
-    assert not desk.fleet.actors["b"].rejected
-    assert isinstance(desk.receive(encode(good(who=identity("b"))), "b"), Rollout)
+    assert not harness.fleet.actors["b"].rejected
+    assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
 
 
-def test_a_duplicate_is_rejected(desk: Desk) -> None:
-    assert isinstance(desk.receive(encode(good())), Rollout)
-    assert assert_rejected(desk, encode(good()), "duplicate").verdict == "rejected"
+def test_a_duplicate_is_rejected(harness: Harness) -> None:
+    assert isinstance(harness.receive(encode(good())), Rollout)
+    assert assert_rejected(harness, encode(good()), "duplicate").verdict == "rejected"
 
 
-def test_a_stale_rollout_is_rejected_once_and_a_duplicate_from_then_on(desk: Desk) -> None:
+def test_a_stale_rollout_is_rejected_once_and_a_duplicate_from_then_on(harness: Harness) -> None:
     data = encode(good(version=VERSION - MAX_LAG - 1))
-    verdicts = [desk.receive(data), desk.receive(data)]
+    verdicts = [harness.receive(data), harness.receive(data)]
     assert [verdict.cause for verdict in verdicts if isinstance(verdict, Rejected)] == ["stale", "duplicate"]
-    assert desk.fleet.actors["a"].accepted == 0
+    assert harness.fleet.actors["a"].accepted == 0
 
 
 def test_a2c_takes_the_newest_version_only_whatever_lag_is_allowed() -> None:
-    desk = Desk(algorithm="a2c")
-    late = desk.receive(encode(good(version=VERSION - 1)))
+    harness = Harness(algorithm="a2c")
+    late = harness.receive(encode(good(version=VERSION - 1)))
     assert isinstance(late, Rejected)
     assert late.cause == "stale"
-    assert isinstance(desk.receive(encode(good(who=identity(sequence=1)))), Rollout)
+    assert isinstance(harness.receive(encode(good(who=identity(sequence=1)))), Rollout)
 
 
 # ------------------------------------------------------------------------------------------- quarantine
@@ -352,62 +354,62 @@ def broken(sequence: int) -> bytes:
     return encode(dataclasses.replace(with_value("rewards", np.nan), identity=identity(sequence=sequence)))
 
 
-def verdicts(desk: Desk, *messages: bytes) -> list[str]:
-    return [acknowledgement(desk.receive(data), VERSION).verdict for data in messages]
+def verdicts(harness: Harness, *messages: bytes) -> list[str]:
+    return [acknowledgement(harness.receive(data), VERSION).verdict for data in messages]
 
 
-def test_after_three_unfit_rollouts_in_a_row_nothing_is_taken_any_more(desk: Desk) -> None:
+def test_after_three_unfit_rollouts_in_a_row_nothing_is_taken_any_more(harness: Harness) -> None:
     fit = encode(good(who=identity(sequence=9)))
-    assert verdicts(desk, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
-    actor = desk.fleet.actors["a"]
+    assert verdicts(harness, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
+    actor = harness.fleet.actors["a"]
     assert actor.quarantined == "3 unfit rollouts in a row, the last: rewards has a value that is not finite"
     assert actor.rejected == {"unfit": 3, "quarantined": 1}
-    assert desk.fleet.live == {"b"}
-    assert isinstance(desk.receive(encode(good(who=identity("b"))), "b"), Rollout)
+    assert harness.fleet.live == {"b"}
+    assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
 
 
-def test_a_fit_rollout_between_them_keeps_an_actor_out_of_quarantine(desk: Desk) -> None:
+def test_a_fit_rollout_between_them_keeps_an_actor_out_of_quarantine(harness: Harness) -> None:
     fit = [encode(good(who=identity(sequence=sequence))) for sequence in (10, 11)]
-    assert "quarantined" not in verdicts(desk, broken(0), broken(1), fit[0], broken(2), broken(3), fit[1])
+    assert "quarantined" not in verdicts(harness, broken(0), broken(1), fit[0], broken(2), broken(3), fit[1])
 
 
-def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(desk: Desk) -> None:
-    verdicts(desk, broken(0), broken(1), broken(2))
-    desk.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    assert verdicts(desk, encode(good(who=identity(sequence=5)))) == ["quarantined"]
-    desk.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    desk.fleet.set_present("a", 2, True)
-    assert desk.fleet.live == {"a", "b"}
-    assert verdicts(desk, encode(good(who=identity(incarnation=2)))) == ["accepted"]
+def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(harness: Harness) -> None:
+    verdicts(harness, broken(0), broken(1), broken(2))
+    harness.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    assert verdicts(harness, encode(good(who=identity(sequence=5)))) == ["quarantined"]
+    harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    harness.fleet.set_present("a", 2, True)
+    assert harness.fleet.live == {"a", "b"}
+    assert verdicts(harness, encode(good(who=identity(incarnation=2)))) == ["accepted"]
 
 
-def test_bytes_that_anybody_could_have_sent_quarantine_nobody(desk: Desk) -> None:
+def test_bytes_that_anybody_could_have_sent_quarantine_nobody(harness: Harness) -> None:
     """Who does not know an actor's incarnation and the learner's epoch cannot have it shut out."""
     strangers = [identity(incarnation=8), identity(epoch=EPOCH + 1)]
     noise = [b"noise", encode(good())[:-1], *(encode(good(who=who, rows=ROWS - 1)) for who in strangers)]
-    assert "quarantined" not in verdicts(desk, *noise, *noise)
-    assert verdicts(desk, encode(good())) == ["accepted"]
+    assert "quarantined" not in verdicts(harness, *noise, *noise)
+    assert verdicts(harness, encode(good())) == ["accepted"]
 
 
-def test_rewards_beyond_what_they_are_clipped_to_are_unfit(desk: Desk) -> None:
+def test_rewards_beyond_what_they_are_clipped_to_are_unfit(harness: Harness) -> None:
     spec = run_spec(max_policy_lag=MAX_LAG)
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
-    desk.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, desk.fleet)
+    harness.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
     within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5, np.float32))
     beyond = good(who=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
-    assert isinstance(desk.receive(encode(within)), Rollout)
-    verdict = desk.receive(encode(beyond))
+    assert isinstance(harness.receive(encode(within)), Rollout)
+    verdict = harness.receive(encode(beyond))
     assert isinstance(verdict, Rejected)
     assert verdict.reason == "rewards has a value beyond the 0.5 that they are clipped to"
 
 
-def test_an_episode_without_a_step_is_unfit(desk: Desk) -> None:
-    assert_rejected(desk, encode(good(episode_lengths=np.array([0], np.int32))), "unfit", "episode_lengths")
+def test_an_episode_without_a_step_is_unfit(harness: Harness) -> None:
+    assert_rejected(harness, encode(good(episode_lengths=np.array([0], np.int32))), "unfit", "episode_lengths")
 
 
 # ---------------------------------------------------------------------------------------- at most once
 
-TINY = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=ChoiceSpace(count=4))
+TINY = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=DiscreteSpace(count=4))
 NAMES = st.sampled_from(["a", "b"])
 SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([2**62, 2**62 - 1500, 2**63 - 1]))
 

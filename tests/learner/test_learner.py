@@ -284,16 +284,16 @@ def test_the_picture_is_the_stack_side_by_side_where_there_are_images(
 ) -> None:
     space = ArraySpace(shape=shape, dtype="uint8", frames=3)
     learner = Learner(learner_spec(), POLICY, SPACES.model_copy(update={"observation": space}))
-    assert learner.take_picture() is None
+    assert learner.take_observation_image() is None
     frames = np.random.default_rng(0).integers(0, 256, (6 + 3, 3, *shape), np.uint8)
     learner.step([make_rollout(frames=frames)], 0.0)
-    picture = learner.take_picture()
+    picture = learner.take_observation_image()
     if size is None:
         assert picture is None
         return
     assert picture is not None
     np.testing.assert_array_equal(picture, np.concatenate(list(frames[:3, 0]), axis=1).reshape(size))
-    assert learner.take_picture() is None
+    assert learner.take_observation_image() is None
 
 
 # --------------------------------------------------------------------------------------------- restarts

@@ -26,7 +26,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("learner.progress.time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr("daedalus.learner.reporting.progress.time", SimpleNamespace(monotonic=lambda: clock.now))
     return clock
 
 

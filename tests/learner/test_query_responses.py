@@ -5,17 +5,17 @@ import threading
 import numpy as np
 
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.query_responses import FrontDesk
+from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.protocol.codec import Limits, decode, encode
-from daedalus.protocol.messages import Farewell, Join, Message, Program, Refusal, Welcome
+from daedalus.protocol.messages import Join, Message, Program, Refusal, RunEnded, Welcome
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 
-def make_desk() -> tuple[FrontDesk, Fleet]:
+def make_responses() -> tuple[QueryResponses, Fleet]:
     fleet = Fleet(seed=1, spaces=None)
-    return FrontDesk("run", SPEC, 5, 0, fleet, threading.Condition()), fleet
+    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition()), fleet
 
 
 def read(data: bytes) -> Message:
@@ -23,53 +23,53 @@ def read(data: bytes) -> Message:
 
 
 def test_an_actor_is_welcomed_with_all_it_needs() -> None:
-    desk, fleet = make_desk()
-    answer = read(desk.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    responses, fleet = make_responses()
+    answer = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(answer, Welcome)
     assert (answer.run, answer.learner_epoch, answer.spec) == ("run", 5, SPEC)
     assert answer.seed == fleet.seed_for("a", 0)
 
 
 def test_what_is_not_a_join_is_refused_and_no_actor() -> None:
-    desk, fleet = make_desk()
-    for data, code in ((b"\xff", "mismatch"), (encode(Farewell(learner_epoch=1, reason="")), "malformed")):
-        answer = read(desk.join(data, 0.0))
+    responses, fleet = make_responses()
+    for data, code in ((b"\xff", "mismatch"), (encode(RunEnded(learner_epoch=1, reason="")), "malformed")):
+        answer = read(responses.join(data, 0.0))
         assert isinstance(answer, Refusal)
         assert answer.code == code
     assert not fleet.actors
 
 
 def test_programs_are_known_by_their_hash() -> None:
-    desk, _ = make_desk()
+    responses, _ = make_responses()
     program = Program(hash="abc", model=np.zeros(3, np.uint8))
-    desk.offer_program(program)
-    answer = read(desk.program("abc"))
+    responses.offer_program(program)
+    answer = read(responses.program("abc"))
     assert isinstance(answer, Program)
-    unknown = read(desk.program("x" * 1000))
+    unknown = read(responses.program("x" * 1000))
     assert isinstance(unknown, Refusal)
     assert unknown.code == "unknown"
 
 
 def test_the_program_is_given_also_to_those_who_do_not_know_its_hash_yet() -> None:
-    desk, _ = make_desk()
-    early = read(desk.program("*"))
+    responses, _ = make_responses()
+    early = read(responses.program("*"))
     assert isinstance(early, Refusal)
     assert early.code == "unknown"
-    desk.offer_program(Program(hash="abc", model=np.zeros(3, np.uint8)))
-    answer = read(desk.program("*"))
+    responses.offer_program(Program(hash="abc", model=np.zeros(3, np.uint8)))
+    answer = read(responses.program("*"))
     assert isinstance(answer, Program)
     assert answer.hash == "abc"
 
 
 def test_there_is_no_snapshot_then_the_newest_then_a_farewell() -> None:
-    desk, _ = make_desk()
-    first = read(desk.snapshot())
+    responses, _ = make_responses()
+    first = read(responses.snapshot())
     assert isinstance(first, Refusal)
     assert first.code == "not_ready"
-    desk.offer_snapshot(b"newest")
-    assert desk.snapshot() == b"newest"
-    desk.close(b"farewell")
-    assert desk.snapshot() == b"farewell"
-    late = read(desk.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    responses.offer_snapshot(b"newest")
+    assert responses.snapshot() == b"newest"
+    responses.close(b"run_ended")
+    assert responses.snapshot() == b"run_ended"
+    late = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"

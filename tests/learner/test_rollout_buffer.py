@@ -3,7 +3,7 @@
 import pytest
 from building import identity, make_rollout
 
-from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, Taken
+from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, TakenRollouts
 from daedalus.protocol.messages import Rollout
 
 
@@ -11,7 +11,7 @@ def rollout(actor: str, sequence: int = 0, version: int = 0) -> Rollout:
     return make_rollout(identity(actor, sequence), version=version, rows=1, environments=1)
 
 
-def actors(taken: Taken) -> list[str]:
+def actors(taken: TakenRollouts) -> list[str]:
     return [rollout.identity.actor for rollout in taken.rollouts]
 
 

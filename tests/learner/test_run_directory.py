@@ -124,7 +124,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch
     def refuse(*_: object) -> None:
         raise OSError("the power failed")
 
-    monkeypatch.setattr("learner.run_directory.os.replace", refuse)
+    monkeypatch.setattr("daedalus.learner.run.run_directory.os.replace", refuse)
     with pytest.raises(OSError, match="power"):
         run_directory.write_json(path, {"run": 2})
     assert json.loads(path.read_text()) == {"run": 1}

@@ -9,7 +9,7 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, PolicySpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, Spaces
 
 Weights = dict[str, np.ndarray]
 
@@ -59,7 +59,7 @@ def observations(space: ArraySpace, leading: tuple[int, ...], seed: int = 1) -> 
 
 def spaces(shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1, actions: int = 4) -> Spaces:
     space = ArraySpace.model_validate({"shape": shape, "dtype": dtype, "frames": frames})
-    return Spaces(observation=space, action=ChoiceSpace(count=actions))
+    return Spaces(observation=space, action=DiscreteSpace(count=actions))
 
 
 def make_policy(spec: dict[str, Any], where: Spaces) -> Policy:

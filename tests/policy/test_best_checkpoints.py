@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, score_anew
+from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, rescore
 
 
 def checkpoint(run: Path, version: int) -> Path:
@@ -50,12 +50,12 @@ def test_another_score_is_another_name(tmp_path: Path) -> None:
     first, second = checkpoint(tmp_path, 1), checkpoint(tmp_path, 2)
     keep_if_best(first, 90.0, 1)
     (kept,) = best_checkpoints(tmp_path)
-    assert score_anew(kept, 50.0, 1).name == "best_50.0_0000000001"
-    assert score_anew(second, 60.0, 2).name == "best_60.0_0000000002"
+    assert rescore(kept, 50.0, 1).name == "best_50.0_0000000001"
+    assert rescore(second, 60.0, 2).name == "best_60.0_0000000002"
     assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
     assert second.exists()
     (best, _) = best_checkpoints(tmp_path)
-    assert score_anew(best, 60.0, 2) == best
+    assert rescore(best, 60.0, 2) == best
     assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
 
 

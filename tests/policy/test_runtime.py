@@ -13,7 +13,7 @@ import torch
 from onnx import TensorProto, helper
 from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
-from daedalus.policy.acting.onnx_initializers import with_constants
+from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import (
     LOGITS,
@@ -293,7 +293,7 @@ def test_a_program_cut_short_is_refused(one_policy: Policy) -> None:
 
 def test_constants_are_the_inputs_they_replace(policy: Policy) -> None:
     weights = {name: array for name, array in policy.weights().items() if name in policy.acting_names()}
-    merged = onnx.load_model_from_string(with_constants(policy.program, weights))
+    merged = onnx.load_model_from_string(with_initializers(policy.program, weights))
     assert {tensor.name for tensor in merged.graph.initializer} == policy.acting_names()
     for tensor in merged.graph.initializer:
         array = onnx.numpy_helper.to_array(tensor)

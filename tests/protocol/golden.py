@@ -15,20 +15,20 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
     Join,
     Message,
     Program,
     Refusal,
     Rollout,
     RolloutIdentity,
+    RunEnded,
     Snapshot,
     SnapshotPart,
     SnapshotRequest,
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spec import ActorStatus, ArraySpace, ChoiceSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
+from daedalus.protocol.spec import ActorStatus, ArraySpace, DiscreteSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4
@@ -58,7 +58,8 @@ MESSAGES: dict[str, Message] = {
         actor="wing-1",
         incarnation=5,
         spaces=Spaces(
-            observation=ArraySpace(shape=(6, 5), dtype="uint8", frames=4), action=ChoiceSpace(kind="choice", count=6)
+            observation=ArraySpace(shape=(6, 5), dtype="uint8", frames=4),
+            action=DiscreteSpace(kind="discrete", count=6),
         ),
         environments=2,
     ),
@@ -100,7 +101,7 @@ MESSAGES: dict[str, Message] = {
         returns=np.array([1.0, 2.5], np.float32),
         lengths=np.array([10, 20], np.int32),
     ),
-    "farewell": Farewell(learner_epoch=9, reason="the learner has finished"),
+    "run_ended": RunEnded(learner_epoch=9, reason="the learner has finished"),
     "status_report": StatusReport(
         status=RunStatus(
             run="r",
@@ -136,7 +137,7 @@ MESSAGES: dict[str, Message] = {
                     rollouts_missed=1,
                     busy_answers=3,
                     policy_lag=1,
-                    slow_link=True,
+                    compact_snapshots=True,
                     bytes_up_per_hour=7200.0,
                     bytes_down_per_hour=1.5,
                 ),

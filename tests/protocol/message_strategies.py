@@ -11,12 +11,12 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
     Join,
     Program,
     Refusal,
     Rollout,
     RolloutIdentity,
+    RunEnded,
     Snapshot,
     SnapshotPart,
     SnapshotRequest,
@@ -26,8 +26,8 @@ from daedalus.protocol.messages import (
 from daedalus.protocol.spec import (
     ActorStatus,
     ArraySpace,
-    ChoiceSpace,
     CollectionSpec,
+    DiscreteSpace,
     EnvironmentSpec,
     EvaluationSpec,
     PolicySpec,
@@ -51,7 +51,7 @@ spaces = st.builds(
         dtype=st.sampled_from(["float32", "uint8"]),
         frames=st.integers(1, 16),
     ),
-    action=st.builds(ChoiceSpace, count=st.integers(1, 65_536)),
+    action=st.builds(DiscreteSpace, count=st.integers(1, 65_536)),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | floats | text,
@@ -72,7 +72,7 @@ run_specs = st.builds(
         frame_stack=st.integers(1, 16),
         reward_clip=st.none() | st.floats(0.1, 10),
         reward_scale=st.floats(1e-6, 1e6),
-        continuing=st.booleans(),
+        bootstrap_terminations=st.booleans(),
     ),
     policy=st.builds(
         PolicySpec,
@@ -214,7 +214,7 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
-    Farewell: st.builds(Farewell, learner_epoch=counters, reason=text),
+    RunEnded: st.builds(RunEnded, learner_epoch=counters, reason=text),
     StatusReport: st.builds(StatusReport, status=statuses),
 }
 messages = st.one_of(*KINDS.values())

@@ -19,10 +19,10 @@ from wire_format import (
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, VersionMismatchError, decode, encode
 from daedalus.protocol.messages import (
-    Farewell,
     Join,
     Message,
     Refusal,
+    RunEnded,
     Snapshot,
 )
 
@@ -135,9 +135,9 @@ def test_every_array_of_a_rollout_is_needed() -> None:
 
 
 def test_an_array_beyond_the_expected_is_refused() -> None:
-    _, content, _ = unwire(encode(Farewell(learner_epoch=1, reason="")))
+    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="")))
     content.update(arrays=[["extra", "|u1", [8], False]], size=8)
-    with pytest.raises(ProtocolError, match="Farewell has no array 'extra'"):
+    with pytest.raises(ProtocolError, match="RunEnded has no array 'extra'"):
         decode(wire(content, bytes(8)), LIMITS)
 
 
@@ -195,7 +195,7 @@ def test_unknown_flags_and_magic_are_refused() -> None:
         decode(b"HTTP" + SAMPLES["snapshot"][4:], LIMITS)
 
 
-@pytest.mark.parametrize("version", [0, 3, 5, 65_535])
+@pytest.mark.parametrize("version", [0, 4, 6, 65_535])
 def test_another_version_is_named_beside_our_own(version: int) -> None:
     for data in (wire({}, version=version), wire_header(b"\xc1 of the future", version=version)):
         with pytest.raises(VersionMismatchError, match=rf"version {version}, this one {PROTOCOL_VERSION}:") as refused:

@@ -22,8 +22,8 @@ from wire_format import (
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
 from daedalus.protocol.messages import (
-    Farewell,
     Program,
+    RunEnded,
     Snapshot,
 )
 
@@ -128,7 +128,7 @@ def test_deep_nesting_is_decoded_or_refused(depth: int) -> None:
 
 
 def test_a_header_beyond_its_limit_is_not_read() -> None:
-    _, content, _ = unwire(encode(Farewell(learner_epoch=1, reason="x" * 5000)))
+    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="x" * 5000)))
     with pytest.raises(ProtocolError, match=r"the header declares .* the limit is 4096"):
         decode(wire(content), SMALL)
     with pytest.raises(ProtocolError, match="the header declares 4294967295 bytes"):

@@ -15,7 +15,7 @@ from daedalus.actor.collecting.collector import Collector
 from daedalus.protocol.codec import Limits, decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spec import ArraySpace, ChoiceSpace, EnvironmentSpec, Spaces
+from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, Spaces
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 
@@ -68,7 +68,7 @@ class Films:
 
     @property
     def spaces(self) -> Spaces:
-        return Spaces(observation=self.space, action=ChoiceSpace(count=2))
+        return Spaces(observation=self.space, action=DiscreteSpace(count=2))
 
     def reset(self, seed: int) -> np.ndarray:
         return self.played.reset(seed=seed)[0]

@@ -49,9 +49,9 @@ def test_the_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> N
 @offline
 @given(run=names, actor=names, incarnation=st.integers(0, 2**63 - 1))
 def test_a_presence_key_tells_whose_life_it_is(run: str, actor: str, incarnation: int) -> None:
-    assert keys.who_is_present(keys.presence(run, actor, incarnation)) == (actor, incarnation)
+    assert keys.parse_presence(keys.presence(run, actor, incarnation)) == (actor, incarnation)
 
 
 @pytest.mark.parametrize("life", ["", "x", "-1", "1.0", "*", "9" * 20, "\u0663"])
 def test_a_presence_key_of_no_actor_of_ours_tells_of_nobody(life: str) -> None:
-    assert keys.who_is_present(keys.presence("r", "a", life)) is None
+    assert keys.parse_presence(keys.presence("r", "a", life)) is None

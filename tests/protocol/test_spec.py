@@ -7,8 +7,8 @@ from pydantic import ValidationError
 from daedalus.protocol.spec import (
     ActorStatus,
     ArraySpace,
-    ChoiceSpace,
     CollectionSpec,
+    DiscreteSpace,
     EnvironmentSpec,
     EvaluationSpec,
     PolicySpec,
@@ -46,7 +46,7 @@ def test_an_environment_alone_makes_a_run() -> None:
         (ServiceSpec, {}),
         (Spaces, SPACES),
         (ArraySpace, SPACES["observation"]),
-        (ChoiceSpace, SPACES["action"]),
+        (DiscreteSpace, SPACES["action"]),
     ],
 )
 def test_a_field_that_is_not_known_is_refused_by_its_name(
@@ -80,8 +80,8 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (ArraySpace, "dtype", "float64"),
     (ArraySpace, "frames", 0),
     (ArraySpace, "frames", 17),
-    (ChoiceSpace, "count", 0),
-    (ChoiceSpace, "count", 65_537),
+    (DiscreteSpace, "count", 0),
+    (DiscreteSpace, "count", 65_537),
     (EnvironmentSpec, "id", ""),
     (EnvironmentSpec, "id", "x" * 201),
     (EnvironmentSpec, "max_episode_steps", 0),
@@ -90,7 +90,7 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (EnvironmentSpec, "action_table", [[0.0], [math.inf]]),
     (EnvironmentSpec, "action_repeat", 0),
     (EnvironmentSpec, "action_repeat", 65),
-    (EnvironmentSpec, "patience", 0),
+    (EnvironmentSpec, "no_reward_limit", 0),
     (EnvironmentSpec, "crop", [0, 0, 0]),
     (EnvironmentSpec, "crop", [0, 0, 0, -1]),
     (EnvironmentSpec, "resize", [0, 84]),

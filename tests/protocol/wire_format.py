@@ -20,7 +20,7 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spec import (
     ArraySpace,
-    ChoiceSpace,
+    DiscreteSpace,
     EnvironmentSpec,
     RunSpec,
     Spaces,
@@ -90,7 +90,7 @@ IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=2, learner_epoch=3
 JOIN = Join(
     actor="a",
     incarnation=7,
-    spaces=Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=ChoiceSpace(count=2)),
+    spaces=Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2)),
 )
 SNAPSHOT = Snapshot(
     learner_epoch=1,

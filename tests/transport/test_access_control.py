@@ -79,15 +79,15 @@ class Scene:
         self.learner, self.actor = session("learner", "learner"), session("actor-box", "actor")
 
     def answered(self, key: str) -> bool:
-        return self.own.ask(key, b"x", timeout=DENIED_SECONDS) == [b"the learner's"]
+        return self.own.query(key, b"x", timeout=DENIED_SECONDS) == [b"the learner's"]
 
     def arrives(self, end: Transport, other: Transport, key: str) -> bool:
         """Whether what `end` publishes on a key reaches `other`, who surely gets what comes from the learner."""
         news: list[bytes] = []
-        inbox = other.follow(key, lambda: news.append(inbox.take() or b""))
+        inbox = other.subscribe(key, lambda: news.append(inbox.take() or b""))
         self.until_heard(lambda: self.learner.publish(key, b"first"), lambda: b"first" in news)
         end.publish(key, b"second")
-        end.ask(keys.join("r"), timeout=DENIED_SECONDS)  # all that was sent before is through
+        end.query(keys.join("r"), timeout=DENIED_SECONDS)  # all that was sent before is through
         self.until_heard(lambda: self.learner.publish(key, b"third"), lambda: b"third" in news)
         return b"second" in news
 
@@ -119,7 +119,7 @@ def reads_snapshots(scene: Scene) -> bool:
     if not scene.answered(keys.snapshots("r")):
         return False
     news: list[bytes] = []
-    inbox = scene.own.follow(keys.snapshots("r"), lambda: news.append(inbox.take() or b""))
+    inbox = scene.own.subscribe(keys.snapshots("r"), lambda: news.append(inbox.take() or b""))
     scene.until_heard(lambda: scene.learner.publish(keys.snapshots("r"), b"new"), lambda: bool(news))
     return True
 
@@ -130,18 +130,18 @@ def publishes_snapshots(scene: Scene) -> bool:
 
 def answers_joins(scene: Scene) -> bool:
     scene.own.serve(keys.join("fake"), lambda request: request.reply(b"come to me"))
-    scene.own.ask(keys.join("r"), timeout=DENIED_SECONDS)
-    return scene.actor.ask(keys.join("fake"), timeout=DENIED_SECONDS) == [b"come to me"]
+    scene.own.query(keys.join("r"), timeout=DENIED_SECONDS)
+    return scene.actor.query(keys.join("fake"), timeout=DENIED_SECONDS) == [b"come to me"]
 
 
 def watches_presence(scene: Scene) -> bool:
     seen: list[str] = []
     sure: list[str] = []
-    scene.own.watch(keys.presence("r", "*", "*"), lambda key, _: seen.append(key))
-    scene.learner.watch(keys.presence("r", "*", "*"), lambda key, _: sure.append(key))
-    scene.actor.announce(keys.presence("r", "box", 7))
+    scene.own.watch_presence(keys.presence("r", "*", "*"), lambda key, _: seen.append(key))
+    scene.learner.watch_presence(keys.presence("r", "*", "*"), lambda key, _: sure.append(key))
+    scene.actor.declare_presence(keys.presence("r", "box", 7))
     scene.until_heard(lambda: None, lambda: bool(sure))
-    scene.own.ask(keys.join("r"), timeout=DENIED_SECONDS)
+    scene.own.query(keys.join("r"), timeout=DENIED_SECONDS)
     time.sleep(0.1)
     return bool(seen)
 
@@ -181,8 +181,8 @@ def test_all_see_the_learner_go(address: str, certificates: Path) -> None:
     with ExitStack() as stack:
         scene = Scene(address, certificates, "actor", stack)
         there: list[bool] = []
-        scene.own.watch(keys.learner("r"), lambda _, present: there.append(present))
-        scene.learner.announce(keys.learner("r"))
+        scene.own.watch_presence(keys.learner("r"), lambda _, present: there.append(present))
+        scene.learner.declare_presence(keys.learner("r"))
         scene.until_heard(lambda: None, lambda: there == [True])
         scene.learner.close()
         scene.until_heard(lambda: None, lambda: there == [True, False])
@@ -258,7 +258,7 @@ def test_a_name_that_was_revoked_may_do_nothing_any_more(tmp_path: Path) -> None
     address, router = listen_somewhere(folder / "router")
     router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
     with closing(router), closing(connect([address], unchecked(kept, arm.role, arm.name))) as actor:
-        assert actor.ask(keys.join("r"), timeout=DENIED_SECONDS) == []
+        assert actor.query(keys.join("r"), timeout=DENIED_SECONDS) == []
 
 
 @pytest.mark.parametrize(

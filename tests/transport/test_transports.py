@@ -104,8 +104,8 @@ def settle(declarer: Transport, other: Transport) -> None:
     """Waits until `other` can know all that `declarer` declared so far: declarations keep their order."""
     key = f"settled/{next(numbers)}"
     tape = Tape()
-    other.watch(key, tape)
-    declarer.announce(key)
+    other.watch_presence(key, tape)
+    declarer.declare_presence(key)
     assert tape.next() == (key, True)
 
 
@@ -121,14 +121,14 @@ def test_a_question_is_answered_with_its_key_and_payload_at_hand(pair: tuple[Tra
     server.serve("d/r/join", echo)
     settle(server, asker)
     payload = bytes(range(256)) * 1000
-    assert asker.ask("d/r/join", payload, timeout=WAIT) == [b"d/r/join " + payload]
-    assert asker.ask("d/r/join", timeout=WAIT) == [b"d/r/join "]
+    assert asker.query("d/r/join", payload, timeout=WAIT) == [b"d/r/join " + payload]
+    assert asker.query("d/r/join", timeout=WAIT) == [b"d/r/join "]
 
 
 def test_an_end_answers_itself(make_end: MakeEnd) -> None:
     end = make_end()
     end.serve("d/r/join", echo)
-    assert end.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
+    assert end.query("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
 
 
 def test_nobody_answers_a_question_that_nobody_serves(pair: tuple[Transport, Transport]) -> None:
@@ -136,16 +136,16 @@ def test_nobody_answers_a_question_that_nobody_serves(pair: tuple[Transport, Tra
     server.serve("d/r/join", echo)
     settle(server, asker)
     for key in ("d/r/other", "d/r", "d/r/join/more", "d/other/join"):
-        assert asker.ask(key, timeout=WAIT) == []
+        assert asker.query(key, timeout=WAIT) == []
 
 
 def test_a_served_wildcard_stands_for_one_chunk(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
     server.serve("d/r/rollouts/*", echo)
     settle(server, asker)
-    assert asker.ask("d/r/rollouts/a1", b"x", timeout=WAIT) == [b"d/r/rollouts/a1 x"]
-    assert asker.ask("d/r/rollouts", timeout=WAIT) == []
-    assert asker.ask("d/r/rollouts/a/b", timeout=WAIT) == []
+    assert asker.query("d/r/rollouts/a1", b"x", timeout=WAIT) == [b"d/r/rollouts/a1 x"]
+    assert asker.query("d/r/rollouts", timeout=WAIT) == []
+    assert asker.query("d/r/rollouts/a/b", timeout=WAIT) == []
 
 
 def test_an_asked_wildcard_reaches_all_that_match_and_each_sees_its_own_key(make_end: MakeEnd) -> None:
@@ -154,7 +154,7 @@ def test_an_asked_wildcard_reaches_all_that_match_and_each_sees_its_own_key(make
         end.serve(key, echo)
     settle(first, asker)
     settle(second, asker)
-    assert sorted(asker.ask("d/*/status", b"x", timeout=WAIT)) == [b"d/one/status x", b"d/two/status x"]
+    assert sorted(asker.query("d/*/status", b"x", timeout=WAIT)) == [b"d/one/status x", b"d/two/status x"]
 
 
 def test_every_server_of_one_key_answers(make_end: MakeEnd) -> None:
@@ -163,8 +163,8 @@ def test_every_server_of_one_key_answers(make_end: MakeEnd) -> None:
     second.serve("d/r/status", lambda request: request.reply(b"second"))
     settle(first, asker)
     settle(second, asker)
-    assert sorted(asker.ask("d/r/status", timeout=WAIT)) == [b"first", b"second"]
-    assert sorted(asker.ask("d/*/status", timeout=WAIT)) == [b"first", b"second"]
+    assert sorted(asker.query("d/r/status", timeout=WAIT)) == [b"first", b"second"]
+    assert sorted(asker.query("d/*/status", timeout=WAIT)) == [b"first", b"second"]
 
 
 def test_what_is_sent_is_answered_exactly_once(pair: tuple[Transport, Transport]) -> None:
@@ -178,16 +178,16 @@ def test_what_is_sent_is_answered_exactly_once(pair: tuple[Transport, Transport]
     settle(server, asker)
     tape = Tape()
     for index in range(20):
-        asker.send("d/r/rollouts/a", b"%d" % index, timeout=WAIT, on_answer=tape)
+        asker.query_async("d/r/rollouts/a", b"%d" % index, timeout=WAIT, on_answer=tape)
     assert sorted(tape.next() for _ in range(20)) == sorted(b"one %d" % index for index in range(20))
-    assert asker.ask("d/r/rollouts/a", b"last", timeout=WAIT) == [b"one last"]
+    assert asker.query("d/r/rollouts/a", b"last", timeout=WAIT) == [b"one last"]
     assert tape.empty()
 
 
 def test_what_nobody_serves_is_answered_by_none(pair: tuple[Transport, Transport]) -> None:
     _, asker = pair
     tape = Tape()
-    asker.send("d/r/nobody", b"x", timeout=WAIT, on_answer=tape)
+    asker.query_async("d/r/nobody", b"x", timeout=WAIT, on_answer=tape)
     assert tape.next() is None
 
 
@@ -196,7 +196,7 @@ def test_an_answer_may_come_later_and_from_another_thread(pair: tuple[Transport,
     requests, answers = Tape(), Tape()
     server.serve("d/r/program/*", requests)
     settle(server, asker)
-    asker.send("d/r/program/x", b"?", timeout=WAIT, on_answer=answers)
+    asker.query_async("d/r/program/x", b"?", timeout=WAIT, on_answer=answers)
     request = requests.next()
     assert (request.key, request.payload) == ("d/r/program/x", b"?")
     assert answers.empty()
@@ -205,7 +205,7 @@ def test_an_answer_may_come_later_and_from_another_thread(pair: tuple[Transport,
     thread.join(WAIT)
     assert answers.next() == b"!"
     request.reply(b"again")
-    asker.send("d/r/nobody", b"", timeout=WAIT, on_answer=answers)  # comes after whatever "again" could cause
+    asker.query_async("d/r/nobody", b"", timeout=WAIT, on_answer=answers)  # comes after whatever "again" could cause
     assert answers.next() is None
 
 
@@ -213,9 +213,9 @@ def test_a_request_that_is_forgotten_is_answered_by_none(make_end: MakeEnd) -> N
     server, asker = make_end(), make_end()
     server.serve("d/r/join", lambda request: None)
     settle(server, asker)
-    assert asker.ask("d/r/join", timeout=1.0) == []
+    assert asker.query("d/r/join", timeout=1.0) == []
     tape = Tape()
-    asker.send("d/r/join", b"x", timeout=1.0, on_answer=tape)
+    asker.query_async("d/r/join", b"x", timeout=1.0, on_answer=tape)
     assert tape.next() is None
 
 
@@ -224,7 +224,7 @@ def test_an_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
     requests = Tape()
     server.serve("d/r/join", requests)
     settle(server, asker)
-    answers = asker.ask("d/r/join", timeout=0.2)
+    answers = asker.query("d/r/join", timeout=0.2)
     requests.next().reply(b"late")
     assert answers == []
 
@@ -232,13 +232,13 @@ def test_an_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
 def test_an_end_that_closed_serves_no_more(make_end: MakeEnd) -> None:
     asker, server = make_end(), make_end()
     gone = Tape()
-    asker.watch("d/r/learner", gone)
+    asker.watch_presence("d/r/learner", gone)
     server.serve("d/r/join", echo)
-    server.announce("d/r/learner")
+    server.declare_presence("d/r/learner")
     assert gone.next() == ("d/r/learner", True)
     server.close()
     assert gone.next() == ("d/r/learner", False)
-    assert asker.ask("d/r/join", timeout=WAIT) == []
+    assert asker.query("d/r/join", timeout=WAIT) == []
 
 
 # ------------------------------------------------------------------------------------------ snapshots
@@ -247,7 +247,7 @@ def test_an_end_that_closed_serves_no_more(make_end: MakeEnd) -> None:
 def test_only_the_newest_value_is_kept(pair: tuple[Transport, Transport]) -> None:
     publisher, follower = pair
     news = Tape()
-    inbox = follower.follow("d/r/snapshots", lambda: news(None))
+    inbox = follower.subscribe("d/r/snapshots", lambda: news(None))
     settle(follower, publisher)
     assert inbox.take() is None
     for value in (b"1", b"2", b"3" * 100_000):
@@ -264,9 +264,9 @@ def test_only_the_newest_value_is_kept(pair: tuple[Transport, Transport]) -> Non
 def test_every_follower_gets_the_value_and_no_other_key_does(make_end: MakeEnd) -> None:
     publisher, first, second = make_end(), make_end(), make_end()
     first_news, second_news, other_news = Tape(), Tape(), Tape()
-    first_inbox = first.follow("d/r/snapshots", lambda: first_news(None))
-    other_inbox = second.follow("d/q/snapshots", lambda: other_news(None))
-    second_inbox = second.follow("d/r/snapshots", lambda: second_news(None))
+    first_inbox = first.subscribe("d/r/snapshots", lambda: first_news(None))
+    other_inbox = second.subscribe("d/q/snapshots", lambda: other_news(None))
+    second_inbox = second.subscribe("d/r/snapshots", lambda: second_news(None))
     settle(first, publisher)
     settle(second, publisher)
     publisher.publish("d/r/snapshots", b"x")
@@ -286,12 +286,12 @@ def test_a_value_that_nobody_follows_is_no_error(make_end: MakeEnd) -> None:
 def test_a_watch_tells_who_is_there_who_comes_and_who_goes(pair: tuple[Transport, Transport]) -> None:
     actor, learner = pair
     tape = Tape()
-    actor.announce("d/r/actors/early")
+    actor.declare_presence("d/r/actors/early")
     settle(actor, learner)
-    learner.watch("d/r/actors/*", tape)
+    learner.watch_presence("d/r/actors/*", tape)
     assert tape.next() == ("d/r/actors/early", True)
-    actor.announce("d/q/actors/elsewhere")
-    actor.announce("d/r/actors/late")
+    actor.declare_presence("d/q/actors/elsewhere")
+    actor.declare_presence("d/r/actors/late")
     assert tape.next() == ("d/r/actors/late", True)
     actor.close()
     assert sorted((tape.next(), tape.next())) == [("d/r/actors/early", False), ("d/r/actors/late", False)]
@@ -301,9 +301,9 @@ def test_a_watch_tells_who_is_there_who_comes_and_who_goes(pair: tuple[Transport
 def test_every_watch_is_told(make_end: MakeEnd) -> None:
     actor, first, second = make_end(), make_end(), make_end()
     tapes = [Tape(), Tape()]
-    first.watch("d/r/actors/*", tapes[0])
-    second.watch("d/r/actors/a", tapes[1])
-    actor.announce("d/r/actors/a")
+    first.watch_presence("d/r/actors/*", tapes[0])
+    second.watch_presence("d/r/actors/a", tapes[1])
+    actor.declare_presence("d/r/actors/a")
     assert [tape.next() for tape in tapes] == [("d/r/actors/a", True)] * 2
 
 
@@ -311,17 +311,17 @@ def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
     learner, first, second = make_end(), make_end(), make_end()
     shared, own = Tape(), Tape()
     for end, key in ((first, "d/r/actors/a"), (second, "d/r/actors/a"), (first, "d/r/own")):
-        end.announce(key)
+        end.declare_presence(key)
         settle(end, learner)
-    learner.watch("d/r/own", own)
+    learner.watch_presence("d/r/own", own)
     assert own.next() == ("d/r/own", True)
-    learner.watch("d/r/actors/*", shared)
+    learner.watch_presence("d/r/actors/*", shared)
     assert shared.next() == ("d/r/actors/a", True)
     while not shared.empty():  # one call for each end is as good as one for both
         assert shared.next() == ("d/r/actors/a", True)
     first.close()
     assert own.next() == ("d/r/own", False)
-    second.announce("d/r/actors/b")
+    second.declare_presence("d/r/actors/b")
     assert shared.next() == ("d/r/actors/b", True)
     second.close()
     assert sorted((shared.next(), shared.next())) == [("d/r/actors/a", False), ("d/r/actors/b", False)]
@@ -330,13 +330,13 @@ def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
 def test_closing_twice_is_closing_once(make_end: MakeEnd) -> None:
     learner, actor = make_end(), make_end()
     tape = Tape()
-    learner.watch("d/r/actors/*", tape)
-    actor.announce("d/r/actors/a")
+    learner.watch_presence("d/r/actors/*", tape)
+    actor.declare_presence("d/r/actors/a")
     assert tape.next() == ("d/r/actors/a", True)
     actor.close()
     actor.close()
     assert tape.next() == ("d/r/actors/a", False)
-    learner.announce("d/r/actors/own")
+    learner.declare_presence("d/r/actors/own")
     assert tape.next() == ("d/r/actors/own", True)
 
 
@@ -376,11 +376,11 @@ def test_a_client_is_answered_by_none_once_its_router_is_gone(closing: Callable[
     requests, answers = Tape(), Tape()
     router.serve("d/r/join", requests)
     settle(router, client)
-    client.send("d/r/join", b"", timeout=1.0, on_answer=answers)
+    client.query_async("d/r/join", b"", timeout=1.0, on_answer=answers)
     requests.next()
     router.close()
     assert answers.next() is None
-    assert client.ask("d/r/join", timeout=1.0) == []
+    assert client.query("d/r/join", timeout=1.0) == []
 
 
 @pytest.mark.parametrize("act", ["ask", "send", "publish"])
@@ -388,8 +388,8 @@ def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[T
     end = closing(listen_somewhere()[1])
     end.close()
     acts: dict[str, Callable[[], object]] = {
-        "ask": lambda: end.ask("d/r/join", timeout=1.0),
-        "send": lambda: end.send("d/r/join", b"", timeout=1.0, on_answer=Tape()),
+        "ask": lambda: end.query("d/r/join", timeout=1.0),
+        "send": lambda: end.query_async("d/r/join", b"", timeout=1.0, on_answer=Tape()),
         "publish": lambda: end.publish("d/r/snapshots", b""),
     }
     with pytest.raises(TransportError, match="d/r/"):
@@ -414,35 +414,35 @@ def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport
     router, end = client
     news, seen, there = Tape(), Tape(), Tape()
     end.serve("d/r/join", echo)
-    inbox = end.follow("d/r/snapshots", lambda: news("news"))
-    end.announce("d/r/actors/a")
-    router.announce("d/r/learner")
-    end.watch("d/r/learner", seen)
-    router.watch("d/r/actors/*", there)
+    inbox = end.subscribe("d/r/snapshots", lambda: news("news"))
+    end.declare_presence("d/r/actors/a")
+    router.declare_presence("d/r/learner")
+    end.watch_presence("d/r/learner", seen)
+    router.watch_presence("d/r/actors/*", there)
     router.serve("d/r/status", echo)
     assert (seen.next(), there.next()) == (("d/r/learner", True), ("d/r/actors/a", True))
     answers = Tape()
-    end.send("d/r/status", b"1", timeout=WAIT, on_answer=answers)
+    end.query_async("d/r/status", b"1", timeout=WAIT, on_answer=answers)
     assert answers.next() == b"d/r/status 1"
     assert end.reopen() is True
     # Who was there is gone for a moment: it may have left while the session was dead.
     assert [seen.next(), seen.next()] == [("d/r/learner", False), ("d/r/learner", True)]
     assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
     settle(end, router)
-    assert router.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
+    assert router.query("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
     router.publish("d/r/snapshots", b"7")
     news.next()
     assert inbox.take() == b"7"
-    end.send("d/r/status", b"2", timeout=WAIT, on_answer=answers)
+    end.query_async("d/r/status", b"2", timeout=WAIT, on_answer=answers)
     assert answers.next() == b"d/r/status 2"
 
 
 def test_a_client_that_others_reach_is_left_as_it_is(client: tuple[Transport, Transport]) -> None:
     router, end = client
     there = Tape()
-    router.watch("d/r/actors/*", there)
+    router.watch_presence("d/r/actors/*", there)
     end.serve("d/r/status", echo)
-    end.announce("d/r/actors/a")
+    end.declare_presence("d/r/actors/a")
     assert there.next() == ("d/r/actors/a", True)
     assert end.reopen(unless_served="d/r/status") is False
     assert end.reopen(unless_served="d/r/nobody") is True
@@ -457,7 +457,7 @@ def test_a_client_whose_router_is_gone_stays_as_it_is(closing: Callable[[Transpo
     router.close()
     with pytest.raises(TransportError, match="nothing answers"):
         end.reopen()
-    assert end.ask("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]  # itself
+    assert end.query("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]  # itself
 
 
 def test_a_closed_client_is_not_brought_back(client: tuple[Transport, Transport]) -> None:

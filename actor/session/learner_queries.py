@@ -13,11 +13,11 @@ from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
     EvaluationRequest,
-    Farewell,
     Join,
     Message,
     Program,
     Refusal,
+    RunEnded,
     Snapshot,
     Welcome,
 )
@@ -44,11 +44,11 @@ class NameTakenError(ActorError):
     """Another actor of that name takes part, or did a moment ago."""
 
 
-class OverError(Exception):
+class RunOverError(Exception):
     """Told to stop, or the run is over; the message says which."""
 
 
-class LearnerLink:
+class LearnerQueries:
     """Questions over a transport, their answers decoded."""
 
     def __init__(self, transport: Transport, say: Callable[[str], None], hint: str = "") -> None:
@@ -60,7 +60,7 @@ class LearnerLink:
     def find(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
         """Asks to join until a learner of `run` (`*`: of any) answers.
 
-        Raises OverError if told to stop; ActorError if refused, or after `timeout` seconds without an answer.
+        Raises RunOverError if told to stop; ActorError if refused, or after `timeout` seconds without an answer.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, told = _FIRST_RETRY_SECONDS, False
@@ -85,7 +85,7 @@ class LearnerLink:
                 self._say(f"waiting for {wanted}")
                 told = True
             if stop.wait(pause):
-                raise OverError("stopped")
+                raise RunOverError("stopped")
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
                 with contextlib.suppress(TransportError):  # no router there now: the session that is goes on looking
@@ -93,7 +93,7 @@ class LearnerLink:
                 reopen_at = time.monotonic() + _REOPEN_SECONDS
 
     def join(self, run: str, join: Join) -> Welcome | None:
-        """One request to join; None if nobody answers now. Raises ActorError or OverError if refused."""
+        """One request to join; None if nobody answers now. Raises ActorError or RunOverError if refused."""
         answers = self._ask(keys.join(run), encode(join))
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         if len(welcomes) > 1:
@@ -104,7 +104,7 @@ class LearnerLink:
         for refusal in answers:
             if isinstance(refusal, Refusal):
                 if refusal.code == "finished":
-                    raise OverError("the run is over")
+                    raise RunOverError("the run is over")
                 kind = NameTakenError if refusal.code == "name_taken" else ActorError
                 raise kind(f"the learner refused this actor: {refusal.reason}")
         return None
@@ -124,22 +124,22 @@ class LearnerLink:
         return None
 
     def newest(self, run: str) -> list[Message]:
-        """The newest snapshot, or the farewell, of a run."""
+        """The newest snapshot, or the run_ended, of a run."""
         return self._ask(keys.snapshots(run))
 
-    def policy_to_evaluate(self, run: str, evaluator: str, stop: threading.Event) -> Snapshot | None:
+    def evaluation_snapshot(self, run: str, evaluator: str, stop: threading.Event) -> Snapshot | None:
         """The newest snapshot, of which the learner keeps a checkpoint until `report`; None if it has none to give.
 
-        Raises OverError if the run is over, or if told to stop.
+        Raises RunOverError if the run is over, or if told to stop.
         """
         request = encode(EvaluationRequest(evaluator=evaluator))
         answer = self._ask_between_updates(keys.evaluations(run, evaluator), request, stop)
-        if isinstance(answer, Farewell) or (isinstance(answer, Refusal) and answer.code == "finished"):
-            raise OverError("the run is over")
+        if isinstance(answer, RunEnded) or (isinstance(answer, Refusal) and answer.code == "finished"):
+            raise RunOverError("the run is over")
         return answer if isinstance(answer, Snapshot) else None
 
     def report(self, run: str, report: EvaluationReport, stop: threading.Event) -> None:
-        """Tells the learner how a policy played; what it does not take is lost. Raises OverError if told to stop."""
+        """Tells the learner how a policy played; what it does not take is lost. Raises RunOverError if told to stop."""
         answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), stop)
         if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
             self._say(f"the learner did not take the evaluation: {answer.reason}")
@@ -158,21 +158,21 @@ class LearnerLink:
             return None
 
     def _ask_between_updates(self, key: str, payload: bytes, stop: threading.Event) -> Message | None:
-        """One question to the learner's main thread; None without an answer. Raises OverError if told to stop."""
+        """One question to the learner's main thread; None without an answer. Raises RunOverError if told to stop."""
         answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         try:
-            self._transport.send(key, payload, timeout=_UPDATE_SECONDS, on_answer=answers.put)
+            self._transport.query_async(key, payload, timeout=_UPDATE_SECONDS, on_answer=answers.put)
         except TransportError:
             return None
         while not stop.is_set():
             with contextlib.suppress(queue.Empty):
                 answer = answers.get(timeout=_HEARTBEAT_SECONDS)
                 return None if answer is None else self.decode(answer)
-        raise OverError("stopped")
+        raise RunOverError("stopped")
 
     def _ask(self, key: str, payload: bytes = b"") -> list[Message]:
         try:
-            answers = self._transport.ask(key, payload, timeout=_ANSWER_SECONDS)
+            answers = self._transport.query(key, payload, timeout=_ANSWER_SECONDS)
         except TransportError:
             return []
         return [message for message in map(self.decode, answers) if message is not None]
