@@ -68,7 +68,7 @@ class Spaces(Specification):
 # ------------------------------------------------------------------------------------------ the run
 
 
-Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # sketch: gymnasium's CarRacing, cheaply drawn
+Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # fast: CarRacing-v3 with a cheaper renderer
 
 
 class EnvironmentSpec(Specification):

@@ -74,7 +74,7 @@ def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tupl
 
 
 def test_the_sketch_is_of_car_racing_only() -> None:
-    with pytest.raises(EnvironmentSetupError, match=r"sketch draws CarRacing-v3 only, not CartPole-v1"):
+    with pytest.raises(EnvironmentSetupError, match=r"fast draws CarRacing-v3 only, not CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPole-v1", backend="fast"), 1)
 
 

@@ -183,7 +183,7 @@ def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     followed: list[object] = []
-    monkeypatch.setattr(MemoryTransport, "follow", lambda *arguments: followed.append(arguments))
+    monkeypatch.setattr(MemoryTransport, "subscribe", lambda *arguments: followed.append(arguments))
     monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
     learner = ScriptedLearner(network)
     learner.publish(3)
