@@ -75,16 +75,14 @@ def _range(kind: Any) -> str:
         f"{sign} {_number(getattr(c, name))}" for c in found for t, (name, sign) in _BOUNDS.items() if isinstance(c, t)
     ]
     bare = _bare(kind)
-    lengths = {type(c): c for c in found if isinstance(c, MinLen | MaxLen)}
     if get_origin(bare) is tuple:
         element = _range(get_args(bare)[0])
         signs += [f"each {element}"] if element else []
         if Ellipsis not in get_args(bare):
             return ", ".join([f"{len(get_args(bare))} values", *signs])
-    if lengths:
-        what = "characters" if bare is str else "values"
-        least = f"{lengths[MinLen].min_length} to" if MinLen in lengths else "at most"
-        signs.append(f"{least} {lengths[MaxLen].max_length:,} {what}")
+    least = next((f"{c.min_length} to" for c in found if isinstance(c, MinLen)), "at most")
+    what = "characters" if bare is str else "values"
+    signs += [f"{least} {c.max_length:,} {what}" for c in found if isinstance(c, MaxLen)]
     return ", ".join(signs)
 
 
