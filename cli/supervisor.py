@@ -97,7 +97,15 @@ def supervised_actor(name: str, connect: str, options: tuple[str, ...] = ()) -> 
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
         process = start(
-            "daedalus.cli.commands.actor", "--connect", connect, "--name", name, "--quiet", *options, one_thread=True
+            "daedalus.cli.commands.actor",
+            "--connect",
+            connect,
+            "--name",
+            name,
+            "--log-level",
+            "warning",
+            *options,
+            one_thread=True,
         )
         with suppress(AttributeError, OSError):  # not everywhere, and it may be gone already
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.settings_arguments import add_settings, resolve
@@ -107,6 +108,7 @@ def _check_listening(parsed: argparse.Namespace) -> None:
 
 def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
     """Everything between the settings and the exit status."""
+    configure_logging()
     stopping = stop_on_signals()
     wrap = parsed.wrap
     listening, address = _where(parsed)
@@ -195,7 +197,7 @@ def _evaluate(directory: Path, spec: RunSpec, wrap: str | None, stopping: thread
     began = time.monotonic()
     options = ["--episodes", str(spec.evaluation.final_episodes), *(["--wrap", wrap] if wrap else [])]
     try:
-        chosen = select_best(directory, spec, options, stopping, lambda text: print(text, flush=True))
+        chosen = select_best(directory, spec, options, stopping)
         (evaluation,) = play([[str(directory), *options]], stopping)
     except EvaluationFailedError:
         return False
