@@ -25,17 +25,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def example(guide: str, language: str = "python") -> str:
-    return code_blocks((DOCS / "guides" / guide).read_text("utf-8"), language)[0]
+def example(guide: str, language: str = "python", number: int = 0) -> str:
+    return code_blocks((DOCS / "guides" / guide).read_text("utf-8"), language)[number]
 
 
 def test_the_environment_can_be_played(folder: Path) -> None:
     (folder / "corridor.py").write_text(example("environment.md"))
-    environments = make_environments(EnvironmentSpec(id="corridor:Corridor-v0"), 2)
+    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
+    spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8})
+    environments = make_environments(spec, 2, wrap="corridor_wrappers:step_costs")
     assert environments.spaces.action.count == 2
     environments.reset(0)
-    steps = [environments.step(np.array([1, 0])) for _ in range(10)]
-    assert steps[-1][1].tolist() == [1.0, 0.0]
+    steps = [environments.step(np.array([1, 0])) for _ in range(8)]
+    assert steps[-1][1].tolist() == [0.99, -0.01]
     assert steps[-1][2].tolist() == [True, False]
     environments.close()
 
