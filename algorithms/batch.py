@@ -10,7 +10,7 @@ from torch import Tensor
 
 from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

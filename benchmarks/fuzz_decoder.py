@@ -20,10 +20,12 @@ atheris: Any = importlib.import_module("atheris")  # an extra of its own, which 
 with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
     from daedalus.learner.serving.fleet import Fleet
     from daedalus.learner.serving.intake import Intake
-    from daedalus.protocol.codec import Limits, ProtocolError, decode
+    from daedalus.protocol.codec import ProtocolError, decode
     from daedalus.protocol.compact import bits_of
+    from daedalus.protocol.limits import Limits
     from daedalus.protocol.messages import CompactSnapshot, Join
-    from daedalus.protocol.spec import ArraySpace, DiscreteSpace, RunSpec, Spaces
+    from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+    from daedalus.protocol.spec import RunSpec
 
 _GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
 _LIMITS = Limits(max_bytes=1 << 20)

@@ -25,7 +25,8 @@ from running import machine, table
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.optimizers import Adam, FlatParameters
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec
 
 # Name: policy, observations, rows, environments.
 NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {

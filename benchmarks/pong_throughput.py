@@ -31,7 +31,7 @@ from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import DiscreteSpace, Spaces
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
 
 ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
 SETTINGS = {

@@ -22,9 +22,10 @@ from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.cli.processes import stop_on_signals
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Snapshot, SnapshotPart, SnapshotRequest
-from daedalus.protocol.spec import RunStatus
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, RunStatus
 
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 

@@ -22,7 +22,8 @@ from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import EvaluationReport, Refusal
-from daedalus.protocol.spec import RunSpec, RunStatus
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:

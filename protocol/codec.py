@@ -17,7 +17,6 @@ name both. Nothing that is read executes, and no size that a message declares is
 is held against `Limits`. This file knows no key, no transport and no state.
 """
 
-import dataclasses
 import math
 import struct
 import threading
@@ -30,6 +29,7 @@ import zstandard
 from pydantic import ValidationError
 
 from daedalus.protocol import schema
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import CompactSnapshot, Message, Program, Rollout
 
 PROTOCOL_VERSION = 5
@@ -43,21 +43,6 @@ _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)
 _COMPRESSED = (Rollout, Program, CompactSnapshot)  # weights are noise to zstd; the rest is small
 _LEVEL, _BYTES_LEVEL = -1, 1  # zstd's: what is cheap for numbers leaves pixels and byte planes twice as large
 _MAX_DIMENSIONS = 8
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """What a message may ask of its reader before anything is known about it.
-
-    Attributes:
-      max_bytes: largest body after decompression; also the largest message.
-      max_header_bytes: largest header.
-      max_arrays: most arrays in one message.
-    """
-
-    max_bytes: int = 64 << 20
-    max_header_bytes: int = 256 << 10
-    max_arrays: int = 4096
 
 
 class ProtocolError(Exception):

@@ -7,7 +7,7 @@ rollout from the frames that came. Pure numpy; this file does not know how frame
 
 import numpy as np
 
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 
 class FrameStack:

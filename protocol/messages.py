@@ -12,7 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from daedalus.protocol.spec import RunSpec, RunStatus, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

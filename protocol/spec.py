@@ -7,66 +7,9 @@ specification and sends it whole to every actor that joins. This file does not k
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import Field, JsonValue, model_validator
 
-PositiveInt = Annotated[int, Field(ge=1)]
-NaturalInt = Annotated[int, Field(ge=0)]
-UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
-
-
-class Specification(BaseModel):
-    """Base of every specification: immutable, and strict about names it does not know."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-# ---------------------------------------------------------------------------------------------- spaces
-
-
-class ArraySpace(Specification):
-    """Arrays of one shape and dtype (gymnasium's Box), as they travel: `float32` or `uint8`.
-
-    An environment shows one frame at a step; the policy sees the newest `frames` of them, stacked on a first axis of
-    their own where there is more than one.
-    """
-
-    kind: Literal["array"] = "array"
-    shape: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=4)]  # of one frame
-    dtype: Literal["float32", "uint8"]
-    frames: Annotated[int, Field(ge=1, le=16)] = 1
-
-    @property
-    def stacked_shape(self) -> tuple[int, ...]:
-        """The shape that the policy sees."""
-        return self.shape if self.frames == 1 else (self.frames, *self.shape)
-
-    def __str__(self) -> str:
-        stacked = f", {self.frames} stacked" if self.frames > 1 else ""
-        return f"{self.dtype} array of shape {self.shape}{stacked}"
-
-
-class DiscreteSpace(Specification):
-    """One of `count` choices, numbered from 0 (gymnasium's Discrete, its `start` taken away)."""
-
-    kind: Literal["discrete"] = "discrete"
-    count: Annotated[int, Field(ge=1, le=65_536)]
-
-    def __str__(self) -> str:
-        return f"{self.count} choices"
-
-
-class Spaces(Specification):
-    """What an environment shows and what it can be told; the actor finds them, the learner holds all to them."""
-
-    observation: ArraySpace
-    action: DiscreteSpace
-
-    def __str__(self) -> str:
-        return f"observation: {self.observation}; action: {self.action}"
-
-
-# ------------------------------------------------------------------------------------------ the run
-
+from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # fast: CarRacing-v3 with a cheaper renderer
 
@@ -80,7 +23,7 @@ class EnvironmentSpec(Specification):
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
     backend: Backend = "gymnasium"  # whose implementation of it
-    kwargs: dict[str, JsonValue] = {}
+    kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     processes: bool = False  # on gymnasium's backend: each in a process of its own, where the environment is slow
     max_episode_steps: PositiveInt | None = None  # in the environment's own steps
 
@@ -227,51 +170,3 @@ class RunSpec(Specification):
     def synchronous(self) -> bool:
         """Whether actors wait for each update (a2c) or never do."""
         return self.training.algorithm == "a2c"
-
-
-# ---------------------------------------------------------------------------------------------- status
-
-
-class ActorStatus(Specification):
-    """One actor as the learner sees it."""
-
-    actor: str
-    alive: bool
-    quarantined: str  # why nothing is taken from it any more; empty if it is not
-    lives: int  # incarnations that joined
-    seconds_since_seen: float
-    environments: int
-    env_steps: int  # trained on
-    env_steps_per_second: float
-    rollouts_accepted: int
-    rollouts_rejected: dict[str, int]  # by cause
-    rollouts_missed: int  # sequence numbers that never came
-    busy_answers: int  # how often it was told to come again later
-    policy_lag: int  # of its newest rollout
-    compact_snapshots: bool  # it asks for snapshots that fit its link; to all others every one is pushed
-    bytes_up_per_hour: float  # rollouts, at the rate of the last seconds
-    bytes_down_per_hour: float  # snapshots
-
-
-class RunStatus(Specification):
-    """The fleet as the learner sees it; the answer to a `status` query."""
-
-    run: str
-    learner_epoch: int
-    algorithm: str
-    environment: str
-    problems: tuple[str, ...]  # what keeps the service from doing its work; healthy if there are none
-    uptime_seconds: float  # of this life
-    env_steps: int
-    env_steps_budget: int
-    updates: int
-    updates_skipped: int  # of them, those whose gradient was not finite: they changed nothing
-    episode_return_mean: float | None
-    env_steps_per_second: float
-    updates_per_second: float
-    policy_lag_mean: float
-    queue_bytes: int  # rollouts that wait to be judged
-    queue_bytes_limit: int
-    checkpoint_age_seconds: float | None  # None before the first of this life
-    rollouts_rejected: dict[str, int]  # by cause, also from senders that never joined
-    actors: tuple[ActorStatus, ...]

@@ -9,7 +9,8 @@ import torch
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces, TrainingSpec
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec, TrainingSpec
 
 EPOCH = 77
 ROWS, ENVIRONMENTS = 6, 3

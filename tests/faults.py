@@ -13,9 +13,10 @@ import numpy as np
 
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
 CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))

@@ -9,7 +9,8 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.learner.training.checkpoint import save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_name
-from daedalus.protocol.spec import EnvironmentSpec, RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=4)
 CARTPOLE = EnvironmentSpec(id="CartPole-v1")

@@ -12,11 +12,12 @@ import numpy as np
 
 from daedalus.actor.collecting.player import Wait
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.actor.environments.make import Transforms
+from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
-from daedalus.protocol.spec import RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 _HELD_ROLLOUTS = 8  # that are full and not yet taken by the service; the oldest gives way
 _REFRESH_SECONDS = 0.2  # how soon newer weights are noticed while a rollout fills

@@ -3,7 +3,7 @@
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.actor.environments.make import VectorEnvironment
+from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spec import EnvironmentSpec

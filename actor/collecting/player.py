@@ -4,10 +4,12 @@ from collections.abc import Callable
 from typing import Protocol
 
 from daedalus.actor.collecting.collector import Collector
-from daedalus.actor.environments.make import VectorEnvironment, make_environments
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
-from daedalus.protocol.spec import EnvironmentSpec, RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 Wait = Callable[[Callable[[], bool], float], bool]  # until something holds, so many seconds at most; whether it does
 

@@ -1,55 +1,13 @@
 """Acts for E environments and writes down what comes of it, row by row. No network, no threads, no environments."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from daedalus.actor.collecting.episode_counter import EpisodeCounter
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import FrameStack
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spec import ArraySpace, EnvironmentSpec, Spaces
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FinishedEpisodes:
-    """The episodes that ended in some rows, in the order of their ends."""
-
-    returns: np.ndarray  # [K] float32, undiscounted and unscaled
-    lengths: np.ndarray  # [K] int32, env_steps
-
-
-class EpisodeCounter:
-    """Follows E environments' running episodes; says which rows are valid and which episodes ended."""
-
-    def __init__(self, count: int) -> None:
-        self._returns = np.zeros(count, np.float64)
-        self._lengths = np.zeros(count, np.int32)
-        self._ended = np.zeros(count, np.bool_)
-        self._finished: list[tuple[np.ndarray, np.ndarray]] = []
-
-    @property
-    def valid(self) -> np.ndarray:
-        """[E] whether the next step is a real one, and not the reset after an episode's end."""
-        return ~self._ended
-
-    def step(self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
-        """Takes in one row: unscaled rewards [E], terminated [E], truncated [E]."""
-        self._returns += rewards
-        self._lengths += ~self._ended
-        self._ended = terminated | truncated
-        if self._ended.any():
-            self._finished.append((self._returns[self._ended], self._lengths[self._ended]))
-            self._returns[self._ended] = 0.0
-            self._lengths[self._ended] = 0
-
-    def take_finished(self) -> FinishedEpisodes:
-        """The episodes that ended since the last call."""
-        finished, self._finished = self._finished, []
-        returns, lengths = zip(*finished, strict=True) if finished else ((), ())
-        return FinishedEpisodes(
-            returns=np.concatenate([np.zeros(0), *returns]).astype(np.float32),
-            lengths=np.concatenate([np.zeros(0, np.int32), *lengths]),
-        )
+from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec
 
 
 class RolloutWriter:

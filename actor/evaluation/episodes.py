@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.actor.collecting.rollout_writer import EpisodeCounter
-from daedalus.actor.environments.make import VectorEnvironment
+from daedalus.actor.collecting.episode_counter import EpisodeCounter
+from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import FrameStack
 from daedalus.protocol.spec import EnvironmentSpec

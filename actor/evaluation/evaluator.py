@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from daedalus.actor.environments.make import VectorEnvironment, make_environments
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
 from daedalus.actor.session.learner_queries import LearnerQueries, RunOverError
 from daedalus.actor.session.service import ActorConfig

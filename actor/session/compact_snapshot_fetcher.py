@@ -9,8 +9,9 @@ import time
 from collections.abc import Callable
 
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.compact import Bits, bits_of, float32
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import CompactSnapshot, Message, Snapshot, SnapshotPart, SnapshotRequest
 from daedalus.transport.interface import Transport, TransportError
 

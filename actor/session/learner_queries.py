@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, VersionMismatchError, decode, encode
+from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,

@@ -19,7 +19,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spec import Spaces
+from daedalus.protocol.spaces import Spaces
 from daedalus.transport.interface import Transport
 
 _DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks for it

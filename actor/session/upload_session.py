@@ -10,7 +10,8 @@ from collections.abc import Callable
 from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
 from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join
 from daedalus.transport.interface import Transport, TransportError
 

@@ -8,7 +8,8 @@ from typing import Any, cast
 
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.cli.processes import stop_on_signals
-from daedalus.protocol.codec import Limits, decode
+from daedalus.protocol.codec import decode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Rollout
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import Transport

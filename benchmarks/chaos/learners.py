@@ -16,7 +16,8 @@ from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scen
 from daedalus.learner.training.checkpoint import load_newest, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, PolicySpec, RunSpec, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
 
 
 def kills(count: int) -> list[tuple[str, str]]:

@@ -17,9 +17,10 @@ from processes import Running, processes_mentioning
 
 from benchmarks.running import COMMAND
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import StatusReport
-from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, RunStatus
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.zenoh_transport import connect
 

@@ -12,7 +12,8 @@ from pathlib import Path
 from faults import Sender
 
 from benchmarks.chaos.scene import ENDLESS, FailedError, Scene, resident_mib, say, scene
-from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import Limits
 
 _QUEUE_MIB = 16
 # Updates that take long beside what a rollout costs to send: else one machine could not send ten times too many.

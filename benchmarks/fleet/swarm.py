@@ -21,9 +21,10 @@ import numpy as np
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.connecting import connect_with_retry
 
 SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))

@@ -5,7 +5,7 @@ Exit status: 0 the run is over, 1 failed, 2 bad usage.
 
 import sys
 
-from daedalus.actor.environments.make import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorService

@@ -14,7 +14,8 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.commands.evaluate_arguments import check, parser

@@ -5,9 +5,10 @@ import sys
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import StatusReport
-from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, RunStatus
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.zenoh_transport import connect

@@ -7,7 +7,8 @@ import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.spec import RunSpec, RunStatus
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 
 _STALLED_SECONDS = 60.0  # without an update for so long, something is wrong
 _ALONE_SECONDS = 10.0  # and without an actor

@@ -25,7 +25,8 @@ from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.learner.serving.snapshot_publisher import Publisher
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -34,7 +35,9 @@ from daedalus.protocol.messages import (
     Rollout,
     StatusReport,
 )
-from daedalus.protocol.spec import RunSpec, RunStatus, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop

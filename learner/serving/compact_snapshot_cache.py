@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import Bits, bfloat16, planes
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import CompactSnapshot, Refusal, Snapshot, SnapshotPart, SnapshotRequest
 
 # A part waits in the router for its reader's link. What is larger than a router's buffers for one reader would, while

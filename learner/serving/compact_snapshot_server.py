@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.learner.serving.request_queue import RequestQueue
-from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Refusal, SnapshotRequest
 from daedalus.transport.interface import Request
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
-from daedalus.protocol.spec import ActorStatus, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.status import ActorStatus
 
 _MOST_ACTORS = 16_384  # remembered at once
 _REMEMBERED_LIVES = 8

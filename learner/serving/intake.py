@@ -11,9 +11,11 @@ from typing import Literal
 import numpy as np
 
 from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.protocol.codec import Limits, ProtocolError, decode
+from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Rollout
-from daedalus.protocol.spec import RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 _ROW_BYTES = 1 + 2 + 4 * 4 + 8  # an environment's share of a row without its observation, rounded up
 _SLACK_BYTES = 64 << 10

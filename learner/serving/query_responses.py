@@ -7,7 +7,8 @@ puts it on the wire.
 import threading
 
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.codec import Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
 

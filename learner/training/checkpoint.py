@@ -18,7 +18,8 @@ from torch import Tensor
 
 from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, SavedPolicy, checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
-from daedalus.protocol.spec import RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 _STATE_FILE = "learner.safetensors"
 

@@ -27,7 +27,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.distributions import categorical_log_probs
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import ArraySpace, PolicySpec, Spaces, TrainingSpec
+from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 
 class Estimates(NamedTuple):

@@ -16,7 +16,7 @@ from daedalus.policy.acting.runtime import LOGITS, NEXT_STATE, OBSERVATIONS, STA
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 _OPSET = 17
 

@@ -7,7 +7,8 @@ from daedalus.policy.acting.runtime import PolicyError
 from daedalus.policy.acting.sampling import greedy_categorical, sample_categorical
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spec import PolicySpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import PolicySpec
 
 
 class TorchRuntime:

@@ -5,7 +5,8 @@ from torch import Tensor, nn
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
-from daedalus.protocol.spec import PolicySpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import PolicySpec
 
 _POLICY_GAIN = 0.01  # the first policy is nearly uniform, whatever the observation
 

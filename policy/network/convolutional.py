@@ -10,7 +10,7 @@ from torch.nn import functional
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.images import ImageLayout, as_floats
 from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 _GAIN = math.sqrt(2.0)  # of a layer before a rectifier
 

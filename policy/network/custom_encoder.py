@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 
 class CustomEncoder(nn.Module):

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.layers import orthogonal
-from daedalus.protocol.spec import ArraySpace, PolicySpec
+from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spec import PolicySpec
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _GAIN = math.sqrt(2.0)

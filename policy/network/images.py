@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 _MAX_COLOURS = 4  # a last axis of at most so many holds the colours of a pixel
 

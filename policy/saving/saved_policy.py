@@ -16,7 +16,8 @@ import safetensors.numpy
 
 from daedalus.policy.saving.best_checkpoints import best_checkpoints
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
-from daedalus.protocol.spec import RunSpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
 PRETRAINED = Path(__file__).parents[1] / "pretrained"

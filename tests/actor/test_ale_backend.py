@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 pytest.importorskip("ale_py.vector_env")

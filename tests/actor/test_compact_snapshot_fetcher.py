@@ -10,10 +10,12 @@ from daedalus.actor.session import compact_snapshot_fetcher as compact_snapshots
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, float32
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Message, RunEnded, Snapshot, SnapshotPart, SnapshotRequest
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request
+from daedalus.transport.interface import Request
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 FIRST = {"w": np.random.default_rng(1).normal(size=(500, 800)).astype(np.float32)}
 

@@ -8,8 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments
-from daedalus.actor.environments.make import EnvironmentSetupError, make_environments
+from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 with warnings.catch_warnings():

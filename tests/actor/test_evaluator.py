@@ -17,7 +17,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -30,8 +31,10 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, RunSpec, Spaces
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.transport.interface import Request
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
 def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:

@@ -11,9 +11,11 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps
-from daedalus.actor.environments.make import EnvironmentSetupError, VectorEnvironment, make_environments
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5

@@ -18,7 +18,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
     Join,
@@ -31,8 +32,10 @@ from daedalus.protocol.messages import (
     SnapshotRequest,
     Welcome,
 )
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, RunSpec, Spaces
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Request, TransportError
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.transport.interface import Request, TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}

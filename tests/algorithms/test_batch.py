@@ -9,7 +9,7 @@ from building import ENVIRONMENTS, ROWS, SPACES, identity, join, make_rollout
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import ArraySpace
+from daedalus.protocol.spaces import ArraySpace
 
 CPU = torch.device("cpu")
 COPIED = ("actions", "behaviour_log_probs", "rewards", "terminated", "truncated", "valid")

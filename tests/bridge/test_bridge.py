@@ -13,7 +13,8 @@ from daedalus.bridge import connection as client_module
 from daedalus.bridge import service as service_module
 from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Packet, encode_packet
 from daedalus.bridge.service import Bridge
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, Transport, TransportError
+from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 HEADER = struct.Struct("<IBBHI")  # once more, by hand
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from daedalus.protocol.spec import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, RunStatus
 
 
 def actor_status(name: str, **changes: Any) -> ActorStatus:

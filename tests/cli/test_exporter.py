@@ -11,7 +11,8 @@ from daedalus.cli.commands.exporter import StatusCollector, exporter
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import StatusReport
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, TransportError
+from daedalus.transport.interface import TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 UNUSED = "tcp/127.0.0.1:1"
 

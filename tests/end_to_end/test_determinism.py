@@ -13,7 +13,7 @@ from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import choose_algorithm, override, read_preset, run_spec
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
 

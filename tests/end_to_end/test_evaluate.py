@@ -25,7 +25,8 @@ from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
-from daedalus.protocol.spec import DiscreteSpace, EnvironmentSpec, RunSpec
+from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 Start = Callable[..., Running]
 

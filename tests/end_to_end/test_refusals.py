@@ -7,9 +7,10 @@ import pytest
 from processes import Running, until
 
 from daedalus.protocol import keys
-from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, decode, encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect, listen
 

@@ -11,10 +11,12 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Program, Refusal, Rollout, RunEnded, Snapshot, Welcome
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
-from daedalus.transport.interface import MemoryTransport, Request
+from daedalus.transport.interface import Request
+from daedalus.transport.memory import MemoryTransport
 
 SPEC = RunSpec(
     environment=EnvironmentSpec(id="CartPole-v1", reward_scale=0.05, max_episode_steps=40),

@@ -20,7 +20,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.messages import Acknowledgement, Refusal
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 Start = Callable[..., Running]
 

@@ -14,7 +14,8 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol import keys
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -25,8 +26,10 @@ from daedalus.protocol.messages import (
     RunEnded,
     Snapshot,
 )
-from daedalus.protocol.spec import RunSpec, RunStatus
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport, TransportError
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
+from daedalus.transport.interface import TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 REPORT = EvaluationReport(
     evaluator="e",

@@ -5,8 +5,9 @@ import pytest
 
 from daedalus.learner.serving import compact_snapshot_cache as compact_cache
 from daedalus.learner.serving.compact_snapshot_cache import PART_BYTES, CompactSnapshotCache
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, bits_of, float32
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     CompactSnapshot,
     Message,

@@ -13,7 +13,8 @@ from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoin
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import ArraySpace, PolicySpec, Spaces, TrainingSpec
+from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device here")
 

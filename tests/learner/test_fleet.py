@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from daedalus.learner.serving.fleet import Fleet, SequenceWindow
 from daedalus.protocol.messages import Join, Refusal
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 WINDOW = 1024
 HUGE = 2**62

@@ -14,7 +14,7 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RunEnded
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
 

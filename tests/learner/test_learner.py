@@ -16,7 +16,8 @@ from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoin
 from daedalus.learner.training.learner import METRICS, Learner
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import ArraySpace, PolicySpec, TrainingSpec
+from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 STEPS = 5
 

@@ -18,7 +18,7 @@ from daedalus.learner.service import LearnerService
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.interface import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
 

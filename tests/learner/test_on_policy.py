@@ -15,9 +15,11 @@ from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.distributions import categorical_log_probs
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, Spaces
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 POLICIES = {

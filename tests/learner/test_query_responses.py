@@ -6,7 +6,8 @@ import numpy as np
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Message, Program, Refusal, RunEnded, Welcome
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 

@@ -9,7 +9,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, PolicySpec, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec
 
 Weights = dict[str, np.ndarray]
 

@@ -13,7 +13,8 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.encoders import MultilayerPerceptron, build_encoder
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.memory import Gru
-from daedalus.protocol.spec import ArraySpace, PolicySpec
+from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spec import PolicySpec
 
 ENCODERS = ("small", "nature", "impala", "article")
 

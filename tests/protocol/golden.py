@@ -28,7 +28,9 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spec import ActorStatus, ArraySpace, DiscreteSpace, EnvironmentSpec, RunSpec, RunStatus, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.status import ActorStatus, RunStatus
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4

@@ -23,20 +23,17 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
-    ActorStatus,
-    ArraySpace,
     CollectionSpec,
-    DiscreteSpace,
     EnvironmentSpec,
     EvaluationSpec,
     PolicySpec,
     RunSpec,
-    RunStatus,
     ServiceSpec,
-    Spaces,
     TrainingSpec,
 )
+from daedalus.protocol.status import ActorStatus, RunStatus
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)

@@ -20,7 +20,8 @@ from wire_format import (
     wire_header,
 )
 
-from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Program,
     RunEnded,

@@ -12,10 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daedalus.actor.collecting.collector import Collector
-from daedalus.protocol.codec import Limits, decode, encode
+from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spec import ArraySpace, DiscreteSpace, EnvironmentSpec, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 

@@ -10,7 +10,8 @@ import zstandard
 from golden import FOLDER, MESSAGES, path
 from wire_format import PREFIX, the_same
 
-from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, VersionMismatchError, decode, encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, VersionMismatchError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Message
 
 OLD = sorted(FOLDER.glob("v*/*.bin"))

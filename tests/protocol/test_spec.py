@@ -4,21 +4,18 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
-    ActorStatus,
-    ArraySpace,
     CollectionSpec,
-    DiscreteSpace,
     EnvironmentSpec,
     EvaluationSpec,
     PolicySpec,
     RunSpec,
-    RunStatus,
     ServiceSpec,
-    Spaces,
-    Specification,
     TrainingSpec,
 )
+from daedalus.protocol.specification import Specification
+from daedalus.protocol.status import ActorStatus, RunStatus
 
 ENVIRONMENT = {"id": "CartPole-v1"}
 SPACES = {"observation": {"shape": [4], "dtype": "float32"}, "action": {"count": 2}}

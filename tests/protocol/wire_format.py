@@ -9,7 +9,8 @@ import msgpack
 import numpy as np
 from hypothesis import settings
 
-from daedalus.protocol.codec import PROTOCOL_VERSION, Limits, ProtocolError, decode, encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
     Join,
     Message,
@@ -18,13 +19,8 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spec import (
-    ArraySpace,
-    DiscreteSpace,
-    EnvironmentSpec,
-    RunSpec,
-    Spaces,
-)
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 LIMITS = Limits()
 PREFIX = struct.Struct("<4sHHI")

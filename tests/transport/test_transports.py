@@ -12,14 +12,8 @@ from typing import Any
 
 import pytest
 
-from daedalus.transport.interface import (
-    AddressInUseError,
-    MemoryNetwork,
-    MemoryTransport,
-    Request,
-    Transport,
-    TransportError,
-)
+from daedalus.transport.interface import AddressInUseError, Request, Transport, TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 from daedalus.transport.zenoh_transport import connect, listen
 
 WAIT = 30.0  # seconds; generous, so that only a real fault reaches it

@@ -1,0 +1,71 @@
+"""A specification's action table and pixel transforms, around a backend's environments."""
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.action_table import env_actions
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.interface import BackendEnvironments, Step
+from daedalus.actor.environments.pixels import Pixels
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec
+
+
+class Transforms:
+    """A specification's action table and pixel transforms, between an environment's spaces and the run's."""
+
+    def __init__(
+        self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
+    ) -> None:
+        """Raises EnvironmentSetupError if they do not fit."""
+        if not isinstance(observation_space, gymnasium.spaces.Box) or not 1 <= len(observation_space.shape) <= 4:
+            raise EnvironmentSetupError(
+                f"observation space {observation_space} is not supported: it must be a Box of one to four dimensions"
+            )
+        self._actions = env_actions(spec.action_table, action_space)
+        self._pixels = Pixels(spec, observation_space)
+        dtype = "uint8" if observation_space.dtype == np.uint8 else "float32"
+        self.spaces = Spaces(
+            observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
+            action=DiscreteSpace(count=len(self._actions)),
+        )
+
+    def frames(self, frames: np.ndarray) -> np.ndarray:
+        """[E, *the environment's shape] as the run has them: [E, *frame_shape]."""
+        return self._pixels(frames)
+
+    def env_actions(self, choices: np.ndarray) -> np.ndarray:
+        """[E] choices as the environment takes them: [E, *action_shape]."""
+        return self._actions[choices]
+
+
+class TransformedEnvironment:
+    """A bare environment seen through a specification's transforms."""
+
+    def __init__(self, bare: BackendEnvironments, spec: EnvironmentSpec) -> None:
+        """Raises EnvironmentSetupError if the two do not fit."""
+        self._bare = bare
+        self._transforms = Transforms(spec, bare.observation_space, bare.action_space)
+
+    @property
+    def count(self) -> int:
+        """See VectorEnvironment."""
+        return self._bare.count
+
+    @property
+    def spaces(self) -> Spaces:
+        """See VectorEnvironment."""
+        return self._transforms.spaces
+
+    def reset(self, seed: int) -> np.ndarray:
+        """See VectorEnvironment."""
+        return self._transforms.frames(self._bare.reset(seed))
+
+    def step(self, actions: np.ndarray) -> Step:
+        """See VectorEnvironment."""
+        frames, rewards, terminated, truncated = self._bare.step(self._transforms.env_actions(actions))
+        return self._transforms.frames(frames), rewards, terminated, truncated
+
+    def close(self) -> None:
+        """See VectorEnvironment."""
+        self._bare.close()

@@ -1,0 +1,155 @@
+"""The transport within one process: for tests, and for an actor and a learner in one program."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from daedalus.transport.interface import Inbox, OnAnswer, Request
+
+
+class _MemoryRequest:
+    def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes | None], None]) -> None:
+        self.key, self.payload, self.size = key, payload, len(payload)
+        self._on_answer: Callable[[bytes | None], None] | None = on_answer
+
+    def reply(self, payload: bytes) -> None:
+        self._answer(payload)
+
+    def __del__(self) -> None:
+        self._answer(None)  # forgotten by who served it
+
+    def _answer(self, payload: bytes | None) -> None:
+        on_answer, self._on_answer = self._on_answer, None
+        if on_answer is not None:
+            on_answer(payload)
+
+
+class _MemoryInbox:
+    def __init__(self, key: str, on_news: Callable[[], None]) -> None:
+        self.key, self.on_news, self.newest = key, on_news, None
+
+    def put(self, payload: bytes) -> None:
+        self.newest: bytes | None = payload
+        self.on_news()
+
+    def take(self) -> bytes | None:
+        newest, self.newest = self.newest, None
+        return newest
+
+    def close(self) -> None:
+        self.key = ""
+
+
+class MemoryNetwork:
+    """Joins the MemoryTransports made with it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.ends: list[MemoryTransport] = []
+
+
+def _matches(pattern: str, key: str) -> bool:
+    """Whether two keys meet; `*` on either side stands for one chunk."""
+    left, right = pattern.split("/"), key.split("/")
+    return len(left) == len(right) and all(a == b or "*" in (a, b) for a, b in zip(left, right, strict=True))
+
+
+class MemoryTransport:
+    """A Transport within one process: the same promises, no sockets, handlers run on the caller's thread."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self._network = network
+        self._served: dict[str, Callable[[Request], None]] = {}
+        self._inboxes: list[_MemoryInbox] = []
+        self._announced: set[str] = set()
+        self._watches: list[tuple[str, Callable[[str, bool], None]]] = []
+        with network.lock:
+            network.ends.append(self)
+
+    def _ends(self) -> list["MemoryTransport"]:
+        with self._network.lock:
+            return list(self._network.ends)
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> None:
+        """See Transport."""
+        self._served[key] = handler
+
+    def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        """See Transport."""
+        answers: list[bytes] = []
+        answered = threading.Semaphore(0)
+
+        def on_answer(answer: bytes | None) -> None:
+            if answer is not None:
+                answers.append(answer)
+            answered.release()
+
+        handlers = self._handlers(key)
+        for served, handler in handlers:
+            handler(_MemoryRequest(served, payload, on_answer))
+        deadline = time.monotonic() + timeout
+        for _ in handlers:
+            answered.acquire(timeout=max(deadline - time.monotonic(), 0.0))
+        return list(answers)
+
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
+        """See Transport. Within a process no answer is lost, so no timer is kept for one."""
+        handlers = self._handlers(key)
+        if not handlers:
+            on_answer(None)
+        for served, handler in handlers[:1]:
+            handler(_MemoryRequest(served, payload, on_answer))
+
+    def _handlers(self, key: str) -> list[tuple[str, Callable[[Request], None]]]:
+        return [
+            (key if "*" in served else served, handler)
+            for end in self._ends()
+            for served, handler in end._served.items()
+            if _matches(served, key)
+        ]
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """See Transport."""
+        for end in self._ends():
+            for inbox in end._inboxes:
+                if _matches(inbox.key, key):
+                    inbox.put(payload)
+
+    def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
+        """See Transport."""
+        inbox = _MemoryInbox(key, on_news)
+        self._inboxes.append(inbox)
+        return inbox
+
+    def declare_presence(self, key: str) -> None:
+        """See Transport."""
+        self._announced.add(key)
+        self._tell(key, True)
+
+    def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+        """See Transport."""
+        self._watches.append((key, on_change))
+        for end in self._ends():
+            for announced in list(end._announced):
+                if _matches(key, announced):
+                    on_change(announced, True)
+
+    def _tell(self, key: str, present: bool) -> None:
+        for end in self._ends():
+            for pattern, on_change in end._watches:
+                if _matches(pattern, key):
+                    on_change(key, present)
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        """See Transport. There is no session here that could die."""
+        return False
+
+    def close(self) -> None:
+        """See Transport."""
+        with self._network.lock:
+            if self not in self._network.ends:
+                return
+            self._network.ends.remove(self)
+        for key in self._announced:
+            if not any(key in end._announced for end in self._ends()):
+                self._tell(key, False)
