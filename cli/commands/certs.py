@@ -61,7 +61,7 @@ def certs(arguments: list[str]) -> int:
         else:
             said = _revoke(parsed.directory, parsed.role, parsed.names)
     except ImportError:
-        print('daedalus certs: needs cryptography: pip install "daedalus-rl[learner]"', file=sys.stderr)
+        print('daedalus certs: needs cryptography: pip install "daedalus-rl[certs]"', file=sys.stderr)
         return 1
     except (CredentialsError, OSError, ValueError) as error:
         print(f"daedalus certs: {error}", file=sys.stderr)

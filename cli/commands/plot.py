@@ -36,7 +36,7 @@ def plot(arguments: list[str]) -> int:
         runs = {directory.name: _read(directory) for directory in parsed.directories}
         _draw(runs, parsed.output)
     except ModuleNotFoundError:
-        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[learner]"', file=sys.stderr)
+        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[plot]"', file=sys.stderr)
         return 1
     except (OSError, ValueError) as error:
         print(f"daedalus plot: {error}", file=sys.stderr)
