@@ -3,6 +3,7 @@
 Exit status: 0 told to stop, 1 failed, 2 bad usage.
 """
 
+import argparse
 import socket
 import sys
 
@@ -26,8 +27,8 @@ examples:
   daedalus bridge --connect tls/gpu-box:7447 --tls actor-arm-3 --listen tcp/127.0.0.1:7448"""
 
 
-def main() -> int:
-    """Runs `daedalus bridge`."""
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus bridge`."""
     options = command_parser("bridge", DESCRIPTION, EXAMPLES)
     add_connect(options, "where the learner, or a router that knows it, listens")
     options.add_argument(
@@ -36,7 +37,12 @@ def main() -> int:
     add_tls(options)
     add_insecure(options)
     options.add_argument("--quiet", action="store_true", help="say nothing but errors")
-    arguments = options.parse_args()
+    return options
+
+
+def main() -> int:
+    """Runs `daedalus bridge`."""
+    arguments = parser().parse_args()
 
     def say(text: str) -> None:
         if not arguments.quiet:

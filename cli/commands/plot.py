@@ -21,8 +21,8 @@ _PANELS = (
 )
 
 
-def plot(arguments: list[str]) -> int:
-    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus plot`."""
     options = argparse.ArgumentParser(
         prog="daedalus plot",
         description="Draws return, entropy, value loss and policy lag against env_steps.",
@@ -31,7 +31,12 @@ def plot(arguments: list[str]) -> int:
     )
     options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, one colour each")
     options.add_argument("--output", type=Path, required=True, metavar="FILE", help="the picture: .png, .svg or .pdf")
-    parsed = options.parse_args(arguments)
+    return options
+
+
+def plot(arguments: list[str]) -> int:
+    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+    parsed = parser().parse_args(arguments)
     try:
         runs = {directory.name: _read(directory) for directory in parsed.directories}
         _draw(runs, parsed.output)
