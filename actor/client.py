@@ -17,7 +17,6 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -46,7 +45,6 @@ class Client:
         tls: Path | None = None,
         link: LinkChoice = "auto",
         timeout: float = 60.0,
-        say: Callable[[str], None] = print,
     ) -> None:
         """Joins, and waits for the first policy.
 
@@ -58,7 +56,6 @@ class Client:
           tls: this actor's certificate (`daedalus certs`), for addresses that begin with tls/.
           link: see `daedalus actor --help`.
           timeout: seconds to wait for a learner and its first policy.
-          say: is told what happens.
 
         Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
@@ -75,10 +72,10 @@ class Client:
         self._stop = threading.Event()
         self._player = ClientPlayer(observation_space, action_space)
         self._error: Exception | None = None
-        transport = connect_with_retry([connect], self._stop, say, timeout, credentials)
+        transport = connect_with_retry([connect], self._stop, timeout, credentials)
         assert transport is not None  # nobody tells it to stop
         self._transport = transport
-        self._service = ActorService(config, transport, self._stop, say, self._player)
+        self._service = ActorService(config, transport, self._stop, self._player)
         self._player.on_full = self._service.wake
         self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
         self._thread.start()

@@ -46,7 +46,7 @@ def main() -> int:
 
 def ship(run: Path, target: Path) -> Path:
     """Writes the best policy of `run`, or its newest, as `target`, with how it came about; returns `target`."""
-    policy = find_policy(run, lambda text: print(text, file=sys.stderr))
+    policy = find_policy(run)
     summary = read_json(run / SUMMARY)
     export_policy(policy.directory, target)
     shutil.copyfile(run / CONFIG, target / CONFIG)

@@ -72,7 +72,7 @@ def play(address: str, link: LinkChoice) -> int:
     transport, stop = connect([address]), stop_on_signals()
     config = ActorConfig(name="far", incarnation=time.monotonic_ns(), link=link)
     try:
-        ActorService(config, transport, stop, lambda text: print(text, flush=True), TellingPlayer()).run()
+        ActorService(config, transport, stop, TellingPlayer()).run()
     finally:
         transport.close()
     return 0

@@ -1,12 +1,15 @@
 """Lets clients in, each with a transport of its own, and ends them all when told to stop."""
 
 import contextlib
+import logging
 import socket
 import threading
 from collections.abc import Callable
 
 from daedalus.bridge.connection import ClientConnection
 from daedalus.transport.interface import Transport
+
+_logger = logging.getLogger(__name__)
 
 _MOST_CLIENTS = 64  # at once
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
@@ -16,12 +19,9 @@ _END_SECONDS = 4.0  # for all clients together, when told to stop
 class Bridge:
     """All clients of one listening socket, each with a transport of its own."""
 
-    def __init__(
-        self, listener: socket.socket, open_transport: Callable[[], Transport], say: Callable[[str], None]
-    ) -> None:
+    def __init__(self, listener: socket.socket, open_transport: Callable[[], Transport]) -> None:
         self._listener = listener
         self._open_transport = open_transport
-        self._say = say
         self._clients: dict[ClientConnection, threading.Thread] = {}
 
     def run(self, stop: threading.Event) -> None:
@@ -43,7 +43,7 @@ class Bridge:
         name = f"{address[0]}:{address[1]}"
         if len(self._clients) >= _MOST_CLIENTS:
             connection.close()
-            self._say(f"turned {name} away: {_MOST_CLIENTS} clients are here already")
+            _logger.info(f"turned {name} away: {_MOST_CLIENTS} clients are here already")
             return
         client = ClientConnection(connection, self._open_transport)
         thread = threading.Thread(target=self._serve, args=(client, name), name="bridge-client", daemon=True)
@@ -51,6 +51,6 @@ class Bridge:
         thread.start()
 
     def _serve(self, client: ClientConnection, name: str) -> None:
-        self._say(f"{name} came")
+        _logger.info(f"{name} came")
         reason = client.run()
-        self._say(f"{name} was given up: {reason}" if reason else f"{name} went")
+        _logger.info(f"{name} was given up: {reason}" if reason else f"{name} went")

@@ -3,11 +3,11 @@
 `daedalus train`, `daedalus resume` and `daedalus.train` share this file.
 """
 
+import logging
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,11 @@ from daedalus.cli.supervisor import FailedError, Supervised, start, stop, superv
 from daedalus.learner.run import run_directory
 from daedalus.protocol.spec import RunSpec
 
+_logger = logging.getLogger(__name__)
+
 _POLL_SECONDS = 0.05
 _EVALUATOR = "evaluator"
 _FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
-
-Say = Callable[[str], None]
 
 
 class RunFailedError(Exception):
@@ -59,7 +59,7 @@ class RunEnd:
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 
-def run_locally(run: LocalRun, stopping: threading.Event, say: Say, streams: Streams = INHERITED) -> RunEnd:
+def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> RunEnd:
     """Train until the target or the end of the budget, then evaluate the best checkpoint.
 
     No child process is left when this returns or raises.
@@ -67,25 +67,24 @@ def run_locally(run: LocalRun, stopping: threading.Event, say: Say, streams: Str
     Args:
       run: what to run.
       stopping: ends the run early when it is set.
-      say: called with each message about the run, from this thread.
       streams: where the child processes write.
 
     Raises RunFailedError or RunStoppedError.
     """
     try:
-        status = _train(run, stopping, say, streams)
+        status = _train(run, stopping, streams)
         if stopping.is_set():
             raise RunStoppedError
         if status not in _FINISHED:
             raise RunFailedError(status=status)
-        return RunEnd(status=status, summary=evaluate_run(run, stopping, say, streams))
+        return RunEnd(status=status, summary=evaluate_run(run, stopping, streams))
     except (FailedError, EvaluationFailedError) as error:
         if stopping.is_set():
             raise RunStoppedError from None
         raise RunFailedError(str(error)) from None
 
 
-def _train(run: LocalRun, stopping: threading.Event, say: Say, streams: Streams) -> int:
+def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
     spec, options = run.spec, ("--wrap", run.wrap) if run.wrap else ()
     listening, address = _addresses(run)
@@ -95,13 +94,13 @@ def _train(run: LocalRun, stopping: threading.Event, say: Say, streams: Streams)
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
         actors += [supervised_actor(name, address, options, streams) for name in names]
         training = spec.training
-        say(
+        _logger.info(
             f"{spec.environment.id}: {training.algorithm}, seed {training.seed}, {len(actors)} actors"
             f" x {spec.collection.envs_per_actor} environments at {address}; run directory {run.directory}"
         )
         if spec.evaluation.seconds is not None:
             actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), streams))
-        return watch(learner, actors, spec, stopping, say)
+        return watch(learner, actors, spec, stopping)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
 
@@ -128,24 +127,19 @@ def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -
     return Supervised("the learner", begin, ended=_FINISHED)
 
 
-def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping: threading.Event, say: Say) -> int:
+def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping: threading.Event) -> int:
     """Wait for the learner's end, restarting processes that die; return the learner's exit status.
 
     Raises FailedError if the learner failed for good, or too few actors are left.
     """
-
-    def tell(news: str | None) -> None:
-        if news:
-            say(f"\n{news}")  # not behind the progress on the terminal's last line
-
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
-        tell(learner.check())
+        _warn(learner.check())
         for actor in list(actors):
             try:
-                tell(actor.check())
+                _warn(actor.check())
             except FailedError as error:
                 actors.remove(actor)
                 stop([actor.process])
@@ -153,18 +147,23 @@ def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping
                 needed = not playing or spec.synchronous  # a2c waits for all at its start
                 if needed and actor.name != _EVALUATOR:
                     raise
-                tell(f"{error}; going on without it")
+                _warn(f"{error}; going on without it")
     return 1
 
 
-def evaluate_run(run: LocalRun, stopping: threading.Event, say: Say, streams: Streams = INHERITED) -> dict[str, Any]:
+def _warn(news: str | None) -> None:
+    if news:
+        _logger.warning(news)
+
+
+def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
     Raises EvaluationFailedError.
     """
     began = time.monotonic()
     options = ["--episodes", str(run.spec.evaluation.final_episodes), *(["--wrap", run.wrap] if run.wrap else [])]
-    chosen = select_best(run.directory, run.spec, options, stopping, say, streams)
+    chosen = select_best(run.directory, run.spec, options, stopping, streams)
     (evaluation,) = play([[str(run.directory), *options]], stopping, streams)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
     summary["evaluation_return_mean"] = evaluation["return_mean"]

@@ -5,11 +5,11 @@ what each can do.
 """
 
 import json
+import logging
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
@@ -18,6 +18,8 @@ from daedalus.cli.child_output import INHERITED, Streams
 from daedalus.cli.supervisor import stop
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
+
+_logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
 _SEEDS = 2**33  # added to the run's: neither training nor the final episodes have these
@@ -32,29 +34,30 @@ def select_best(
     spec: RunSpec,
     options: list[str],
     stopping: threading.Event,
-    say: Callable[[str], None],
     streams: Streams = INHERITED,
 ) -> list[dict[str, Any]]:
     """Scores each candidate anew; what each got, the best first. Nothing, if there are not two to choose from.
 
     `options` are what `daedalus evaluate` takes. Raises EvaluationFailedError.
     """
-    finalists = candidates(directory, say)
+    finalists = candidates(directory)
     if len(finalists) < 2:
         return []
     backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
-    say(f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}")
+    _logger.info(
+        f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}"
+    )
     with_it = [*options, "--backend", backend, "--seed", str(seed)]
     results = play([[str(each.directory), *with_it] for each in finalists], stopping, streams)
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
         before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
-        say(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
+        _logger.info(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
         try:
             candidate.rescore(mean)
         except OSError as error:
-            say(f"  which could not be written down ({error.strerror})")
+            _logger.info(f"  which could not be written down ({error.strerror})")
         scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.logs import add_logging
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.protocol.spec import RunSpec
@@ -140,6 +141,7 @@ def learner_parser() -> argparse.ArgumentParser:
     )
     add_tls(options)
     add_insecure(options)
+    add_logging(options)
     # What the launcher says to the learner it starts: a directory with config.toml that is there already.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)

@@ -104,7 +104,7 @@ def supervised_actor(
     """An actor, or the evaluator, under supervision."""
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
-        arguments = ["--connect", connect, "--name", name, "--quiet", *options]
+        arguments = ["--connect", connect, "--name", name, "--log-level", "warning", *options]
         process = start("daedalus.cli.commands.actor", *arguments, one_thread=True, streams=streams)
         with suppress(AttributeError, OSError):  # not everywhere, and it may be gone already
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS

@@ -1,9 +1,11 @@
 """`daedalus.train`: what `daedalus train` does, as a function."""
 
+import logging
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -88,10 +90,6 @@ def train(
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
     """Run to the end, with the output of the child processes passed on to this process's streams."""
 
-    def say(text: str) -> None:
-        if not quiet:
-            print(text, flush=True)
-
     def pass_on(line: str, stream: TextIO) -> None:
         if not quiet:
             stream.write(line)
@@ -103,7 +101,8 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
     errors = CollectedOutput(lambda line: pass_on(line, err))
     try:
         streams = Streams(stdout=output.descriptor, stderr=errors.descriptor)
-        return run_locally(run, threading.Event(), say, streams)
+        with _records_to(logging.NullHandler() if quiet else logging.StreamHandler(out)):
+            return run_locally(run, threading.Event(), streams)
     except RunFailedError as error:
         failure = error
     finally:
@@ -112,6 +111,23 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
     # A process that is started again fails with the same words.
     reasons = dict.fromkeys(f"{printed}\n{failure}".strip().splitlines())
     raise TrainingError("\n".join(reasons) or f"the learner ended with status {failure.status}")
+
+
+@contextmanager
+def _records_to(handler: logging.Handler) -> Iterator[None]:
+    """Send the records of this process's daedalus loggers to a handler, unless the program has configured logging."""
+    logger = logging.getLogger("daedalus")
+    if logger.hasHandlers():
+        yield
+        return
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)
 
 
 def _result(directory: Path, end: RunEnd) -> RunResult:

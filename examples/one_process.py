@@ -23,7 +23,7 @@ def play(network: MemoryNetwork, stop: threading.Event) -> None:
     """Run the actor: it gets the environment and the policy from the learner and streams rollouts to it."""
     transport = MemoryTransport(network)
     try:
-        ActorService(ActorConfig(name="actor-0", incarnation=1), transport, stop, print).run()
+        ActorService(ActorConfig(name="actor-0", incarnation=1), transport, stop).run()
     finally:
         transport.close()
 

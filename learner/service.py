@@ -4,6 +4,7 @@ The other threads are the actor server's and the recorder's. Torch is imported o
 takes a second, in which they make their environments.
 """
 
+import logging
 import secrets
 import threading
 import time
@@ -25,6 +26,8 @@ from daedalus.protocol.messages import EvaluationReport, Refusal
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
+
+_logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -88,7 +91,7 @@ class LearnerService:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop, self._progress.say)
+            spaces = self._server.await_spaces(self._stop)
             if spaces is None:
                 return Outcome(solved=False, finished=False, seconds_to_target=None)
             learner = Learner(self._spec.training, self._spec.policy, spaces)
@@ -161,7 +164,7 @@ class LearnerService:
         self._health.updated = self._health.attended = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
-            self._progress.say("an update was skipped: its gradient was not finite; the weights stay as they were")
+            _logger.warning("an update was skipped: its gradient was not finite; the weights stay as they were")
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
 
@@ -172,7 +175,7 @@ class LearnerService:
                 answer, news = self._evaluations.report(message)
                 request.reply(encode(answer))
                 if news:
-                    self._progress.say(news)
+                    _logger.info(news)
                 continue
             directory = self._save(learner, program)
             if directory is None:
@@ -253,14 +256,14 @@ class LearnerService:
             )
         except OSError as error:
             if not self._health.save_fault:
-                self._progress.say(
+                _logger.warning(
                     f"no checkpoint could be saved ({error.strerror}); the one before it stays, training goes on, "
                     f"and it is tried again every {self._spec.service.checkpoint_seconds:g} s"
                 )
             self._health.save_fault = error.strerror or type(error).__name__
             return None
         if self._health.save_fault:
-            self._progress.say("checkpoints are saved again")
+            _logger.info("checkpoints are saved again")
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         return directory
 
@@ -278,4 +281,4 @@ class LearnerService:
         try:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
-            self._progress.say(f"no summary was written: {error.strerror}")
+            _logger.warning("no summary was written: %s", error.strerror)

@@ -5,8 +5,15 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import log_lines
 import pytest
 from processes import Running
+
+
+@pytest.fixture(autouse=True)
+def _log_lines() -> Iterator[None]:
+    with log_lines.collected():
+        yield
 
 
 @pytest.fixture

@@ -158,7 +158,7 @@ class Sender:
     def __init__(self, address: str, name: str, environments: int = 2) -> None:
         self.transport = connect([address])
         self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
-        self._link = LearnerQueries(self.transport, lambda text: None)
+        self._link = LearnerQueries(self.transport)
         join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
         self.welcome: Welcome = self._link.find(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
         self.transport.declare_presence(keys.presence(self.welcome.run, name, self.incarnation))

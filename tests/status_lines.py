@@ -12,7 +12,7 @@ from daedalus.transport.interface import TransportError
 
 if __name__ == "__main__":
     never = threading.Event()
-    transport = connect_with_retry([sys.argv[1]], never, lambda text: None)
+    transport = connect_with_retry([sys.argv[1]], never)
     assert transport is not None
     while not never.wait(0.2):
         try:

@@ -1,12 +1,14 @@
 """Waits for a router or learner that is not there yet: who starts first does not matter."""
 
+import logging
 import threading
 import time
-from collections.abc import Callable
 
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect
+
+_logger = logging.getLogger(__name__)
 
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts
 
@@ -14,7 +16,6 @@ _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts
 def connect_with_retry(
     endpoints: list[str],
     stop: threading.Event,
-    say: Callable[[str], None],
     timeout: float | None = None,
     credentials: Credentials | None = None,
 ) -> Transport | None:
@@ -35,7 +36,7 @@ def connect_with_retry(
                     f"{error} (for {timeout:g} s): is the learner running, and is the address its own?"
                 ) from None
             if not told and pause >= _MAX_PAUSE_SECONDS / 2:
-                say(f"{error}; waiting for it")
+                _logger.info("%s; waiting for it", error)
                 told = True
         if stop.wait(pause):
             return None

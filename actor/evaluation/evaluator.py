@@ -3,9 +3,9 @@ nothing to the training data. No threads but the transport's.
 """
 
 import itertools
+import logging
 import threading
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -18,19 +18,18 @@ from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
 from daedalus.transport.interface import Transport
 
+_logger = logging.getLogger(__name__)
+
 _DEFAULT_SECONDS = 60.0  # between evaluations where the run does not say
 
 
 class Evaluator:
     """One evaluator over one transport."""
 
-    def __init__(
-        self, config: ActorConfig, transport: Transport, stop: threading.Event, say: Callable[[str], None]
-    ) -> None:
+    def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
         self._config = config
         self._stop = stop
-        self._say = say
-        self._link = LearnerQueries(transport, say, config.hint)
+        self._link = LearnerQueries(transport, config.hint)
 
     def run(self) -> None:
         """Evaluates until stopped or until the run is over.
@@ -43,7 +42,7 @@ class Evaluator:
             while True:
                 self._attend(self._link.find(self._config.run, join, self._config.timeout, self._stop))
         except RunOverError as error:
-            self._say(str(error))
+            _logger.info(str(error))
 
     def _attend(self, welcome: Welcome) -> None:
         """Evaluates for one life of a learner, until it ends."""
@@ -51,7 +50,9 @@ class Evaluator:
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes
         actions = spec.evaluation.actions
-        self._say(f"run {welcome.run!r}: {episodes} {actions} episodes of {spec.environment.id} every {interval:g} s")
+        _logger.info(
+            f"run {welcome.run!r}: {episodes} {actions} episodes of {spec.environment.id} every {interval:g} s"
+        )
         environment = spec.environment.as_evaluated()
         environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
         try:
@@ -81,7 +82,7 @@ class Evaluator:
         evaluation = play_episodes(
             runtime, environments, how.episodes, seed, sampled=how.actions == "sampled", progress=self._continue
         )
-        self._say(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
+        _logger.info(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
         self._link.report(
             welcome.run,
             EvaluationReport(

@@ -1,6 +1,5 @@
 """A trained policy for a loop of the caller's own: load it from a run, give it observations, take its actions."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +100,7 @@ def load_policy(
     if (observation_space is None) != (action_space is None):
         raise ValueError("give both observation_space and action_space, or neither")
     path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
-    saved = find_policy(path, lambda text: warnings.warn(text, stacklevel=3), newest)
+    saved = find_policy(path, newest)
     if observation_space is None or action_space is None:
         environment = make_gymnasium(as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False}), 1)
         environment.close()

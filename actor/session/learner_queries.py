@@ -1,10 +1,10 @@
 """What an actor asks of learners: to be found, to be let in, for programs and snapshots. No state, no threads."""
 
 import contextlib
+import logging
 import queue
 import threading
 import time
-from collections.abc import Callable
 
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
@@ -23,6 +23,8 @@ from daedalus.protocol.messages import (
     Welcome,
 )
 from daedalus.transport.interface import Transport, TransportError
+
+_logger = logging.getLogger(__name__)
 
 _LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
 _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
@@ -52,10 +54,9 @@ class RunOverError(Exception):
 class LearnerQueries:
     """Questions over a transport, their answers decoded."""
 
-    def __init__(self, transport: Transport, say: Callable[[str], None], hint: str = "") -> None:
+    def __init__(self, transport: Transport, hint: str = "") -> None:
         """`hint`: what else may be the matter, said where no learner answers."""
         self._transport = transport
-        self._say = say
         self._hint = hint
 
     def find(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
@@ -83,7 +84,7 @@ class LearnerQueries:
                     f"no learner answered within {timeout:g} s: is it running, and is the address its own?{self._hint}"
                 )
             if not told and pause >= _MAX_RETRY_SECONDS:
-                self._say(f"waiting for {wanted}")
+                _logger.info(f"waiting for {wanted}")
                 told = True
             if stop.wait(pause):
                 raise RunOverError("stopped")
@@ -143,7 +144,7 @@ class LearnerQueries:
         """Tells the learner how a policy played; what it does not take is lost. Raises RunOverError if told to stop."""
         answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), stop)
         if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
-            self._say(f"the learner did not take the evaluation: {answer.reason}")
+            _logger.info(f"the learner did not take the evaluation: {answer.reason}")
 
     def decode(self, data: bytes) -> Message | None:
         """The message in `data`; None, and a word about it, if it is damaged.
@@ -155,7 +156,7 @@ class LearnerQueries:
         except VersionMismatchError as error:
             raise ActorError(str(error)) from None
         except ProtocolError as error:
-            self._say(f"ignored a message: {error}")
+            _logger.info(f"ignored a message: {error}")
             return None
 
     def _ask_between_updates(self, key: str, payload: bytes, stop: threading.Event) -> Message | None:

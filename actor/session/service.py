@@ -1,8 +1,8 @@
 """Joins a learner, collects, uploads, follows its snapshots, leaves. The only threads are the transport's."""
 
+import logging
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -21,6 +21,8 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.transport.interface import Transport
+
+_logger = logging.getLogger(__name__)
 
 _DOUBT_SECONDS = 1.0  # this long without the snapshot it needs, the actor asks for it
 _FIRST_DOUBT_SECONDS = 0.02  # before the first snapshot: the learner may be just about to have one
@@ -54,15 +56,13 @@ class ActorService:
         config: ActorConfig,
         transport: Transport,
         stop: threading.Event,
-        say: Callable[[str], None],
         player: Player | None = None,
     ) -> None:
         """Environments of its own are played, unless a `player` is given."""
         self._config = config
         self._transport = transport
         self._stop = stop
-        self._say = say
-        self._link = LearnerQueries(transport, say, config.hint)
+        self._link = LearnerQueries(transport, config.hint)
         self._upload_session = UploadSession(transport, self._link, stop)
         self._player = player or EnvironmentPlayer(config.environments, config.wrap)
         self._feed = SnapshotFeed(transport, self._link, config.name, self._upload_session.hear)
@@ -83,9 +83,9 @@ class ActorService:
                 try:
                     self._take_part(self._find_learner())
                 except LearnerLostError:
-                    self._say("the learner went away; looking for it again")
+                    _logger.info("the learner went away; looking for it again")
         except RunOverError as error:
-            self._say(str(error))
+            _logger.info(str(error))
         finally:
             self._player.close()
 
@@ -116,7 +116,7 @@ class ActorService:
             self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         if self._config.link == "wan" and not welcome.spec.synchronous:
             self._feed.use_compact_snapshots()
-        self._say(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
+        _logger.info(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
         self._play(confirmed, spaces)
 
     def _announce(self, run: str) -> None:
@@ -189,7 +189,7 @@ class ActorService:
             self._link.program(welcome.run)
             seconds = time.monotonic() - began
         if seconds > allowed:
-            self._say(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
+            _logger.info(f"a slow link ({size:,} bytes took {seconds:.2f} s): weights come small, and less often")
             self._feed.use_compact_snapshots()
 
     def _tell_if_in_vain(self) -> None:
@@ -197,7 +197,7 @@ class ActorService:
         refused, reason = self._upload_session.refusals
         if refused >= _IN_VAIN and not self._told_in_vain:
             self._told_in_vain = True
-            self._say(
+            _logger.info(
                 f"the learner rejected the last {_IN_VAIN} rollouts ({reason}): the way there is "
                 "too slow for it; start it with a higher --set training.max_policy_lag=..., or this actor nearer to it"
             )

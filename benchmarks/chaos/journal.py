@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
@@ -45,13 +46,14 @@ class JournalTransport:
 
 
 if __name__ == "__main__":
+    configure_logging()
     stop = stop_on_signals()
-    transport = connect_with_retry([sys.argv[1]], stop, print)
+    transport = connect_with_retry([sys.argv[1]], stop)
     if transport is None:
         raise SystemExit(0)
     try:
         config = ActorConfig(name=sys.argv[2], incarnation=secrets.randbits(62))
         journal = cast(Transport, JournalTransport(transport, sys.argv[3]))
-        ActorService(config, journal, stop, print).run()
+        ActorService(config, journal, stop).run()
     finally:
         transport.close()

@@ -57,10 +57,10 @@ class Simulated:
     """One actor, as far as the learner and the router can tell."""
 
     def __init__(self, address: str, name: str) -> None:
-        transport = connect_with_retry([address], threading.Event(), lambda text: None, _WAIT_SECONDS)
+        transport = connect_with_retry([address], threading.Event(), _WAIT_SECONDS)
         assert transport is not None  # nobody tells it to stop
         self._transport = transport
-        self._link = LearnerQueries(self._transport, lambda text: None)
+        self._link = LearnerQueries(self._transport)
         self._changed = threading.Condition()
         self._uploader = Uploader(window=1)
         self._sequence, self._version = 0, -1

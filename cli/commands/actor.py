@@ -10,6 +10,7 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.transport.connecting import connect_with_retry
@@ -30,17 +31,14 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
 
-    def say(text: str) -> None:
-        if not arguments.quiet:
-            print(f"actor {config.name}: {text}", flush=True)
-
+    configure_logging(arguments.log_level, as_json=arguments.log_json, prefix=f"actor {config.name}: ")
     try:
-        transport = connect_with_retry(arguments.connect, stop, say, config.timeout, credentials)
+        transport = connect_with_retry(arguments.connect, stop, config.timeout, credentials)
         if transport is None:
             return 0
         try:
             role = Evaluator if arguments.evaluator else ActorService
-            role(config, transport, stop, say).run()
+            role(config, transport, stop).run()
         finally:
             transport.close()
     except (ActorError, EnvironmentSetupError, PolicyError, TransportError) as error:

@@ -8,6 +8,7 @@ import socket
 
 from daedalus.actor.session.service import ActorConfig
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
+from daedalus.cli.logs import add_logging
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import authorization_hint
@@ -69,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
         help="play greedily on the run's schedule and report, instead of gathering experience",
     )
     add_tls(options)
-    options.add_argument("--quiet", action="store_true", help="say nothing but errors")
+    add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options
 

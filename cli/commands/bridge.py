@@ -4,15 +4,19 @@ Exit status: 0 told to stop, 1 failed, 2 bad usage.
 """
 
 import argparse
+import logging
 import socket
 import sys
 
 from daedalus.bridge.service import Bridge
 from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_parser
+from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.transport.addresses import AddressError, check_listening
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.zenoh_transport import connect
+
+_logger = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7448"
 
@@ -36,18 +40,14 @@ def parser() -> argparse.ArgumentParser:
     )
     add_tls(options)
     add_insecure(options)
-    options.add_argument("--quiet", action="store_true", help="say nothing but errors")
+    add_logging(options)
     return options
 
 
 def main() -> int:
     """Runs `daedalus bridge`."""
     arguments = parser().parse_args()
-
-    def say(text: str) -> None:
-        if not arguments.quiet:
-            print(f"bridge: {text}", flush=True)
-
+    configure_logging(arguments.log_level, as_json=arguments.log_json, prefix="bridge: ")
     try:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
         if arguments.listen.startswith("tls/"):
@@ -65,8 +65,8 @@ def main() -> int:
     except OSError as error:
         print(f"daedalus bridge: cannot listen on {arguments.listen}: {error.strerror}", file=sys.stderr)
         return 1
-    say(f"clients connect to tcp/{host}:{listener.getsockname()[1]}")
-    Bridge(listener, lambda: connect(arguments.connect, credentials), say).run(stop)
+    _logger.info(f"clients connect to tcp/{host}:{listener.getsockname()[1]}")
+    Bridge(listener, lambda: connect(arguments.connect, credentials)).run(stop)
     return 0
 
 

@@ -18,6 +18,7 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.commands.evaluate_arguments import check, parser
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
@@ -37,6 +38,7 @@ class _StoppedError(Exception):
 def main(words: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
     """Runs `daedalus evaluate`. Exit status: 0 done, 1 failed, or stopped by the event, 2 bad usage."""
     arguments = parser().parse_args(words)
+    configure_logging(prefix="daedalus evaluate: ", write=lambda line: print(line, file=sys.stderr))
     stop = stop or threading.Event()
     try:
         check(arguments)
@@ -58,7 +60,7 @@ def main(words: Sequence[str] | None = None, stop: threading.Event | None = None
 def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
     """Everything between the command line and the result."""
     directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
-    policy = find_policy(directory, lambda text: print(f"daedalus evaluate: {text}", file=sys.stderr), arguments.newest)
+    policy = find_policy(directory, arguments.newest)
     spec = _environment(policy, arguments)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
     progress = _Progress(sys.stderr, arguments.episodes, stop)

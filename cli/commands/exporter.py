@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.commands.status import ask
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import ProtocolError
 from daedalus.transport.connecting import connect_with_retry
@@ -92,6 +93,7 @@ def exporter(arguments: list[str]) -> int:
     except SECURITY_ERRORS as error:
         print(f"daedalus exporter: {error}", file=sys.stderr)
         return 2
+    configure_logging(prefix="exporter: ")
     stop = stop_on_signals()
     collector, registry = StatusCollector(), CollectorRegistry()
     registry.register(collector)
@@ -119,10 +121,7 @@ def _follow(
 ) -> None:
     """Keeps the collector connected, until told to stop. Raises TransportError if it will never be let in."""
 
-    def say(text: str) -> None:
-        print(f"exporter: {text}", flush=True)
-
-    transport = connect_with_retry(endpoints, stop, say, credentials=credentials)
+    transport = connect_with_retry(endpoints, stop, credentials=credentials)
     if transport is None:
         return
     collector.transport = transport

@@ -5,11 +5,13 @@ Exit status: 0 the target was reached or the asked-for steps were done, 3 the bu
 """
 
 import argparse
+import logging
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_with_parent, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_again
 from daedalus.learner.reporting.progress import Progress
@@ -25,6 +27,8 @@ from daedalus.transport.credentials import CredentialsError
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from daedalus.transport.zenoh_transport import listen
+
+_logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -51,12 +55,13 @@ def main() -> int:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
     progress = Progress(sys.stdout, spec.training.env_steps)
+    configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
         restored = None
         if arguments.resume and begun:
-            restored = _newest_checkpoint(directory, progress)
+            restored = _newest_checkpoint(directory)
         if arguments.connect:
-            transport = connect_with_retry(arguments.connect, stop, progress.say, credentials=credentials)
+            transport = connect_with_retry(arguments.connect, stop, credentials=credentials)
         else:
             transport = listen(addresses, credentials=credentials)
         if transport is None:
@@ -69,8 +74,8 @@ def main() -> int:
             run_directory.create(directory, spec)
         if arguments.prepared is None:
             there = ", ".join(arguments.connect or addresses)
-            progress.say(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
-            progress.say(f"actors join with: daedalus actor --connect {there}")
+            _logger.info(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
+            _logger.info(f"actors join with: daedalus actor --connect {there}")
         service = LearnerService(
             spec,
             directory,
@@ -102,16 +107,16 @@ def _what(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
     return spec, directory, begun
 
 
-def _newest_checkpoint(directory: Path, progress: Progress) -> "Checkpoint | None":
+def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     """What to go on from; None if the run ended before its first checkpoint. Raises DamagedError if none is whole."""
     if not checkpoints(directory):
-        progress.say("there is no checkpoint yet: the run starts from its beginning")
+        _logger.info("there is no checkpoint yet: the run starts from its beginning")
         return None
     from daedalus.learner.training.checkpoint import load_newest
 
-    restored = load_newest(directory, progress.say)
+    restored = load_newest(directory)
     steps = restored.counters["env_steps"]
-    progress.say(f"going on from checkpoint {restored.policy.policy_version} at {steps:,} env_steps")
+    _logger.info(f"going on from checkpoint {restored.policy.policy_version} at {steps:,} env_steps")
     return restored
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
+from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.settings_arguments import add_settings, resolve
 from daedalus.learner.run import run_directory
@@ -119,8 +120,11 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
         insecure=parsed.insecure,
         wrap=parsed.wrap,
     )
+    # The learner rewrites a line of progress on the same terminal: a record takes its place.
+    clear = "\r\x1b[K" if sys.stdout.isatty() else ""
+    configure_logging(write=lambda line: print(f"{clear}{line}", flush=True))
     try:
-        end = run_locally(run, stop_on_signals(), lambda text: print(text, flush=True))
+        end = run_locally(run, stop_on_signals())
     except RunStoppedError:
         print(f"stopped; continue with: daedalus resume {directory}")
         return 1

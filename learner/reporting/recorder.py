@@ -4,6 +4,7 @@ Works on a thread of its own: a slow disk, and the loading of TensorBoard, cost 
 """
 
 import contextlib
+import logging
 import queue
 import threading
 import time
@@ -12,6 +13,8 @@ from pathlib import Path
 from daedalus.learner.reporting.metrics import CsvWriter, Details, MetricsWriter, MetricsWriters, TensorBoardWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.run_directory import METRICS
+
+_logger = logging.getLogger(__name__)
 
 _QUEUED_ROWS = 256  # beyond that rows are left out rather than waited for
 _RETRY_SECONDS = 10.0  # after the disk refused a row
@@ -58,12 +61,12 @@ class Recorder:
         except OSError as error:
             self._let_go()
             if self._refused_at is None:
-                self._progress.say(f"metrics cannot be written ({error.strerror}); training goes on")
+                _logger.warning("metrics cannot be written (%s); training goes on", error.strerror)
             self._refused_at = time.monotonic()
             return
         if self._refused_at is not None:
             self._refused_at = None
-            self._progress.say("metrics are written again")
+            _logger.info("metrics are written again")
 
     def _let_go(self) -> None:
         if self._writer is not None:

@@ -1,12 +1,14 @@
 """Which checkpoints of a run may be its best, once it is over."""
 
-from collections.abc import Callable
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score, is_best, rescore
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +24,7 @@ class Candidate:
         rescore(self.directory, score, self.policy_version)
 
 
-def candidates(run_directory: Path, warn: Callable[[str], None]) -> list[Candidate]:
+def candidates(run_directory: Path) -> list[Candidate]:
     """Those that scored highest, and the newest if it is none of them. Of a run that was never evaluated: none."""
     best = best_checkpoints(run_directory)
     found: dict[int, Candidate] = {}
@@ -30,7 +32,7 @@ def candidates(run_directory: Path, warn: Callable[[str], None]) -> list[Candida
         try:
             version = read_policy(directory).policy_version
         except DamagedError as error:
-            warn(f"passed over: {error}")
+            _logger.warning("passed over: %s", error)
         else:
             found.setdefault(
                 version, Candidate(directory, version, best_score(directory) if is_best(directory) else None)

@@ -10,6 +10,7 @@ counters, and the version that rollouts are held against.
 """
 
 import contextlib
+import logging
 import threading
 import time
 from collections import deque
@@ -39,6 +40,8 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
+
+_logger = logging.getLogger(__name__)
 
 HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _WAITING_EVALUATIONS = 64  # at once; evaluators beyond that ask again later
@@ -130,14 +133,14 @@ class ActorServer:
 
     # ------------------------------------------------------------------------------------ the main thread
 
-    def await_spaces(self, stop: threading.Event, say: Callable[[str], None]) -> Spaces | None:
+    def await_spaces(self, stop: threading.Event) -> Spaces | None:
         """Waits for an actor that knows the environment's spaces; None if told to stop first."""
         hint_at: float | None = time.monotonic() + _HINT_SECONDS
         with self.lock:
             while self.fleet.spaces is None and not stop.is_set():
                 self.lock.wait(HEARTBEAT_SECONDS)
                 if hint_at is not None and time.monotonic() > hint_at:
-                    say("waiting for the first actor: `daedalus actor --connect ADDRESS` starts one")
+                    _logger.info("waiting for the first actor: `daedalus actor --connect ADDRESS` starts one")
                     hint_at = None
             return self.fleet.spaces
 

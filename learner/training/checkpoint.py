@@ -4,8 +4,9 @@ A checkpoint is a sealed directory (policy/saving/sealed.py) named by its policy
 policy/saving/saved_policy.py too; this file adds what learning goes on from.
 """
 
+import logging
 import shutil
-from collections.abc import Callable, Set
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, S
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+
+_logger = logging.getLogger(__name__)
 
 _STATE_FILE = "learner.safetensors"
 
@@ -85,7 +88,7 @@ def load_checkpoint(directory: Path) -> Checkpoint:
     return Checkpoint(policy=policy, state=state, counters=counters)
 
 
-def load_newest(run_directory: Path, warn: Callable[[str], None]) -> Checkpoint:
+def load_newest(run_directory: Path) -> Checkpoint:
     """The newest checkpoint that is whole; names each damaged one that it passes over.
 
     Raises DamagedError if none is left.
@@ -94,5 +97,5 @@ def load_newest(run_directory: Path, warn: Callable[[str], None]) -> Checkpoint:
         try:
             return load_checkpoint(directory)
         except DamagedError as error:
-            warn(f"checkpoint passed over: {error}")
+            _logger.warning("checkpoint passed over: %s", error)
     raise DamagedError(f"{run_directory} has no checkpoint that can be read")

@@ -6,7 +6,7 @@ they lie: a run's by policy version, those that ship with the package by their o
 """
 
 import difflib
-from collections.abc import Callable
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,8 @@ from daedalus.policy.saving.best_checkpoints import best_checkpoints
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+
+_logger = logging.getLogger(__name__)
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
@@ -47,7 +49,7 @@ def checkpoints(run_directory: Path) -> list[Path]:
     return sorted((entry for entry in folder.iterdir() if entry.name.isdigit()), reverse=True)
 
 
-def find_policy(directory: Path, warn: Callable[[str], None], newest: bool = False) -> SavedPolicy:
+def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """The policy of a checkpoint; of a run directory its best, or its newest if none is or `newest` is asked for.
 
     Damaged ones are named and passed over. Raises DamagedError if none is left.
@@ -61,7 +63,7 @@ def find_policy(directory: Path, warn: Callable[[str], None], newest: bool = Fal
         try:
             return read_policy(candidate)
         except DamagedError as error:
-            warn(f"passed over: {error}")
+            _logger.warning("passed over: %s", error)
     raise DamagedError(f"{directory} has no checkpoint that can be read")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from log_lines import LINES
 from processes import LIMIT
 
 from daedalus.actor.evaluation.evaluator import Evaluator
@@ -106,10 +107,9 @@ class ScriptedLearner:
 class RunningEvaluator:
     def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
         self.stop = threading.Event()
-        self.said: list[str] = []
         self.error: Exception | None = None
         config = ActorConfig(name="e", incarnation=7, timeout=timeout)
-        self._evaluator = Evaluator(config, MemoryTransport(network), self.stop, self.said.append)
+        self._evaluator = Evaluator(config, MemoryTransport(network), self.stop)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -211,7 +211,7 @@ def test_a_report_that_is_not_taken_is_told_and_the_next_is_played(
     learner.receive_report("rejected", "no such version")
     learner.give(learner.snapshot(2))
     assert learner.receive_report().policy_version == 2
-    assert "the learner did not take the evaluation: no such version" in evaluator.said
+    assert "the learner did not take the evaluation: no such version" in LINES
 
 
 # ----------------------------------------------------------------------------------------- losing the learner
@@ -241,7 +241,7 @@ def test_it_looks_for_a_learner_that_went_away(
     asked = learner.receive()
     learner.transport.close()
     asked[1].reply(b"what a learner that dies might send")
-    while not any(text.startswith("ignored a message") for text in evaluator.said):
+    while not any(text.startswith("ignored a message") for text in LINES):
         evaluator.stop.wait(0.001)
     second = ScriptedLearner(network, run_spec(), epoch=2)
     second.give(second.snapshot(0))
@@ -275,7 +275,7 @@ def test_it_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: Runni
     learner.give(answer)
     evaluator.join()
     assert evaluator.error is None
-    assert evaluator.said[-1] == "the run is over"
+    assert LINES[-1] == "the run is over"
 
 
 def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
@@ -285,7 +285,7 @@ def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
     evaluator.stop.set()
     evaluator.join()
     assert evaluator.error is None
-    assert evaluator.said[-1] == "stopped"
+    assert LINES[-1] == "stopped"
     assert learner.told.empty()
 
 
@@ -328,7 +328,7 @@ def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     evaluator.stop.set()
     evaluator.join()
     assert evaluator.error is None
-    assert evaluator.said[-1] == "stopped"
+    assert LINES[-1] == "stopped"
     assert endless.closed.is_set()
     assert learner.told.empty()  # half an evaluation is none
 

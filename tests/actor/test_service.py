@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.actor.session import learner_queries, service
@@ -117,11 +118,10 @@ def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
 class RunningActor:
     def __init__(self, network: MemoryNetwork, timeout: float | None = None, link: LinkChoice = "auto") -> None:
         self.stop = threading.Event()
-        self.said: list[str] = []
         self.error: Exception | None = None
         self.transport = MemoryTransport(network)
         config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
-        self._service = ActorService(config, self.transport, self.stop, self.said.append)
+        self._service = ActorService(config, self.transport, self.stop)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -192,7 +192,7 @@ def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
     learner.publish(3)
     actor = RunningActor(network)
     assert learner.receive()[0].policy_version == 3
-    assert any("a slow link" in text for text in actor.said)
+    assert any("a slow link" in text for text in LINES)
     assert followed == []
     actor.stop.set()
     actor.join()
@@ -326,7 +326,7 @@ def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, acto
     while (received := second.receive())[0].identity.learner_epoch == 1:
         acknowledge(received[1], "fenced")
     assert received[0].identity.sequence == 0
-    assert any("went away" in text for text in actor.said)
+    assert any("went away" in text for text in LINES)
 
 
 @pytest.mark.parametrize("how", ["run_ended", "finished"])
@@ -341,7 +341,7 @@ def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningAc
         acknowledge(request, "finished")
     actor.join()
     assert actor.error is None
-    assert actor.said[-1].startswith("the run is over")
+    assert LINES[-1].startswith("the run is over")
 
 
 def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
@@ -353,7 +353,7 @@ def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, ac
     _, request = learner.receive()
     acknowledge(request, "accepted")
     learner.receive()
-    assert any("ignored a message" in text for text in actor.said)
+    assert any("ignored a message" in text for text in LINES)
 
 
 def test_a_refusal_ends_it_with_the_reason(network: MemoryNetwork) -> None:
@@ -404,8 +404,8 @@ def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
         else:
             request.reply(encode(Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")))
         if count < 15:
-            assert not any("rejected" in line for line in actor.said)
-    told = [line for line in actor.said if "rejected the last" in line]
+            assert not any("rejected" in line for line in LINES)
+    told = [line for line in LINES if "rejected the last" in line]
     assert len(told) == 1
     assert "policy lag 31, at most 30 is allowed" in told[0]
     assert "max_policy_lag" in told[0]
@@ -422,9 +422,9 @@ def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to
     assert learner.joins.get(timeout=LIMIT).spaces == SPACES
     for _ in range(3):
         assert learner.joins.get(timeout=LIMIT).spaces is None  # it asks, and is answered: the learner takes its time
-    assert not any("went away" in text for text in actor.said)
+    assert not any("went away" in text for text in LINES)
     learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # nothing that makes sense
-    until(lambda: any("went away" in text for text in actor.said))
+    until(lambda: any("went away" in text for text in LINES))
     learner.transport.serve(keys.join("r"), learner._join)
     again = learner.receive()
     assert again[0].identity in [rollout.identity for rollout, _ in held]  # sent again, to be taken at most once

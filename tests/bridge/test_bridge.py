@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
+from log_lines import LINES
 from processes import LIMIT, until
 
 from daedalus.bridge import connection as client_module
@@ -59,11 +60,10 @@ class Scene:
         self.network = MemoryNetwork()
         self.end = MemoryTransport(self.network)
         self.open: Callable[[], Transport] = lambda: MemoryTransport(self.network)
-        self.said: list[str] = []
         listener = socket.create_server(("127.0.0.1", 0))
         self.port = listener.getsockname()[1]
         self.stop = threading.Event()
-        self.bridge = Bridge(listener, lambda: self.open(), self.said.append)
+        self.bridge = Bridge(listener, lambda: self.open())
         self.thread = threading.Thread(target=self.bridge.run, args=(self.stop,))
         self.thread.start()
         self.callers: list[Caller] = []
@@ -190,7 +190,7 @@ def test_who_does_not_greet_is_closed(scene: Scene) -> None:
         assert stranger.recv(4) == GREETING
         with contextlib.suppress(ConnectionError):  # it is closed with bytes unread
             assert stranger.recv(1) == b""
-    until(lambda: any("speaks another protocol" in line for line in scene.said))
+    until(lambda: any("speaks another protocol" in line for line in LINES))
 
 
 def test_who_stops_within_a_parcel_is_given_up(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

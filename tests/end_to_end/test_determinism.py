@@ -29,7 +29,7 @@ def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
     threads = [threading.Thread(target=lambda: outcomes.append(service.run()), daemon=True)]
     for index in range(spec.collection.actors):
         config = ActorConfig(name=f"actor-{index}", incarnation=index)
-        actor = ActorService(config, MemoryTransport(network), stop, lambda _text: None)
+        actor = ActorService(config, MemoryTransport(network), stop)
         threads.append(threading.Thread(target=actor.run, daemon=True))
     for thread in threads:
         thread.start()

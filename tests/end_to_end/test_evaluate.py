@@ -266,7 +266,7 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event(), print)
+    summary = evaluate_run(local_run, threading.Event())
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
@@ -287,7 +287,7 @@ def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, eval
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
     newest = max(version for version in (1, 2, 3) if version != worst)
-    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), print)
+    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event())
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
@@ -307,7 +307,7 @@ def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) 
     stopping = threading.Event()
     stopping.set()
     with pytest.raises(EvaluationFailedError):
-        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping, print)
+        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping)
     assert not processes_mentioning(str(run))
 
 

@@ -36,9 +36,7 @@ def network() -> Iterator[tuple[MemoryNetwork, str]]:
     inside, stop = MemoryNetwork(), threading.Event()
     listener = socket.create_server(("127.0.0.1", 0))
     address = f"127.0.0.1:{listener.getsockname()[1]}"
-    thread = threading.Thread(
-        target=Bridge(listener, lambda: MemoryTransport(inside), lambda _: None).run, args=(stop,)
-    )
+    thread = threading.Thread(target=Bridge(listener, lambda: MemoryTransport(inside)).run, args=(stop,))
     thread.start()
     yield inside, address
     stop.set()

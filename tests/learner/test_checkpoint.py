@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from building import SPACES, run_spec
+from log_lines import LINES
 
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
@@ -38,10 +39,6 @@ def save(run: Path, version: int, keep: int = 9, **replaced: Any) -> Path:
     return save_checkpoint(run, policy_version=version, keep=keep, **{**content, **replaced})
 
 
-def no_warning(text: str) -> None:
-    raise AssertionError(text)
-
-
 def names(run: Path) -> list[str]:
     return sorted(entry.name for entry in (run / "checkpoints").iterdir())
 
@@ -54,7 +51,7 @@ def flip(path: Path, place: int) -> None:
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     save(tmp_path, 7)
-    loaded = load_newest(tmp_path, no_warning)
+    loaded = load_newest(tmp_path)
     assert loaded.policy.policy_version == 7
     assert loaded.policy.spec == SPEC
     assert loaded.policy.spaces == SPACES
@@ -72,28 +69,26 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 def test_the_newest_is_loaded(tmp_path: Path) -> None:
     for version in (9, 10, 2):
         save(tmp_path, version)
-    assert load_newest(tmp_path, no_warning).policy.policy_version == 10
+    assert load_newest(tmp_path).policy.policy_version == 10
 
 
 def test_a_damaged_newest_is_named_and_the_one_before_it_is_used(tmp_path: Path) -> None:
     save(tmp_path, 1)
     flip(save(tmp_path, 2) / "parameters.safetensors", -1)
-    warnings: list[str] = []
-    assert load_newest(tmp_path, warnings.append).policy.policy_version == 1
-    assert len(warnings) == 1
-    assert "0000000002" in warnings[0]
-    assert "parameters.safetensors" in warnings[0]
+    assert load_newest(tmp_path).policy.policy_version == 1
+    assert len(LINES) == 1
+    assert "0000000002" in LINES[0]
+    assert "parameters.safetensors" in LINES[0]
 
 
 def test_without_a_whole_one_there_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DamagedError, match="no checkpoint"):
-        load_newest(tmp_path, no_warning)
+        load_newest(tmp_path)
     for version in (1, 2):
         flip(save(tmp_path, version) / "seal", 0)
-    warnings: list[str] = []
     with pytest.raises(DamagedError, match="no checkpoint"):
-        load_newest(tmp_path, warnings.append)
-    assert len(warnings) == 2
+        load_newest(tmp_path)
+    assert len(LINES) == 2
 
 
 FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]
@@ -138,14 +133,14 @@ def test_what_was_just_saved_is_kept_though_a_damaged_one_has_a_higher_version(t
     flip(save(tmp_path, 20) / "seal", 0)
     saved = save(tmp_path, 11, keep=1)  # a learner that went on from 10
     assert saved.is_dir()
-    assert load_newest(tmp_path, lambda _: None).policy.policy_version == 11
+    assert load_newest(tmp_path).policy.policy_version == 11
 
 
 def test_the_same_version_may_be_saved_again(tmp_path: Path) -> None:
     save(tmp_path, 1)
     save(tmp_path, 1, counters={"env_steps": 99})
     assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path, no_warning).counters == {"env_steps": 99}
+    assert load_newest(tmp_path).counters == {"env_steps": 99}
 
 
 def test_what_a_crash_left_half_written_is_no_checkpoint(tmp_path: Path) -> None:
@@ -172,7 +167,7 @@ def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
         save(tmp_path, version, keep=1, counters={})
     monkeypatch.undo()
     assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path, no_warning).counters == COUNTERS
+    assert load_newest(tmp_path).counters == COUNTERS
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -194,4 +189,4 @@ def test_a_rename_that_fails_leaves_the_last_good_one_and_nothing_else(
         save(tmp_path, version, keep=1, counters={})
     monkeypatch.undo()
     assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path, no_warning).counters == COUNTERS
+    assert load_newest(tmp_path).counters == COUNTERS

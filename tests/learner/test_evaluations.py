@@ -110,7 +110,7 @@ def test_the_best_is_no_checkpoint_to_go_on_from(run: Run) -> None:
     run.play(1, 5.0)
     run.save(2)
     assert [path.name for path in checkpoints(run.directory)] == ["0000000002", "0000000001"]
-    assert load_newest(run.directory, lambda _: None).policy.policy_version == 2
+    assert load_newest(run.directory).policy.policy_version == 2
 
 
 def test_a_resumed_run_knows_its_best(run: Run) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from log_lines import LINES
 from processes import until
 
 from daedalus.actor.evaluation.evaluator import Evaluator
@@ -39,8 +40,6 @@ class House:
                 **sections,
             }
         )
-        self.output = io.StringIO()
-        self.said: list[str] = []
         self.stop = threading.Event()
         self._network = MemoryNetwork()
         self._errors: list[BaseException] = []
@@ -63,7 +62,7 @@ class House:
 
     def _learn(self) -> None:
         transport = MemoryTransport(self._network)
-        progress = Progress(self.output, self.spec.training.env_steps)
+        progress = Progress(io.StringIO(), self.spec.training.env_steps)
         try:
             LearnerService(self.spec, self.directory, transport, self.stop, progress, started=time.monotonic()).run()
         finally:
@@ -72,7 +71,7 @@ class House:
     def _play(self, role: Any, name: str) -> None:
         transport = MemoryTransport(self._network)
         try:
-            role(ActorConfig(name=name, incarnation=1), transport, self.stop, self.said.append).run()
+            role(ActorConfig(name=name, incarnation=1), transport, self.stop).run()
         finally:
             transport.close()
 
@@ -94,7 +93,7 @@ FEW_UPDATES = {"passes": 2, "minibatches": 2}
 def test_evaluations_end_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Path) -> None:
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
-        until(lambda: sum("evaluation at" in line for line in house.output.getvalue().splitlines()) >= 3)
+        until(lambda: sum("evaluation at" in line for line in LINES) >= 3)
     finally:
         house.end()
     best = best_checkpoints(house.directory)[0]
@@ -113,17 +112,17 @@ def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> No
     often = {**FAST, "checkpoint_seconds": 1e-6}
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 400}, service=often)
     try:
-        until(lambda: house.output.getvalue().count("evaluation at") >= 2)
+        until(lambda: "\n".join(LINES).count("evaluation at") >= 2)
     finally:
         house.end()
-    assert "the best so far" in house.output.getvalue()
-    assert "could not be kept" not in house.output.getvalue()
+    assert "the best so far" in "\n".join(LINES)
+    assert "could not be kept" not in "\n".join(LINES)
 
 
 def test_the_evaluator_is_no_part_of_the_training(tmp_path: Path) -> None:
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
-        until(lambda: "evaluation at" in house.output.getvalue())
+        until(lambda: "evaluation at" in "\n".join(LINES))
     finally:
         house.end()
     assert {row["actors"] for row in house.rows()} <= {"0", "1"}

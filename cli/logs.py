@@ -1,0 +1,75 @@
+"""Where log records go: plain lines for a person, or one JSON object a line for a log collector."""
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Callable
+
+LEVELS = ("debug", "info", "warning", "error")
+
+
+def add_logging(options: argparse._ActionsContainer) -> None:
+    """Add --log-level and --log-json."""
+    options.add_argument(
+        "--log-level", choices=LEVELS, default="info", help="least severity that is shown (default: %(default)s)"
+    )
+    options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object a line")
+
+
+def configure_logging(
+    level: str = "info", *, as_json: bool = False, prefix: str = "", write: Callable[[str], None] | None = None
+) -> None:
+    """Send the records of all daedalus loggers to the terminal.
+
+    Args:
+      level: least severity that is shown, one of LEVELS.
+      as_json: one JSON object a line, for a log collector, instead of plain messages.
+      prefix: put before each plain message, such as the name of the process.
+      write: takes a whole line, where a progress line shares the terminal; default: standard output.
+    """
+    handler = _LineHandler(write or _print)
+    plain = logging.Formatter(prefix.replace("%", "%%") + "%(message)s")
+    handler.setFormatter(_JsonFormatter() if as_json else plain)
+    logger = logging.getLogger("daedalus")
+    logger.handlers[:] = [handler]
+    logger.setLevel(level.upper())
+
+
+def _print(line: str) -> None:
+    print(line, flush=True)
+
+
+class _LineHandler(logging.Handler):
+    """Writes each record as one line; a terminal that is gone is nobody's fault."""
+
+    def __init__(self, write: Callable[[str], None]) -> None:
+        super().__init__()
+        self._write = write
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See logging.Handler."""
+        try:
+            self._write(self.format(record))
+        except (OSError, ValueError):  # closed
+            return
+        except Exception:
+            self.handleError(record)
+
+
+class _JsonFormatter(logging.Formatter):
+    """The fields of a record that a log collector indexes."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        fields = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "process": record.process,
+            "thread": record.threadName,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            fields["exception"] = self.formatException(record.exc_info)
+        return json.dumps(fields)
