@@ -5,11 +5,10 @@ The marker `<!-- commands -->` in a page is replaced by the help of every comman
 
 import argparse
 import os
-from collections.abc import Callable
 from typing import Any
 from unittest.mock import patch
 
-from daedalus.cli.commands import bridge, certs, exporter, plot, router, status, train
+from daedalus.cli.commands import bridge, certs, completion, exporter, plot, router, status, train
 from daedalus.cli.commands.actor_arguments import parser as actor_parser
 from daedalus.cli.commands.evaluate_arguments import parser as evaluate_parser
 from daedalus.cli.settings_arguments import learner_parser
@@ -17,41 +16,21 @@ from daedalus.cli.settings_arguments import learner_parser
 MARKER = "<!-- commands -->"
 
 
-class _ParserFoundError(Exception):
-    """The parser of a command, taken before the command does anything."""
-
-    def __init__(self, parser: argparse.ArgumentParser) -> None:
-        self.parser = parser
-
-
-def _parser_of(run: Callable[[], object]) -> argparse.ArgumentParser:
-    """Return the parser that a command makes for itself."""
-
-    def found(parser: argparse.ArgumentParser, *_: Any) -> None:
-        raise _ParserFoundError(parser)
-
-    with patch.object(argparse.ArgumentParser, "parse_args", found):
-        try:
-            run()
-        except _ParserFoundError as result:
-            return result.parser
-    raise AssertionError("the command has parsed no arguments")
-
-
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Return the parser of every command, in the order of `daedalus --help`."""
     return {
-        "train": _parser_of(lambda: train.train([])),
-        "resume": _parser_of(lambda: train.resume([])),
+        "train": train.train_parser(),
+        "resume": train.resume_parser(),
         "learner": learner_parser(),
         "actor": actor_parser(),
         "router": router.parser(),
         "status": status.parser(),
-        "bridge": _parser_of(bridge.main),
+        "bridge": bridge.parser(),
         "exporter": exporter.parser(),
-        "certs": _parser_of(lambda: certs.certs([])),
+        "certs": certs.parser(),
         "evaluate": evaluate_parser(),
-        "plot": _parser_of(lambda: plot.plot([])),
+        "plot": plot.parser(),
+        "completion": completion.parser(),
     }
 
 

@@ -11,6 +11,8 @@ import pytest
 import yaml
 from pages import DOCS, ROOT
 
+import daedalus
+
 LOADING = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "video": "src"}
 
 
@@ -80,5 +82,7 @@ def test_pictures_are_on_the_site(site: Path) -> None:
 
 def test_the_python_api_is_on_its_page(site: Path) -> None:
     page = (site / "reference" / "python.html").read_text("utf-8")
-    for name in ("Client.act", "Transport.query", "MetricsWriter.write"):
+    for name in daedalus.__all__:
+        assert name == "__version__" or f'id="daedalus.{name}"' in page, name
+    for name in ("Client.act", "Policy.act", "Transport.query", "MetricsWriter.write"):
         assert f'.{name}"' in page, name

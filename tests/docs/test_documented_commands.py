@@ -21,7 +21,7 @@ def commands_in_blocks(text: str) -> list[list[str]]:
     return [
         shlex.split(command)
         for line in lines
-        for part in line.split("&&")
+        for part in re.split(r"&&|\s>\s", line)
         for command in re.findall(r"(?<![`\w./'-])daedalus (?=[a-z])(.*)", part)
     ]
 

@@ -52,7 +52,7 @@ def test_rows_state_type_range_and_default(setting: str, kind: str, limits: str,
 
 
 def test_every_command_is_in_the_reference() -> None:
-    commands = re.findall(r"^  ([a-z]+)  ", USAGE, re.MULTILINE)
+    commands = re.findall(r"^  ([a-z]+) ", USAGE, re.MULTILINE)
     assert set(COMMANDS.parsers()) == set(commands)
     text = COMMANDS.command_sections()
     for command in [*commands, "certs init", "certs issue", "certs revoke"]:
