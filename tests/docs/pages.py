@@ -10,7 +10,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted(
     [
         *DOCS.rglob("*.md"),
-        ROOT / "README.md",
+        *ROOT.glob("*.md"),
         ROOT / "examples" / "node" / "README.md",
         ROOT / "policy" / "pretrained" / "car_racing" / "README.md",
     ]

@@ -9,6 +9,7 @@ from pages import DOCS, PAGES, ROOT, code_blocks, inline_code, name_of
 from pydantic import BaseModel
 
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.credentials import CERTIFICATE, KEY
 
 FOLDERS = "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|learner|policy|protocol|tests|transport"
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
@@ -51,6 +52,17 @@ def test_settings_exist(page: Path) -> None:
         assert isinstance(model, type)
         assert issubclass(model, BaseModel)
         assert key in model.model_fields or key in FILE_ENDINGS, f"{section}.{key}"
+
+
+def test_the_messages_about_certificates_are_those_of_the_code() -> None:
+    table = (DOCS / "security.md").read_text("utf-8").partition("| message |")[2]
+    sources = "".join(path.read_text("utf-8") for path in (ROOT / "transport").glob("*.py"))
+    sources = sources.replace("{KEY}", KEY).replace("{CERTIFICATE}", CERTIFICATE)
+    messages = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
+    assert len(messages) > 4
+    for message in messages:
+        for words in filter(None, (part.strip() for part in message.split("..."))):
+            assert words in sources, message
 
 
 def test_the_way_of_a_rollout_names_functions_that_exist() -> None:
