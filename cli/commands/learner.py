@@ -30,7 +30,7 @@ from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from daedalus.transport.zenoh_transport import listen
 
-_logger = logging.getLogger(__name__)
+_logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
