@@ -144,7 +144,7 @@ def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping
                 actors.remove(actor)
                 stop([actor.process])
                 playing = sum(other.name != _EVALUATOR for other in actors)
-                needed = not playing or spec.synchronous  # a2c waits for all at its start
+                needed = not playing or spec.algorithm.synchronous  # a2c waits for all at its start
                 if needed and actor.name != _EVALUATOR:
                     raise
                 _warn(f"{error}; going on without it")

@@ -8,8 +8,9 @@ line) or how it is used.
 
 from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import AfterValidator, Field, JsonValue, model_validator
 
+from daedalus.protocol.algorithms import ALGORITHMS, Algorithm, check_algorithm
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
@@ -93,7 +94,7 @@ class CollectionSpec(Specification):
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
-    algorithm: Literal["a2c", "a3c", "impala", "appo"] = "impala"
+    algorithm: Annotated[str, AfterValidator(check_algorithm)] = "impala"
     """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the network, the environments and the actions."""
@@ -160,7 +161,7 @@ class TrainingSpec(Specification):
     @property
     def updates_per_batch(self) -> int:
         """Number of policy versions that one batch produces."""
-        return self.passes * self.minibatches if self.algorithm == "appo" else 1
+        return self.passes * self.minibatches if ALGORITHMS[self.algorithm].passes_over_batch else 1
 
     @property
     def policy_lag_bound(self) -> int:
@@ -219,9 +220,10 @@ class RunSpec(Specification):
 
     @model_validator(mode="after")
     def _one_batch_fits_the_barrier(self) -> "RunSpec":
-        if self.training.algorithm == "a2c" and self.training.batch_rollouts is not None:
+        if self.algorithm.synchronous and self.training.batch_rollouts is not None:
             raise ValueError(
-                "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
+                f"training.batch_rollouts has no meaning for {self.algorithm.name}: "
+                "its batch is one rollout of every live actor"
             )
         return self
 
@@ -236,6 +238,11 @@ class RunSpec(Specification):
         return self
 
     @property
-    def synchronous(self) -> bool:
-        """Whether actors wait for each update (a2c) or never do."""
-        return self.training.algorithm == "a2c"
+    def algorithm(self) -> Algorithm:
+        """How the run's updates are scheduled."""
+        return ALGORITHMS[self.training.algorithm]
+
+    @property
+    def batch_rollouts(self) -> int:
+        """How many rollouts make a batch where no barrier decides it."""
+        return self.training.batch_rollouts or self.algorithm.batch_rollouts or self.collection.actors
