@@ -78,7 +78,7 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
         if isinstance(node, ast.Call) and ast.unparse(node.func) in wall
     }
     assert users == {
-        ("metrics.py", "time.time"),
+        ("tensorboard_writer.py", "time.time"),
         ("logs.py", "time.strftime"),  # only dates log records
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are good from one day to another
