@@ -26,6 +26,9 @@ afterwards:
   evaluate   play episodes with what a run has learned, or film them
   plot       draw the curves of one or more runs
 
+for the shell:
+  completion print a script that completes commands, options and presets
+
 `daedalus COMMAND --help` tells more. To begin: daedalus train cartpole"""
 
 
@@ -94,6 +97,12 @@ def _certs(arguments: list[str]) -> int:
     return certs(arguments)
 
 
+def _completion(arguments: list[str]) -> int:
+    from daedalus.cli.commands.completion import completion
+
+    return completion(arguments)
+
+
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
@@ -102,4 +111,5 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "exporter": _exporter,
     "plot": _plot,
     "certs": _certs,
+    "completion": _completion,
 }

@@ -12,8 +12,9 @@ import tempfile
 import threading
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+from daedalus.cli.child_output import INHERITED, Streams
 from daedalus.cli.supervisor import stop
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
@@ -25,7 +26,7 @@ _SEEDS = 2**33  # added to the run's: neither training nor the final episodes ha
 
 
 class EvaluationFailedError(Exception):
-    """Episodes could not be played, and why was said; or they were to be played no more."""
+    """Episodes could not be played, or were stopped; the message is what the first evaluation did not print itself."""
 
 
 def select_best(
@@ -33,6 +34,7 @@ def select_best(
     spec: RunSpec,
     options: list[str],
     stopping: threading.Event,
+    streams: Streams = INHERITED,
 ) -> list[dict[str, Any]]:
     """Scores each candidate anew; what each got, the best first. Nothing, if there are not two to choose from.
 
@@ -46,7 +48,7 @@ def select_best(
         f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}"
     )
     with_it = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *with_it] for each in finalists], stopping)
+    results = play([[str(each.directory), *with_it] for each in finalists], stopping, streams)
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
@@ -60,7 +62,7 @@ def select_best(
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 
 
-def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str, Any]]:
+def play(commands: list[list[str]], stopping: threading.Event, streams: Streams = INHERITED) -> list[dict[str, Any]]:
     """Runs `daedalus evaluate`, once for each list of words, beside one another; their results.
 
     Raises EvaluationFailedError.
@@ -68,25 +70,20 @@ def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str,
     with ExitStack() as stack:
         outputs = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
         # The first tells how far it is, for all of them; what the others say is for when they fail.
-        errors = [None, *(stack.enter_context(tempfile.TemporaryFile()) for _ in commands[1:])]
-        processes = [
-            subprocess.Popen(
-                [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate", *words, "--json", "--exit-with-parent"],
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=error,
-            )
-            for words, output, error in zip(commands, outputs, errors, strict=True)
-        ]
-        while any(process.poll() is None for process in processes) and not stopping.wait(_POLL_SECONDS):
-            pass
-        stop(processes)
+        others = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands[1:]]
+        processes: list[subprocess.Popen[bytes]] = []
+        try:
+            for words, output, error in zip(commands, outputs, [streams.stderr, *others], strict=True):
+                processes.append(_start_evaluation(words, output, error))
+            while any(process.poll() is None for process in processes) and not stopping.wait(_POLL_SECONDS):
+                pass
+        finally:
+            stop(processes)
+        errors = [None, *others]
         failed = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
         if failed:
-            for error in filter(None, [] if stopping.is_set() else failed):
-                error.seek(0)
-                sys.stderr.write(error.read().decode(errors="replace"))
-            raise EvaluationFailedError
+            said = [] if stopping.is_set() else [_text(error) for error in failed if error is not None]
+            raise EvaluationFailedError("".join(said))
         for output in outputs:
             output.seek(0)
         results = [json.load(output) for output in outputs]
@@ -94,3 +91,14 @@ def play(commands: list[list[str]], stopping: threading.Event) -> list[dict[str,
         for each_episode in ("returns", "lengths"):
             del result[each_episode]
     return results
+
+
+def _start_evaluation(words: list[str], output: IO[bytes], error: IO[bytes] | int | None) -> subprocess.Popen[bytes]:
+    program = [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate"]
+    command = [*program, *words, "--json", "--exit-with-parent"]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=error)
+
+
+def _text(file: IO[bytes]) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace")

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging
@@ -64,22 +65,43 @@ def add_settings(options: argparse.ArgumentParser) -> None:
 
 def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
     """The specification and the run directory that the arguments ask for. Raises SettingsError."""
-    if (arguments.preset is None) == (arguments.env is None):
+    settings = chosen_settings(
+        arguments.preset,
+        arguments.env,
+        arguments.algorithm,
+        seed=arguments.seed,
+        env_steps=arguments.env_steps,
+        actors=arguments.actors,
+    )
+    override(settings, arguments.set)
+    spec = run_spec(settings)
+    return spec, arguments.run_dir or named_directory(arguments.preset, spec)
+
+
+def chosen_settings(
+    preset: str | None,
+    env: str | None,
+    algorithm: str | None,
+    *,
+    seed: int | None,
+    env_steps: int | None,
+    actors: int | None,
+) -> dict[str, Any]:
+    """Return the settings of a preset or an environment with the most used settings applied. Raises SettingsError."""
+    if (preset is None) == (env is None):
         raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
-    settings = {"environment": {"id": arguments.env}} if arguments.env else read_preset(arguments.preset)
-    choose_algorithm(settings, arguments.algorithm)
-    shortcuts = {
-        ("training", "seed"): arguments.seed,
-        ("training", "env_steps"): arguments.env_steps,
-        ("collection", "actors"): arguments.actors,
-    }
+    settings: dict[str, Any] = {"environment": {"id": env}} if preset is None else read_preset(preset)
+    choose_algorithm(settings, algorithm)
+    shortcuts = {("training", "seed"): seed, ("training", "env_steps"): env_steps, ("collection", "actors"): actors}
     for (section, key), value in shortcuts.items():
         if value is not None:
             settings.setdefault(section, {})[key] = value
-    override(settings, arguments.set)
-    spec = run_spec(settings)
-    name = Path(arguments.preset).stem if arguments.preset else spec.environment.id
-    return spec, arguments.run_dir or run_directory.default_directory(name, spec)
+    return settings
+
+
+def named_directory(preset: str | None, spec: RunSpec) -> Path:
+    """Return the default run directory, named after the preset or the environment."""
+    return run_directory.default_directory(Path(preset).stem if preset else spec.environment.id, spec)
 
 
 def resolve_again(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from daedalus.cli.child_output import INHERITED, Streams
+
 _MOST_FAILURES = 3  # of one process's own doing, by exit status
 _SOON_SECONDS = 60.0  # a failure later than that after its start begins the count anew
 _MOST_RESTARTS = 1000  # of one process killed from outside
@@ -21,7 +23,9 @@ _ACTORS_NICENESS = 5  # beyond the learner's
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
-def start(module: str, *arguments: str, one_thread: bool = False) -> subprocess.Popen[bytes]:
+def start(
+    module: str, *arguments: str, one_thread: bool = False, streams: Streams = INHERITED
+) -> subprocess.Popen[bytes]:
     """Starts `python -m module` with its own end of a pipe as standard input.
 
     The pipe closes when this process is gone, however it went, and the child then ends by itself.
@@ -29,6 +33,8 @@ def start(module: str, *arguments: str, one_thread: bool = False) -> subprocess.
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
         stdin=subprocess.PIPE,
+        stdout=streams.stdout,
+        stderr=streams.stderr,
         env={**os.environ, **_ONE_THREAD} if one_thread else None,
     )
 
@@ -92,21 +98,14 @@ class Supervised:
         return f"{self.name} {how}; started again"
 
 
-def supervised_actor(name: str, connect: str, options: tuple[str, ...] = ()) -> Supervised:
+def supervised_actor(
+    name: str, connect: str, options: tuple[str, ...] = (), streams: Streams = INHERITED
+) -> Supervised:
     """An actor, or the evaluator, under supervision."""
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
-        process = start(
-            "daedalus.cli.commands.actor",
-            "--connect",
-            connect,
-            "--name",
-            name,
-            "--log-level",
-            "warning",
-            *options,
-            one_thread=True,
-        )
+        arguments = ["--connect", connect, "--name", name, "--log-level", "warning", *options]
+        process = start("daedalus.cli.commands.actor", *arguments, one_thread=True, streams=streams)
         with suppress(AttributeError, OSError):  # not everywhere, and it may be gone already
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
             os.setpriority(os.PRIO_PROCESS, process.pid, niceness)

@@ -1,1 +1,60 @@
-"""Actor-critic reinforcement learning with one learner and any number of actors, anywhere."""
+"""Actor-critic reinforcement learning with one learner and any number of actors, anywhere.
+
+The public API; each name is imported when it is first used, so that `import daedalus` itself loads no other package:
+
+    result = daedalus.train("cartpole")
+    policy = daedalus.load_policy(result.directory)
+    action = policy.act(observation)
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from daedalus.actor.client import Client
+    from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
+    from daedalus.cli.train_function import RunResult, TrainingError, train
+    from daedalus.learner.run.settings import SettingsError
+
+    __version__: str
+
+__all__ = [
+    "Client",
+    "Policy",
+    "RunResult",
+    "SettingsError",
+    "TrainingError",
+    "__version__",
+    "load_policy",
+    "train",
+]
+
+_MODULES = {
+    "Client": "daedalus.actor.client",
+    "Policy": "daedalus.actor.evaluation.loaded_policy",
+    "RunResult": "daedalus.cli.train_function",
+    "SettingsError": "daedalus.learner.run.settings",
+    "TrainingError": "daedalus.cli.train_function",
+    "load_policy": "daedalus.actor.evaluation.loaded_policy",
+    "train": "daedalus.cli.train_function",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of the public API when it is first used."""
+    import importlib
+
+    if name == "__version__":
+        import importlib.metadata
+
+        value: Any = importlib.metadata.version("daedalus-rl")
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the names of the public API and of the module itself."""
+    return sorted({*globals(), *__all__})

@@ -10,7 +10,7 @@ import argparse
 
 import gymnasium
 
-from daedalus.actor import Client
+from daedalus import Client
 
 
 def main() -> None:

@@ -128,14 +128,8 @@ class ClientPlayer:
         self._ended = True
 
     def _frame(self, observation: Any) -> np.ndarray:
-        space = self._spaces[0]
-        frame = np.asarray(observation, space.dtype)
-        if frame.shape != space.shape:
-            raise ValueError(f"the observation has shape {frame.shape}, its space {space.shape}")
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise ValueError("the observation has a value that is not finite")
         assert self._transforms is not None
-        return self._transforms.frames(frame[None])
+        return self._transforms.frame(observation)
 
     def _adopt(self, frame: np.ndarray) -> None:
         """Goes over to a policy that has come since: what was being written down is given up."""

@@ -1,6 +1,8 @@
 """gymnasium's environments, and every environment that a user registers with it."""
 
+import importlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, SupportsFloat
 
@@ -184,6 +186,23 @@ def registration(environment_id: str) -> EnvSpec:
         raise unknown_environment(
             name, gymnasium.registry.keys(), "is its package installed and its module named (module:Id)?"
         ) from None
+
+
+def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Return the specification for an evaluation on gymnasium's implementation of the environment.
+
+    Atari games of the other backends have another name there, and repeat actions unless told not to.
+    """
+    evaluated = spec.as_evaluated("gymnasium")
+    if spec.backend == "gymnasium":
+        return evaluated
+    atari_id = f"ALE/{spec.id.removeprefix('ALE/').removesuffix('-v5')}-v5"
+    with suppress(ImportError):
+        gymnasium.register_envs(importlib.import_module("ale_py"))
+    if atari_id not in gymnasium.registry:
+        return evaluated
+    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}  # as the others have it by default
+    return evaluated.model_copy(update={"id": atari_id, "kwargs": kwargs})
 
 
 def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:

@@ -1,5 +1,7 @@
 """A specification's action table and pixel transforms, around a backend's environments."""
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 
@@ -22,6 +24,7 @@ class Transforms:
             raise EnvironmentSetupError(
                 f"observation space {observation_space} is not supported: it must be a Box of one to four dimensions"
             )
+        self._observation_space = observation_space
         self._actions = env_actions(spec.action_table, action_space)
         self._pixels = Pixels(spec, observation_space)
         dtype = "uint8" if observation_space.dtype == np.uint8 else "float32"
@@ -29,6 +32,19 @@ class Transforms:
             observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
             action=DiscreteSpace(count=len(self._actions)),
         )
+
+    def frame(self, observation: Any) -> np.ndarray:
+        """Return one observation of the environment as the run has it: [1, *frame_shape].
+
+        Raises ValueError if the observation is not of the environment's space.
+        """
+        space = self._observation_space
+        frame = np.asarray(observation, space.dtype)
+        if frame.shape != space.shape:
+            raise ValueError(f"the observation has shape {frame.shape}, its space {space.shape}")
+        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+            raise ValueError("the observation has a value that is not finite")
+        return self.frames(frame[None])
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
         """[E, *the environment's shape] as the run has them: [E, *frame_shape]."""

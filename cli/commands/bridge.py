@@ -3,6 +3,7 @@
 Exit status: 0 told to stop, 1 failed, 2 bad usage.
 """
 
+import argparse
 import logging
 import socket
 import sys
@@ -30,8 +31,8 @@ examples:
   daedalus bridge --connect tls/gpu-box:7447 --tls actor-arm-3 --listen tcp/127.0.0.1:7448"""
 
 
-def main() -> int:
-    """Runs `daedalus bridge`."""
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus bridge`."""
     options = command_parser("bridge", DESCRIPTION, EXAMPLES)
     add_connect(options, "where the learner, or a router that knows it, listens")
     options.add_argument(
@@ -40,7 +41,12 @@ def main() -> int:
     add_tls(options)
     add_insecure(options)
     add_logging(options)
-    arguments = options.parse_args()
+    return options
+
+
+def main() -> int:
+    """Runs `daedalus bridge`."""
+    arguments = parser().parse_args()
     configure_logging(arguments.log_level, as_json=arguments.log_json, prefix="bridge: ")
     try:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")

@@ -1,5 +1,6 @@
 """`daedalus certs`: a private CA, and certificates for routers, learners, actors and operators."""
 
+import argparse
 import datetime
 import json
 import os
@@ -36,8 +37,8 @@ An actor's certificate lets it play under its own name, or NAME.anything, and no
 for the status. Learners and routers read whom they let in when they start: restart them after issue and revoke."""
 
 
-def certs(arguments: list[str]) -> int:
-    """Runs `daedalus certs`."""
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus certs`."""
     options = command_parser("certs", _DESCRIPTION, _EXAMPLES)
     verbs = options.add_subparsers(dest="verb", required=True, metavar="VERB")
     init = verbs.add_parser("init", help="a new CA, and certificates for the learner, a router and one operator")
@@ -52,7 +53,12 @@ def certs(arguments: list[str]) -> int:
     revoke.add_argument("names", nargs="+", metavar="NAME")
     for verb in (issue, revoke):
         verb.add_argument("--directory", type=Path, default=Path("certs"), metavar="DIR", help="default: certs")
-    parsed = options.parse_args(arguments)
+    return options
+
+
+def certs(arguments: list[str]) -> int:
+    """Runs `daedalus certs`."""
+    parsed = parser().parse_args(arguments)
     try:
         if parsed.verb == "init":
             said = _init(parsed.directory, parsed.host)
@@ -61,7 +67,7 @@ def certs(arguments: list[str]) -> int:
         else:
             said = _revoke(parsed.directory, parsed.role, parsed.names)
     except ImportError:
-        print('daedalus certs: needs cryptography: pip install "daedalus-rl[learner]"', file=sys.stderr)
+        print('daedalus certs: needs cryptography: pip install "daedalus-rl[certs]"', file=sys.stderr)
         return 1
     except (CredentialsError, OSError, ValueError) as error:
         print(f"daedalus certs: {error}", file=sys.stderr)

@@ -1,13 +1,11 @@
 """`daedalus evaluate`: plays a run's best checkpoint, or a given one, and prints how it does."""
 
 import argparse
-import importlib
 import json
 import sys
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, TextIO
 
 import gymnasium
@@ -15,6 +13,7 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
@@ -85,21 +84,8 @@ def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> Environm
     backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
     if watched:
         backend = "gymnasium"
-    played = trained.as_evaluated(backend)
-    if backend == "gymnasium" and trained.backend != "gymnasium":
-        played = _as_gymnasium_has_it(played)
+    played = as_on_gymnasium(trained) if backend == "gymnasium" else trained.as_evaluated(backend)
     return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
-
-
-def _as_gymnasium_has_it(spec: EnvironmentSpec) -> EnvironmentSpec:
-    """Atari games of the other backends have another name there, and repeat actions on their own unless told not to."""
-    atari_id = f"ALE/{spec.id.removeprefix('ALE/').removesuffix('-v5')}-v5"
-    with suppress(ImportError):
-        gymnasium.register_envs(importlib.import_module("ale_py"))
-    if atari_id not in gymnasium.registry:
-        return spec
-    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}  # as the others have it by default
-    return spec.model_copy(update={"id": atari_id, "kwargs": kwargs})
 
 
 def _play(

@@ -21,8 +21,8 @@ _PANELS = (
 )
 
 
-def plot(arguments: list[str]) -> int:
-    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus plot`."""
     options = argparse.ArgumentParser(
         prog="daedalus plot",
         description="Draws return, entropy, value loss and policy lag against env_steps.",
@@ -31,12 +31,17 @@ def plot(arguments: list[str]) -> int:
     )
     options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, one colour each")
     options.add_argument("--output", type=Path, required=True, metavar="FILE", help="the picture: .png, .svg or .pdf")
-    parsed = options.parse_args(arguments)
+    return options
+
+
+def plot(arguments: list[str]) -> int:
+    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+    parsed = parser().parse_args(arguments)
     try:
         runs = {directory.name: _read(directory) for directory in parsed.directories}
         _draw(runs, parsed.output)
     except ModuleNotFoundError:
-        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[learner]"', file=sys.stderr)
+        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[plot]"', file=sys.stderr)
         return 1
     except (OSError, ValueError) as error:
         print(f"daedalus plot: {error}", file=sys.stderr)

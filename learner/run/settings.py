@@ -45,25 +45,35 @@ def read_file(path: Path) -> dict[str, Any]:
 
 
 def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
-    """Applies `section.key=value` assignments in place; values are TOML, or plain text where they are not.
+    """Apply `section.key=value` assignments in place; values are TOML, or plain text where they are not.
 
     Raises SettingsError for an assignment that names nothing.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
-        keys = path.strip().split(".")
-        if not equals or len(keys) < 2:
+        if not equals or "." not in path:
             raise SettingsError(f"--set {assignment}: write section.key=value, such as training.learning_rate=0.001")
         try:
             value = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             value = text
-        section = settings
-        for key in keys[:-1]:
-            section = section.setdefault(key, {})
-            if not isinstance(section, dict):
-                raise SettingsError(f"--set {assignment}: {key} is a value, not a section")
-        _assign(section, keys[-1], value)
+        try:
+            assign(settings, path, value)
+        except SettingsError as error:
+            raise SettingsError(f"--set {assignment}: {error}") from None
+
+
+def assign(settings: dict[str, Any], path: str, value: Any) -> None:
+    """Set `section.key` to a value in place; None and "none" unset it. Raises SettingsError if the path is none."""
+    *sections, key = path.strip().split(".")
+    if not sections:
+        raise SettingsError(f"{path!r} has no section: write section.key, such as training.learning_rate")
+    section = settings
+    for name in sections:
+        section = section.setdefault(name, {})
+        if not isinstance(section, dict):
+            raise SettingsError(f"{name} is a value, not a section")
+    _assign(section, key, value)
 
 
 def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
@@ -84,7 +94,7 @@ def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
 
 
 def _assign(section: dict[str, Any], key: str, value: Any) -> None:
-    if value == "none":  # TOML has no word for it
+    if value is None or (isinstance(value, str) and value == "none"):  # TOML has no word for it
         section.pop(key, None)
     else:
         section[key] = value

@@ -10,7 +10,7 @@ import pytest
 from processes import LIMIT, until
 
 from daedalus.cli import supervisor
-from daedalus.cli.commands import train
+from daedalus.cli.local_run import watch
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import RunSpec
 
@@ -90,7 +90,7 @@ def test_who_left_while_the_others_go_on_is_fetched_back(monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(("algorithm", "told"), [("impala", True), ("a2c", False)])
 def test_training_goes_on_without_an_actor_that_fails_for_good_unless_it_is_needed(
-    algorithm: str, told: bool, capsys: pytest.CaptureFixture[str]
+    algorithm: str, told: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "training": {"algorithm": algorithm}})
     learner, actors = supervised(SLEEP), [supervised("raise SystemExit(7)") for _ in range(2)]
@@ -99,8 +99,10 @@ def test_training_goes_on_without_an_actor_that_fails_for_good_unless_it_is_need
     processes = [*actors, evaluator, learner]
     try:
         with pytest.raises(FailedError, match="it failed 3 times"):
-            train._watch(learner, [evaluator, *actors], spec, threading.Event())
-        output = capsys.readouterr().out
-        assert ("it failed 3 times; its error is above; going on without it" in output) == told
+            watch(learner, [evaluator, *actors], spec, threading.Event())
+        assert (
+            any("it failed 3 times; its error is above; going on without it" in text for text in caplog.messages)
+            == told
+        )
     finally:
         stop([each.process for each in processes])

@@ -1,6 +1,7 @@
 """Docker on the machine of the test: a daemon, and a base image where none can be pulled."""
 
 import contextlib
+import json
 import os
 import shutil
 import ssl
@@ -10,6 +11,8 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+from pip_configuration import for_image, options_of
 
 BASE = "daedalus-test-base"  # what override.yml names
 _PYTHON = "python:3.11-slim"  # what the Dockerfile names
@@ -78,27 +81,19 @@ def make_base() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         steps = [f"FROM {origin}", "COPY pip.conf /etc/pip.conf"]
-        options, wheels = _pip_options()
-        (folder / "pip.conf").write_text("\n".join(["[global]", *options, ""]))
-        for index, directory in enumerate(wheels):
-            shutil.copytree(directory, folder / f"wheels-{index}")
-            steps.append(f"COPY wheels-{index} {directory}")
+        options, copied = for_image(options_of(run(sys.executable, "-m", "pip", "config", "list").stdout))
+        lines = [f"{name} = {value}" for name, value in options.items()]
+        (folder / "pip.conf").write_text("\n".join(["[global]", *lines, ""]))
+        for index, path in enumerate(copied):
+            copy = shutil.copytree if path.is_dir() else shutil.copy
+            copy(path, folder / f"pip-{index}")
+            steps.append(f"COPY {json.dumps([f'pip-{index}', str(path)])}")
         authorities = os.environ.get("SSL_CERT_FILE") or ssl.get_default_verify_paths().cafile
         if authorities:
             shutil.copy(authorities, folder / "authorities.crt")
             steps.append("COPY authorities.crt /etc/ssl/certs/ca-certificates.crt")
         (folder / "Dockerfile").write_text("\n".join([*steps, ""]))
         run("docker", "build", "--tag", BASE, folder)
-
-
-def _pip_options() -> tuple[list[str], list[Path]]:
-    """This machine's pip configuration as lines of a file, and the folders of wheels that it names."""
-    told = run(sys.executable, "-m", "pip", "config", "list").stdout.splitlines()
-    settings = dict(line.split("=", 1) for line in told if "=" in line)
-    # `global.cert='...'`; what comes by the environment is `:env:.cert='...'`, and goes before.
-    options = {name.rpartition(".")[2]: value.strip("'") for name, value in sorted(settings.items(), reverse=True)}
-    wheels = [Path(word) for word in options.get("find-links", "").split() if Path(word).is_dir()]
-    return [f"{name} = {value}" for name, value in options.items()], wheels
 
 
 def _stand_in() -> str:

@@ -16,7 +16,8 @@ SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml
 def test_images_are_built_of_every_package() -> None:
     packages = {"daedalus", *(link.name for link in (ROOT / "daedalus").iterdir() if link.is_symlink())}
     kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    assert packages | {"pyproject.toml", "constraints.txt", "README.md"} == kept
+    files = {"pyproject.toml", "constraints.txt", "README.md", "LICENSE", "MANIFEST.in"}
+    assert packages | files == kept
 
 
 def test_without_the_profile_it_is_router_learner_and_actors() -> None:

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from processes import Running
 
+from daedalus.cli import main
+
 Start = Callable[..., Running]
 
 
@@ -80,9 +82,7 @@ def test_an_address_in_use_is_told(start: Start, address: str, tmp_path: Path) -
     assert not (tmp_path / "two").exists()
 
 
-@pytest.mark.parametrize(
-    "command", ["train", "resume", "learner", "actor", "router", "status", "exporter", "certs", "evaluate", "plot"]
-)
+@pytest.mark.parametrize("command", [*main._MODULES, *main._COMMANDS])
 def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
     running = start(command, "--help")
     assert running.wait() == 0

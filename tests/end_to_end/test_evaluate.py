@@ -21,6 +21,8 @@ from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.commands import train as train_command
 from daedalus.cli.commands.evaluate import main
+from daedalus.cli.local_run import LocalRun, evaluate_run
+from daedalus.cli.select_best import EvaluationFailedError
 from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -255,7 +257,7 @@ def test_the_car_that_ships_drives(evaluate: Callable[..., dict]) -> None:
 
 
 def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
 ) -> None:
     settings = {"final_episodes": 3, "final_backend": "envpool"}
     run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation=settings)
@@ -263,15 +265,17 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
     (run / "checkpoints" / "0000000005").rename(tmp_path / "no newer one")
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
-    assert train_command._evaluate(run, spec, None, threading.Event())
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    summary = evaluate_run(local_run, threading.Event())
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
     assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
     assert evaluation["select_best"] == []
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
-    train_command._report(run, spec)
-    assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in capsys.readouterr().out
+    assert result == summary
+    report = train_command._report(local_run, summary)
+    assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in report
 
 
 def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
@@ -283,7 +287,7 @@ def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, eval
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
     newest = max(version for version in (1, 2, 3) if version != worst)
-    assert train_command._evaluate(run, spec, None, threading.Event())
+    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event())
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
@@ -302,7 +306,8 @@ def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) 
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
     stopping.set()
-    assert not train_command._evaluate(run, spec, None, stopping)
+    with pytest.raises(EvaluationFailedError):
+        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping)
     assert not processes_mentioning(str(run))
 
 

@@ -1,0 +1,108 @@
+"""A trained policy for a loop of the caller's own: load it from a run, give it observations, take its actions."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
+from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
+from daedalus.protocol.frames import FrameStack
+from daedalus.protocol.spec import RunSpec
+
+
+class Policy:
+    """A trained policy that plays one environment: frame stack, memory and action repeat are kept here.
+
+    It takes observations and returns actions of the environment itself; `action_space` and `observation_space` are
+    the environment's.
+    """
+
+    def __init__(self, saved: SavedPolicy, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> None:
+        """Raises EnvironmentSetupError if the spaces are not those that the policy was trained on."""
+        self.spec: RunSpec = saved.spec
+        self.policy_version: int = saved.policy_version
+        self.observation_space, self.action_space = observation_space, action_space
+        self._transforms = Transforms(saved.spec.environment, observation_space, action_space)
+        if self._transforms.spaces != saved.spaces:
+            raise EnvironmentSetupError(
+                f"the environment has {self._transforms.spaces} after the run's transforms; the policy was trained on "
+                f"{saved.spaces}: use the environment that the run used (config.toml, versions.json)"
+            )
+        self._runtime = OnnxRuntime(saved.program)
+        self._runtime.load(saved.weights)
+        self._random = np.random.default_rng()
+        self._repeat = saved.spec.environment.action_repeat
+        self.reset()
+
+    def reset(self, *, seed: int | None = None) -> None:
+        """Start an episode: forget what was seen. `seed` is for the actions of `act(sampled=True)`."""
+        if seed is not None:
+            self._random = np.random.default_rng(seed)
+        self._stack = FrameStack(self._transforms.spaces.observation, 1)
+        self._state = np.zeros((1, self._runtime.state_size), np.float32)
+        self._action: Any = None
+        self._repeats_left = 0
+
+    def act(self, observation: Any, *, sampled: bool = False) -> Any:
+        """Return the action for the next step of the environment: the most probable one, or a sampled one.
+
+        Call it once for every step, with the newest observation, and call `reset` at the start of each episode. If the
+        run repeats actions (environment.action_repeat), an action is returned as many times before the next is chosen.
+
+        Args:
+          observation: one observation, of the environment's own shape and dtype.
+          sampled: sample from the policy's distribution, as training does.
+
+        Raises ValueError for an observation that is not of the space.
+        """
+        if self._repeats_left == 0:
+            self._action = self._choose(self._transforms.frame(observation), sampled)
+            self._repeats_left = self._repeat
+        self._repeats_left -= 1
+        return self._action.copy()
+
+    def _choose(self, frame: np.ndarray, sampled: bool) -> Any:
+        self._stack.push(frame, np.array([self._action is None]))
+        random = self._random if sampled else None
+        actions, _, self._state = self._runtime.act(self._stack.observations, self._state, random)
+        return self._transforms.env_actions(actions)[0]
+
+
+def load_policy(
+    directory: str | Path | None = None,
+    *,
+    newest: bool = False,
+    pretrained: str | None = None,
+    observation_space: gymnasium.Space | None = None,
+    action_space: gymnasium.Space | None = None,
+) -> Policy:
+    """Load the policy of a run, or one that ships with the package.
+
+    Args:
+      directory: a run directory, or one of its checkpoints; of a run the best checkpoint, else the newest.
+      newest: load the newest checkpoint of the run, not the best.
+      pretrained: the name of a policy that ships with the package, in place of a directory.
+      observation_space, action_space: of the environment to play, if it was changed by wrappers or cannot be made here;
+        by default the run's environment is made once to learn its spaces.
+
+    Raises DamagedError if there is no checkpoint that can be read, NoPolicyError for an unknown pretrained name,
+    EnvironmentSetupError if the environment cannot be made or is not the one of the run, and ValueError if not exactly
+    one of directory and pretrained is given, or only one of the spaces.
+    """
+    if (directory is None) == (pretrained is None):
+        raise ValueError("name either a run directory or a pretrained policy")
+    if (observation_space is None) != (action_space is None):
+        raise ValueError("give both observation_space and action_space, or neither")
+    path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
+    saved = find_policy(path, newest)
+    if observation_space is None or action_space is None:
+        environment = make_gymnasium(as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False}), 1)
+        environment.close()
+        observation_space, action_space = environment.observation_space, environment.action_space
+    return Policy(saved, observation_space, action_space)

@@ -1,0 +1,74 @@
+"""`daedalus completion`: prints a script that completes the command line of `daedalus` in a shell."""
+
+import argparse
+import importlib
+from pathlib import Path
+from typing import get_args
+
+import shtab
+
+from daedalus.cli.arguments import command_parser
+from daedalus.learner.run.settings import preset_names
+from daedalus.protocol.spec import TrainingSpec
+
+_DESCRIPTION = "Prints a script that completes commands, options and presets in your shell."
+
+_EXAMPLES = """\
+examples:
+  daedalus completion bash > ~/.local/share/bash-completion/completions/daedalus
+  daedalus completion zsh > ~/.zfunc/_daedalus      (with fpath+=~/.zfunc before compinit in ~/.zshrc)
+  daedalus completion tcsh > ~/.daedalus.completion.csh      (source it in ~/.tcshrc)"""
+
+# Where the parser of each command is: module in cli, function. Only this command imports them all.
+_PARSERS = {
+    "train": ("commands.train", "train_parser"),
+    "resume": ("commands.train", "resume_parser"),
+    "learner": ("settings_arguments", "learner_parser"),
+    "actor": ("commands.actor_arguments", "parser"),
+    "router": ("commands.router", "parser"),
+    "status": ("commands.status", "parser"),
+    "bridge": ("commands.bridge", "parser"),
+    "exporter": ("commands.exporter", "parser"),
+    "certs": ("commands.certs", "parser"),
+    "evaluate": ("commands.evaluate_arguments", "parser"),
+    "plot": ("commands.plot", "parser"),
+    "completion": ("commands.completion", "parser"),
+}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus completion`."""
+    options = command_parser("completion", _DESCRIPTION, _EXAMPLES)
+    options.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="the shell that reads the script")
+    return options
+
+
+def completion(arguments: list[str]) -> int:
+    """Runs `daedalus completion`."""
+    parsed = parser().parse_args(arguments)
+    print(shtab.complete(command_tree(), parsed.shell))
+    return 0
+
+
+def command_tree() -> argparse.ArgumentParser:
+    """Return one parser of all commands, with what completes each argument; for completion only, not to parse with."""
+    root = argparse.ArgumentParser(prog="daedalus")
+    commands = root.add_subparsers(metavar="COMMAND")
+    for name, (module, function) in _PARSERS.items():
+        command = getattr(importlib.import_module(f"daedalus.cli.{module}"), function)()
+        summary = " ".join((command.description or "").split()).partition(". ")[0].removesuffix(".")
+        tree = commands.add_parser(name, parents=[command], add_help=False, help=summary)
+        for action in tree._actions:
+            _complete(action)
+    return root
+
+
+def _complete(action: argparse.Action) -> None:
+    """Say what completes an argument. The choices are not the parser's: it also takes files, and checks by itself."""
+    if action.dest == "preset":
+        action.choices = preset_names()
+    elif action.dest == "algorithm":
+        action.choices = get_args(TrainingSpec.model_fields["algorithm"].annotation)
+    elif action.type is Path:
+        folder = action.metavar in ("DIR", "RUN_DIR")
+        vars(action)["complete"] = shtab.DIRECTORY if folder else shtab.FILE

@@ -1,0 +1,102 @@
+"""`daedalus completion`: its bash script is asked through bash itself what completes a line."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli import main
+from daedalus.cli.commands.completion import _PARSERS, command_tree, completion
+from daedalus.learner.run.settings import preset_names
+
+BASH = shutil.which("bash")
+needs_bash = pytest.mark.skipif(BASH is None, reason="there is no bash here")
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    program = "from daedalus.cli.main import main; raise SystemExit(main())"
+    output = subprocess.run(
+        [sys.executable, "-c", program, "completion", "bash"], capture_output=True, text=True, check=True
+    ).stdout
+    path = tmp_path_factory.mktemp("completion") / "daedalus"
+    path.write_text(output)
+    return path
+
+
+def completed(script: Path, line: str) -> set[str]:
+    """What bash offers for the last word of a line, as it does when Tab is pressed."""
+    program = (
+        'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}\n'
+        "function=$(complete -p daedalus | sed 's/.*-F \\([^ ]*\\).*/\\1/')\n"
+        '"$function" daedalus "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"\n'
+        "printf '%s\\n' \"${COMPREPLY[@]}\""
+    )
+    assert BASH is not None
+    words = [BASH, "--norc", "-c", program, "bash", str(script), *line.split(" ")]
+    result = subprocess.run(words, capture_output=True, text=True, check=True, env={**os.environ, "LC_ALL": "C"})
+    return set(result.stdout.split())
+
+
+@needs_bash
+def test_the_script_is_valid_bash(script: Path) -> None:
+    assert BASH is not None
+    subprocess.run([BASH, "-n", str(script)], check=True)
+
+
+@needs_bash
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("daedalus tra", {"train"}),
+        ("daedalus e", {"evaluate", "exporter"}),
+        ("daedalus train --al", {"--algorithm"}),
+        ("daedalus train --algorithm im", {"impala"}),
+        ("daedalus train cartp", {name for name in preset_names() if name.startswith("cartp")}),
+        ("daedalus learner pon", {"pong"}),
+        ("daedalus train --alg", {"--algorithm"}),
+        ("daedalus train cartpole --see", {"--seed"}),
+        ("daedalus certs is", {"issue"}),
+        ("daedalus certs issue ac", {"actor"}),
+        ("daedalus evaluate --act", {"--actions"}),
+        ("daedalus completion z", {"zsh"}),
+    ],
+)
+def test_bash_completes(script: Path, line: str, expected: set[str]) -> None:
+    assert completed(script, line) == expected
+
+
+@needs_bash
+def test_bash_completes_run_directories(script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run-a").mkdir()
+    (tmp_path / "run-b.txt").touch()
+    assert completed(script, "daedalus evaluate run") == {"run-a"}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_a_script_for_each_shell_names_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert completion([shell]) == 0
+    output = capsys.readouterr().out
+    assert set(re.findall(r"[\w-]+", output)) >= set(_PARSERS)
+
+
+def test_every_command_is_completed_and_its_hidden_options_are_not(script: Path) -> None:
+    assert _PARSERS.keys() == {*main._MODULES, *main._COMMANDS}
+    assert "--exit-with-parent" not in script.read_text()
+    assert "--prepared" not in script.read_text()
+
+
+def test_the_tree_says_what_each_command_does() -> None:
+    text = command_tree().format_help()
+    assert "Starts a learner and actors as processes of this machine" in " ".join(text.split())
+
+
+def test_no_other_command_loads_the_parsers_of_all() -> None:
+    program = "import sys, daedalus.cli.commands.train; print('shtab' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout == "False\n"

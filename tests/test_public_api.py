@@ -1,0 +1,246 @@
+"""`import daedalus`: the names that it offers, `daedalus.train` and `daedalus.load_policy`."""
+
+import ast
+import inspect
+import json
+import signal
+import subprocess
+import sys
+import threading
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from processes import Running, processes_mentioning, until
+from saved_runs import CARTPOLE, COUNTING, save
+
+import daedalus
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.evaluation.episodes import play_episodes
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.saved_policy import NoPolicyError, find_policy, pretrained
+
+BUDGET = {"env_steps": 20_000, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
+
+
+def test_importing_it_loads_no_other_package() -> None:
+    program = "import sys; before = set(sys.modules); import daedalus; print(*sys.modules.keys() - before)"
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    loaded = set(output.split()) - {"daedalus"}
+    assert {name.partition(".")[0] for name in loaded} <= sys.stdlib_module_names
+
+
+@pytest.mark.parametrize("name", daedalus.__all__)
+def test_each_name_is_there_documented_and_declared_for_type_checkers(name: str) -> None:
+    value = getattr(daedalus, name)
+    assert name in dir(daedalus)
+    if name != "__version__":
+        assert inspect.getdoc(value)
+    (declared,) = [node for node in ast.parse(inspect.getsource(daedalus)).body if isinstance(node, ast.If)]
+    names = {alias.name for node in declared.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert name in names | {"__version__"}
+
+
+def test_the_version_is_the_distributions() -> None:
+    assert daedalus.__version__ == version("daedalus-rl")
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'Clinet'"):
+        daedalus.Clinet  # type: ignore[attr-defined]  # noqa: B018
+
+
+# ------------------------------------------------------------------------------------------------ train
+
+
+def test_train_returns_the_result_from_any_thread(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    results: list[daedalus.RunResult] = []
+    directory = tmp_path / "from-a-thread"
+    arguments = {**BUDGET, "run_dir": str(directory), "quiet": True, "seed": 3, "actors": 1}
+    thread = threading.Thread(target=lambda: results.append(daedalus.train("cartpole", **arguments)))
+    thread.start()
+    thread.join()
+    (result,) = results
+    summary = json.loads((directory / "summary.json").read_text())
+    assert (result.directory, result.exit_status) == (directory, 3)  # the budget ended without the target
+    assert (result.solved, result.finished) == (False, True)
+    assert result.env_steps == summary["env_steps"] >= 20_000
+    assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
+    assert result.summary == summary
+    assert (summary["seed"], summary["algorithm"]) == (3, "impala")
+    assert capfd.readouterr() == ("", "")
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+    assert not processes_mentioning("from-a-thread")
+    policy = daedalus.load_policy(directory)
+    assert policy.policy_version == result.updates
+
+
+def test_train_passes_the_output_of_its_processes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = daedalus.train(env="CartPole-v1", **BUDGET, run_dir=tmp_path / "run")
+    assert (result.exit_status, result.solved) == (0, False)  # no target: the asked-for steps were done
+    assert "env_steps" in capsys.readouterr().out  # printed by the learner
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_train_prints_its_own_records_unless_quiet(tmp_path: Path, quiet: bool) -> None:
+    settings = {**BUDGET, "env": "CartPole-v1", "run_dir": "run", "quiet": quiet}
+    program = f"import daedalus, logging; daedalus.train(**{settings}); print(logging.getLogger('daedalus').handlers)"
+    output = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    lines = output.stdout.splitlines()
+    assert lines[-1] == "[]"
+    assert any(line.startswith("CartPole-v1: impala, seed 1, 2 actors") for line in lines) != quiet
+    assert len(lines) == 1 or not quiet
+    assert not output.stderr or not quiet
+
+
+def test_train_tells_why_it_failed(tmp_path: Path) -> None:
+    with pytest.raises(daedalus.TrainingError) as failed:
+        daedalus.train(env="CartPole-v9", run_dir=tmp_path / "run", quiet=True)
+    lines = str(failed.value).splitlines()
+    assert lines[0].startswith("daedalus actor: unknown environment 'CartPole-v9'")
+    assert len(lines) == len(set(lines))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"preset": "cartpol"}, "unknown preset 'cartpol': did you mean cartpole"),
+        ({}, "name a preset"),
+        ({"preset": "cartpole", "settings": {"seed": 1}}, "settings 'seed': 'seed' has no section"),
+        ({"preset": "cartpole", "settings": {"training.sed": 1}}, "unknown setting training.sed: did you mean seed"),
+        ({"preset": "cartpole", "run_dir": "."}, "run directory . exists"),
+    ],
+)
+def test_settings_that_make_no_run_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(daedalus.SettingsError) as refused:
+        daedalus.train(**arguments)
+    assert str(refused.value).startswith(message)
+
+
+def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
+    program = (
+        "import daedalus; daedalus.train('cartpole', run_dir='interrupted-run', env_steps=10**9,"
+        " settings={'training.stop_when_solved': False})"
+    )
+    running = Running([sys.executable, "-c", program], tmp_path)
+    try:
+        running.expect(r"updates .*/s")
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() != 0
+        assert running.lines[-1] == "KeyboardInterrupt"
+        until(lambda: not processes_mentioning("interrupted-run"))
+        assert any((tmp_path / "interrupted-run" / "checkpoints").iterdir())
+    finally:
+        running.end()
+
+
+# ------------------------------------------------------------------------------------------ load_policy
+
+
+def play(policy: daedalus.Policy, environment: gymnasium.Env, seed: int, steps: int = 10_000) -> float:
+    """The return of one episode in a plain gymnasium loop."""
+    observation, _ = environment.reset(seed=seed)
+    policy.reset()
+    total = 0.0
+    for _ in range(steps):
+        observation, reward, terminated, truncated, _ = environment.step(policy.act(observation))
+        total += float(reward)
+        if terminated or truncated:
+            break
+    environment.close()
+    return total
+
+
+def evaluated(directory: Path, seed: int) -> tuple[float, int]:
+    """The return of one episode by the evaluation, and the seed of its environment."""
+    saved = find_policy(directory)
+    runtime = OnnxRuntime(saved.program)
+    runtime.load(saved.weights)
+    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1)
+    try:
+        evaluation = play_episodes(runtime, environments, 1, seed, sampled=False)
+    finally:
+        environments.close()
+    return float(evaluation.returns[0]), int(np.random.SeedSequence(seed).generate_state(1)[0])
+
+
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_a_loaded_policy_plays_as_the_evaluation_does(tmp_path: Path, memory: str) -> None:
+    save(tmp_path, CARTPOLE, 7, policy={"hidden": (16,), "memory": memory, "memory_units": 8})
+    policy = daedalus.load_policy(tmp_path)
+    assert (policy.policy_version, policy.spec.environment.id) == (7, "CartPole-v1")
+    returns = []
+    for seed in range(4):
+        expected, environment_seed = evaluated(tmp_path, seed)
+        returns.append(expected)
+        assert play(policy, gymnasium.make("CartPole-v1"), environment_seed) == expected
+    assert len(set(returns)) > 1
+
+
+def test_the_shipped_policy_drives_gymnasiums_car() -> None:
+    policy = daedalus.load_policy(pretrained="car_racing")
+    environment = policy.spec.environment
+    assert environment.action_repeat * environment.frame_stack > 1  # what the policy itself has to keep
+    limit = 60
+    own = environment.as_evaluated("gymnasium").model_copy(update={"max_episode_steps": limit, "processes": False})
+    saved = find_policy(pretrained("car_racing"))
+    runtime = OnnxRuntime(saved.program)
+    runtime.load(saved.weights)
+    environments = make_environments(own, 1)
+    try:
+        expected = play_episodes(runtime, environments, 1, 5, sampled=False).returns[0]
+    finally:
+        environments.close()
+    seed = int(np.random.SeedSequence(5).generate_state(1)[0])
+    kwargs: dict[str, Any] = dict(environment.kwargs)
+    car = gymnasium.make(environment.id, max_episode_steps=limit, **kwargs)
+    assert play(policy, car, seed) == pytest.approx(expected, abs=1e-3)
+
+
+def test_frames_are_stacked_and_forgotten_at_a_reset(tmp_path: Path) -> None:
+    save(tmp_path, COUNTING, 1)
+    policy = daedalus.load_policy(tmp_path)
+    space = policy.observation_space
+    observations = [space.sample() for _ in range(5)]
+    actions = [policy.act(observation) for observation in observations]
+    policy.reset()
+    assert [policy.act(observation) for observation in observations] == actions
+
+
+def test_sampled_actions_follow_a_seed(tmp_path: Path) -> None:
+    save(tmp_path, CARTPOLE, 1)
+    policy = daedalus.load_policy(tmp_path)
+    observation = np.zeros(4, np.float32)
+
+    def sampled(seed: int) -> list[int]:
+        policy.reset(seed=seed)
+        return [int(policy.act(observation, sampled=True)) for _ in range(64)]
+
+    assert sampled(1) == sampled(1) != sampled(2)
+    assert len(set(sampled(1))) == 2
+
+
+def test_spaces_may_be_given_in_place_of_the_environment(tmp_path: Path) -> None:
+    save(tmp_path, CARTPOLE, 1)
+    space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float64)
+    policy = daedalus.load_policy(tmp_path, observation_space=space, action_space=gymnasium.spaces.Discrete(2, start=5))
+    assert policy.act(space.sample()) in (5, 6)
+    with pytest.raises(EnvironmentSetupError, match="the policy was trained on"):
+        daedalus.load_policy(tmp_path, observation_space=space, action_space=gymnasium.spaces.Discrete(3))
+
+
+def test_what_cannot_be_loaded_is_refused(tmp_path: Path) -> None:
+    save(tmp_path, CARTPOLE, 1)
+    with pytest.raises(ValueError, match="either a run directory or a pretrained policy"):
+        daedalus.load_policy()
+    with pytest.raises(ValueError, match="both observation_space and action_space"):
+        daedalus.load_policy(tmp_path, action_space=gymnasium.spaces.Discrete(2))
+    with pytest.raises(NoPolicyError, match="no pretrained policy 'car_race'"):
+        daedalus.load_policy(pretrained="car_race")
+    with pytest.raises(ValueError, match="has shape"):
+        daedalus.load_policy(tmp_path).act(np.zeros(5))

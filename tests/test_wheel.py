@@ -1,0 +1,156 @@
+"""The distributions: what is in them, and that they work beside packages and scripts with the same names as ours."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from daedalus.learner.run.settings import preset_names
+
+ROOT = Path(__file__).parent.parent
+FILES = ("LICENSE", "MANIFEST.in", "README.md", "pyproject.toml")
+BUILD = "import sys, setuptools.build_meta as backend; getattr(backend, sys.argv[1])(sys.argv[2])"
+SCRIPTS = ("actor", "bridge", "cli", "learner", "policy", "protocol", "transport")
+RAISES = "raise ImportError('this is not the package that Daedalus means')\n"
+
+
+def run(*words: str | Path, folder: Path) -> str:
+    """Runs a command without this repository on the path; returns its output."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    result = subprocess.run(
+        words, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the source tree with its links: building leaves files behind."""
+    copy = tmp_path_factory.mktemp("source") / "tree"
+    shutil.copytree(ROOT / "daedalus", copy / "daedalus", symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for link in (copy / "daedalus").iterdir():
+        if link.is_symlink():
+            shutil.copytree(ROOT / link.name, copy / link.name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in FILES:
+        shutil.copy(ROOT / name, copy / name)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def sdist(tree: Path) -> Path:
+    target = tree.parent / "sdist"
+    run(sys.executable, "-c", BUILD, "build_sdist", target, folder=tree)
+    (archive,) = target.iterdir()
+    return archive
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist: Path) -> Path:
+    """Built from the unpacked sdist, as installers do that find no wheel."""
+    unpacked, target = sdist.parent.parent / "unpacked", sdist.parent.parent / "wheel"
+    with tarfile.open(sdist) as archive:
+        archive.extractall(unpacked, filter="data")
+    (folder,) = unpacked.iterdir()
+    target.mkdir()
+    run(sys.executable, "-c", BUILD, "build_wheel", target, folder=folder)
+    (built,) = target.iterdir()
+    return built
+
+
+def installed(environment: Path, *what: str | Path) -> Path:
+    """Makes an environment that sees this one's packages but not this repository; returns its site-packages."""
+    run(sys.executable, "-m", "venv", "--without-pip", environment, folder=environment.parent)
+    pip = [sys.executable, "-m", "pip", "--python", environment / "bin" / "python"]
+    options = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
+    (packages,) = environment.glob("lib/python*/site-packages")
+    # Lines of a .pth file are added to the path; .pth files in the folders that they name are not read.
+    (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    run(*pip, "install", *options, *what, folder=environment.parent)
+    return packages
+
+
+@pytest.fixture(scope="module")
+def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment with the wheel, and with a package `launch` as ROS 2 installs it."""
+    folder = tmp_path_factory.mktemp("installed") / "environment"
+    packages = installed(folder, wheel)
+    (packages / "launch").mkdir()
+    (packages / "launch" / "__init__.py").write_text(RAISES)
+    return folder / "bin"
+
+
+@pytest.fixture
+def scripts(tmp_path: Path) -> Path:
+    """A folder of a user's scripts that have the names of our packages."""
+    for name in SCRIPTS:
+        (tmp_path / f"{name}.py").write_text(RAISES)
+    return tmp_path
+
+
+def expected_in_package() -> set[str]:
+    """The paths of all files that belong to the package, through its links."""
+    paths = set()
+    for entry in (ROOT / "daedalus").iterdir():
+        files = [path for path in entry.resolve().rglob("*") if path.is_file()] if entry.is_dir() else [entry]
+        paths |= {path.relative_to(ROOT) for path in files if "__pycache__" not in path.parts}
+    return {path.as_posix() if path.parts[0] == "daedalus" else f"daedalus/{path.as_posix()}" for path in paths}
+
+
+def test_the_wheel_holds_one_top_level_package_whole(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    ours = {name for name in names if name.startswith("daedalus/")}
+    assert ours == expected_in_package()
+    others = {name.split("/")[0] for name in names - ours}
+    assert len(others) == 1
+    assert others.pop().endswith(".dist-info")
+    assert {"daedalus/py.typed", "daedalus/policy/pretrained/car_racing/program.onnx"} < ours
+    assert {f"daedalus/learner/run/presets/{name}.toml" for name in preset_names()} < ours
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+
+
+def test_the_sdist_holds_the_same_package_and_what_builds_it(sdist: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        files = [member for member in archive.getmembers() if not member.isdir()]
+    assert all(member.isfile() for member in files)  # no links: not every system can make them
+    names = {member.name.partition("/")[2] for member in files}
+    ours = {name for name in names if name.startswith("daedalus/")}
+    assert ours == expected_in_package()
+    made = {name for name in names - ours if name.startswith("daedalus_rl.egg-info/")}
+    assert names - ours - made == {*FILES, "PKG-INFO", "setup.cfg"}
+
+
+def test_training_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:
+    settings = ("--env-steps", "20000", "--set", "training.target_return=none", "--set", "evaluation.final_episodes=3")
+    output = run(environment / "daedalus", "train", "cartpole", *settings, "--run-dir", "run", folder=scripts)
+    assert "evaluation: return" in output
+    assert run(environment / "daedalus", "evaluate", "run", "--episodes", "2", folder=scripts)
+
+
+def test_the_public_api_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:
+    program = (
+        "import daedalus, gymnasium\n"
+        "policy = daedalus.load_policy(pretrained='car_racing')\n"
+        "for name in daedalus.__all__: getattr(daedalus, name)\n"
+        "print(daedalus.__file__, daedalus.__version__)\n"
+    )
+    where, version = run(environment / "python", "-c", program, folder=scripts).split()
+    assert Path(where).is_relative_to(environment.parent)
+    assert version in (ROOT / "pyproject.toml").read_text()
+
+
+def test_a_module_added_to_the_source_is_importable_at_once_if_the_install_is_editable(
+    tree: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(tree, tmp_path / "tree", symlinks=True)
+    installed(tmp_path / "environment", "--editable", tmp_path / "tree")
+    (tmp_path / "tree" / "policy" / "added_module.py").write_text("ANSWER = 42\n")
+    program = "from daedalus.policy.added_module import ANSWER; print(ANSWER)"
+    assert run(tmp_path / "environment" / "bin" / "python", "-c", program, folder=tmp_path) == "42\n"
