@@ -33,7 +33,7 @@ def learn(spec: RunSpec, directory: Path, network: MemoryNetwork, stop: threadin
     transport = MemoryTransport(network)
     progress = Progress(sys.stdout, spec.training.env_steps)
     try:
-        LearnerService(spec, directory, transport, stop, progress, started=time.monotonic()).run()
+        LearnerService(spec, directory, transport, stop, progress, [], started=time.monotonic()).run()
     finally:
         transport.close()
 

@@ -8,30 +8,31 @@ import logging
 import secrets
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.progress import Progress
-from daedalus.learner.reporting.recorder import Recorder
-from daedalus.learner.reporting.report import Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.recorder import OpenWriter, Recorder
+from daedalus.learner.reporting.report import Health
+from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluations import Evaluations
-from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import EvaluationReport, Refusal
+from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
-from daedalus.transport.interface import Transport
-
-_logger = logging.getLogger(__name__)
+from daedalus.transport.interface import Request, Transport
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
+    from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,39 +54,58 @@ class LearnerService:
         transport: Transport,
         stop: threading.Event,
         progress: Progress,
+        open_writers: Sequence[OpenWriter],
         *,
         started: float,
         restored: "Checkpoint | None" = None,
     ) -> None:
-        """The run is named after its directory; `started`, on the monotonic clock, is what its seconds count from.
+        """Construct the service.
 
-        With `restored` it continues from that checkpoint.
+        Args:
+          spec: what is learned.
+          directory: of the run, which is named after it.
+          transport: to the actors; the caller closes it.
+          stop: ends the run when it is set.
+          progress: shows each metrics row.
+          open_writers: where metrics rows go.
+          started: on the monotonic clock, what the run's seconds count from.
+          restored: the checkpoint to continue from.
         """
-        self._spec, self._run, self._directory = spec, directory.name, directory
-        self._stop, self._progress, self._started = stop, progress, started
-        self._restored = restored
-        self._epoch = secrets.randbits(62)
+        self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
+        self._open_writers, self._restored = open_writers, restored
         self._counters = RunCounters(spec.training.target_episodes)
         if restored is not None:
             self._counters.restore(restored.counters)
-        self._evaluations = Evaluations(self._epoch)
-        self._meter = RateMeter(self._counters, started)
+        epoch = secrets.randbits(62)
+        self._evaluations = Evaluations(epoch)
         self._health = Health(started=started, updated=started, attended=started)
         self._server = ActorServer(
-            self._run,
+            directory.name,
             spec,
             transport,
             self._counters,
             self._status,
-            learner_epoch=self._epoch,
+            learner_epoch=epoch,
             start_version=restored.policy.policy_version if restored else 0,
             spaces=restored.policy.spaces if restored else None,
         )
+        self._reporter = RunReporter(
+            directory.name,
+            spec,
+            epoch,
+            counters=self._counters,
+            fleet=self._server.fleet,
+            lock=self._server.lock,
+            evaluations=self._evaluations,
+            health=self._health,
+            started=started,
+        )
 
     def run(self) -> Outcome:
-        """Serves actors and learns until the target, the budget's end, or the order to stop.
+        """Serve actors and learn until the target, the budget's end, or the order to stop.
 
-        Once it has begun to learn, it ends with a checkpoint and a summary, however it ends.
+        Once learning has begun, the run ends with a checkpoint and a summary, however it ends. Raises TransportError
+        if another learner serves the run, CheckpointMismatchError, NetworkError or SettingsError.
         """
         try:
             self._server.open()
@@ -98,40 +118,49 @@ class LearnerService:
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
-            return self._learn(learner)
+            return self._learn(learner, self._checkpointer(learner))
         finally:
             self._leave()
 
-    def _learn(self, learner: "Learner") -> Outcome:
-        """The main loop, and what surrounds it."""
-        program = learner.program()
-        self._server.offer_program(program, learner.state_size)
-        self._server.publish(learner.policy_version, learner.weights())
-        recorder = Recorder(self._directory, self._progress)
-        begun, first_env_steps = time.monotonic(), self._counters.env_steps
-        self._meter = RateMeter(self._counters, begun)
-        self._health.updated = self._health.attended = begun
+    def _checkpointer(self, learner: "Learner") -> "Checkpointer":
+        """Offer the policy to the actors, and return what saves it."""
+        from daedalus.learner.training.checkpointer import Checkpointer
+
+        program, spaces = learner.program(), self._server.fleet.spaces
+        assert spaces is not None
+        self._server.offer_policy(program, learner.state_size)
+        self._server.publisher.publish(learner.policy_version, learner.weights())
+        return Checkpointer(
+            self._directory,
+            self._spec,
+            spaces,
+            learner,
+            program,
+            counters=lambda: self._reporter.counters_state(time.monotonic()),
+            evaluations=self._evaluations,
+            health=self._health,
+        )
+
+    def _learn(self, learner: "Learner", checkpointer: "Checkpointer") -> Outcome:
+        """Run the main loop, and what must follow it."""
+        recorder = Recorder(self._open_writers, self._progress)
+        self._reporter.begin(time.monotonic())
         try:
-            seconds_to_target = self._loop(learner, program, recorder)
+            seconds_to_target = self._loop(learner, checkpointer, recorder)
         finally:
             ended = time.monotonic()
             self._leave()
-            recorder.record(self._row(learner, ended), self._details(learner))
+            recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
             recorder.close()
-            self._save(learner, program)
+            checkpointer.save()
         solved = seconds_to_target is not None
         used_up = self._counters.env_steps >= self._spec.training.env_steps
-        outcome = Outcome(
-            solved=solved,
-            finished=used_up or (solved and self._spec.training.stop_when_solved),
-            seconds_to_target=seconds_to_target,
-        )
-        rate = (self._counters.env_steps - first_env_steps) / max(ended - begun, 1e-9)
-        self._write_summary(outcome, self._wall_seconds(ended), rate)
-        return outcome
+        finished = used_up or (solved and self._spec.training.stop_when_solved)
+        self._write_summary(solved, finished, seconds_to_target, ended)
+        return Outcome(solved=solved, finished=finished, seconds_to_target=seconds_to_target)
 
-    def _loop(self, learner: "Learner", program: bytes, recorder: Recorder) -> float | None:
-        """Updates until there is a reason to end; returns when the target was reached, if it was."""
+    def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
+        """Update until there is a reason to end; return when the target was reached, if it was."""
         training, service = self._spec.training, self._spec.service
         seconds_to_target = None
         now = time.monotonic()
@@ -140,27 +169,28 @@ class LearnerService:
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._counters.reached(training.target_return):
-                seconds_to_target = self._wall_seconds(now)
+                seconds_to_target = self._reporter.wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
-            self._attend_evaluators(learner, program)
+            for request, message in self._server.evaluations.take():
+                self._serve_evaluator(request, message, learner, checkpointer)
             if now >= log_at:
-                recorder.record(self._row(learner, now), self._details(learner))
+                recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
             if now >= save_at:
-                self._save(learner, program)
+                checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds
         return seconds_to_target
 
     def _update(self, learner: "Learner") -> None:
-        """One batch, one update, one snapshot; none of them if no batch is complete soon."""
+        """Learn from one batch and publish; do nothing if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
-        rollouts = self._server.take_batch(learner.policy_version)
+        rollouts = self._server.rollouts.take_batch(learner.policy_version)
         if not rollouts:
             return
         skipped = learner.updates_skipped
         learner.step(rollouts, progress)
-        self._server.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
+        self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
         self._health.updated = self._health.attended = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
@@ -168,116 +198,39 @@ class LearnerService:
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
 
-    def _attend_evaluators(self, learner: "Learner", program: bytes) -> None:
-        """Gives evaluators the newest policy, a checkpoint of which is kept, and takes in how it played."""
-        for request, message in self._server.take_evaluations():
-            if isinstance(message, EvaluationReport):
-                answer, news = self._evaluations.report(message)
-                request.reply(encode(answer))
-                if news:
-                    _logger.info(news)
-                continue
-            directory = self._save(learner, program)
-            if directory is None:
-                request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
-                continue
-            version, env_steps = learner.policy_version, self._counters.env_steps
-            if version != self._server.published_version:
-                self._server.publish(version, learner.weights())
-            self._evaluations.begin(message.evaluator, directory, version, env_steps)
-            request.reply(self._server.newest_snapshot())
+    def _serve_evaluator(
+        self,
+        request: Request,
+        message: EvaluationRequest | EvaluationReport,
+        learner: "Learner",
+        checkpointer: "Checkpointer",
+    ) -> None:
+        """Give an evaluator the newest policy, of which a checkpoint is kept; or take in how it played."""
+        if isinstance(message, EvaluationReport):
+            answer, news = self._evaluations.report(message)
+            request.reply(encode(answer))
+            if news:
+                _logger.info(news)
+            return
+        directory = checkpointer.save()
+        if directory is None:
+            request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
+            return
+        publisher, version = self._server.publisher, learner.policy_version
+        if version != publisher.version:
+            publisher.publish(version, learner.weights())
+        self._evaluations.begin(message.evaluator, directory, version, self._counters.env_steps)
+        request.reply(publisher.newest())
 
     def _leave(self) -> None:
         stopped = self._stop.is_set()
         self._server.close("the learner was stopped" if stopped else "the learner has finished")
 
-    # --------------------------------------------------------------------------------------- what it tells
+    def _status(self) -> RunStatus:
+        return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())
 
-    def _wall_seconds(self, now: float) -> float:
-        return self._counters.wall_seconds + now - self._started
-
-    def _row(self, learner: "Learner", now: float) -> dict[str, float]:
-        with self._server.lock:
-            progress = self._counters.env_steps / self._spec.training.env_steps
-            rates = self._meter.look(self._counters, self._server.fleet, now)
-            if self._server.fleet.live:
-                self._health.attended = now
-            learning = {
-                **learner.metrics.take_means(),
-                **self._evaluations.take_newest(),
-                "learning_rate": learner.learning_rate(progress),
-                "entropy_bonus": learner.entropy_bonus(progress),
-            }
-            return metrics_row(self._counters, self._server.fleet, rates, learning, self._wall_seconds(now))
-
-    def _details(self, learner: "Learner") -> Details:
-        with self._server.lock:
-            returns, lengths = list(self._counters.returns), list(self._counters.lengths)
-        return Details(
-            returns=returns,
-            lengths=lengths,
-            action_counts=learner.metrics.take_action_counts(),
-            picture=learner.metrics.take_observation_image(),
-        )
-
-    def _status(self, fleet: Fleet) -> RunStatus:
-        return run_status(
-            self._run,
-            self._epoch,
-            self._spec,
-            self._counters,
-            fleet,
-            self._meter.rates,
-            self._health,
-            self._server.queue_bytes,
-            time.monotonic(),
-        )
-
-    def _save(self, learner: "Learner", program: bytes) -> Path | None:
-        """Saves a checkpoint and says where; a disk that refuses costs a warning."""
-        from daedalus.learner.training.checkpoint import save_checkpoint
-
-        spaces = self._server.fleet.spaces
-        assert spaces is not None
-        with self._server.lock:
-            counters = self._counters.state(self._wall_seconds(time.monotonic()))
-        try:
-            directory = save_checkpoint(
-                self._directory,
-                spec=self._spec,
-                spaces=spaces,
-                policy_version=learner.policy_version,
-                program=program,
-                parameters=learner.weights(),
-                state=learner.state(),
-                counters=counters,
-                keep=self._spec.service.keep_checkpoints,
-                also_keep=self._evaluations.kept,
-            )
-        except OSError as error:
-            if not self._health.save_fault:
-                _logger.warning(
-                    f"no checkpoint could be saved ({error.strerror}); the one before it stays, training goes on, "
-                    f"and it is tried again every {self._spec.service.checkpoint_seconds:g} s"
-                )
-            self._health.save_fault = error.strerror or type(error).__name__
-            return None
-        if self._health.save_fault:
-            _logger.info("checkpoints are saved again")
-        self._health.saved, self._health.save_fault = time.monotonic(), ""
-        return directory
-
-    def _write_summary(self, outcome: Outcome, wall_seconds: float, env_steps_per_second: float) -> None:
-        content = summary(
-            self._run,
-            self._spec,
-            self._counters,
-            solved=outcome.solved,
-            finished=outcome.finished,
-            seconds_to_target=outcome.seconds_to_target,
-            wall_seconds=wall_seconds,
-            env_steps_per_second=env_steps_per_second,
-        )
+    def _write_summary(self, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> None:
+        content = self._reporter.summary(solved=solved, finished=finished, seconds_to_target=seconds_to_target, now=now)
         try:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:

@@ -78,7 +78,7 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
         if isinstance(node, ast.Call) and ast.unparse(node.func) in wall
     }
     assert users == {
-        ("metrics.py", "time.time"),
+        ("tensorboard_writer.py", "time.time"),
         ("logs.py", "time.strftime"),  # only dates log records
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are good from one day to another
@@ -92,6 +92,8 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
         ("cli.commands.evaluate", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
         ("cli.commands.learner", {"torch", "daedalus.actor", "gymnasium"}),
         ("cli.commands.train", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime"}),
+        ("cli.train_function", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime", "shtab"}),
+        ("actor.evaluation.loaded_policy", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
         ("cli.commands.router", {"torch", "daedalus.actor", "gymnasium", "onnxruntime"}),
         ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
         ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),

@@ -7,15 +7,15 @@ import sys
 import time
 
 from daedalus.cli.commands.learner import main
-from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 
 if __name__ == "__main__":
     notes = open(sys.argv.pop(1), "a", buffering=1)  # noqa: SIM115 - for as long as the process lives
-    publish = ActorServer.publish
+    publish = SnapshotPublisher.publish
 
-    def noted(self: ActorServer, policy_version: int, weights: dict) -> None:
+    def noted(self: SnapshotPublisher, policy_version: int, weights: dict) -> None:
         notes.write(f"{policy_version} {time.monotonic()}\n")
         publish(self, policy_version, weights)
 
-    ActorServer.publish = noted  # type: ignore[method-assign] - this process is for that
+    SnapshotPublisher.publish = noted  # type: ignore[method-assign] - this process is for that
     sys.exit(main())

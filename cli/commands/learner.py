@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_with_parent, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_again
+from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -84,6 +86,7 @@ def main() -> int:
             transport,
             stop,
             progress,
+            [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
             started=arguments.started or started,
             restored=restored,
         )

@@ -46,7 +46,12 @@ class RateMeter:
         self.rates: dict[str, float] = {}  # as of the last look
         self._actors: dict[str, tuple[int, int, int]] = {}  # their env_steps, bytes received, bytes of answers
         self._pushed_bytes = 0
+        self._begun, self._first_env_steps = now, counters.env_steps
         self._mark(counters, now)
+
+    def overall(self, counters: RunCounters, now: float) -> float:
+        """Return env_steps a second since construction."""
+        return (counters.env_steps - self._first_env_steps) / max(now - self._begun, 1e-9)
 
     def _mark(self, counters: RunCounters, now: float) -> None:
         self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates

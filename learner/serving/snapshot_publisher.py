@@ -1,10 +1,11 @@
-"""What actors are given to play with: the program, and snapshots, which are pushed, asked for, or fetched small."""
+"""What actors play with: the program, and snapshots, which are pushed, asked for, or fetched in compact form."""
 
 import contextlib
-from collections.abc import Callable
+import threading
 
 import numpy as np
 
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.compact_snapshot_server import CompactSnapshotServer
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
@@ -16,77 +17,95 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
 
 
-class Publisher:
-    """One life of a learner's. Publishing is for one thread, answering for any; `fleet` is read under its lock."""
+class SnapshotPublisher:
+    """Publishes for one learner epoch. Publishing is for one thread, answering for any."""
 
     def __init__(
         self,
         run: str,
         spec: RunSpec,
-        learner_epoch: int,
-        start_version: int,
         transport: Transport,
         responses: QueryResponses,
         fleet: Fleet,
-        on_small_answer: Callable[[str, int], None],
+        lock: threading.Condition,
+        counters: RunCounters,
+        *,
+        learner_epoch: int,
+        start_version: int,
     ) -> None:
-        """`on_small_answer` is told which actor on a slow link was sent how many bytes."""
+        """`lock` guards the fleet."""
         self._key, self._spec, self._epoch = keys.snapshots(run), spec, learner_epoch
-        self._transport, self._responses, self._fleet = transport, responses, fleet
-        self._compact_snapshots = CompactSnapshotServer(learner_epoch, responses.snapshot, on_small_answer)
-        self._unpublished = 0  # rollouts that were learned from since
-        self.program_hash = ""  # empty before there is one
+        self._transport, self._responses, self._counters = transport, responses, counters
+        self._fleet, self._lock = fleet, lock
+        self._compact = CompactSnapshotServer(learner_epoch, responses.snapshot, self._count_compact)
+        self._unpublished_rollouts = 0  # learned from since the last snapshot
+        self._program_hash = ""
         self.version = start_version  # the newest that actors can have
 
     def open(self) -> None:
-        """Starts to answer."""
-        self._compact_snapshots.open()
+        """Start to answer."""
+        self._compact.open()
 
     def close(self, reason: str) -> None:
-        """Says run_ended in place of snapshots."""
-        run_ended = encode(RunEnded(learner_epoch=self._epoch, reason=reason))
-        self._responses.close(run_ended)
-        self._push(run_ended)
-        self._compact_snapshots.close()
+        """Tell actors that the run has ended, in place of snapshots."""
+        ended = encode(RunEnded(learner_epoch=self._epoch, reason=reason))
+        self._responses.close(ended)
+        self._push(ended)
+        self._compact.close()
 
     def answer(self, request: Request) -> None:
-        """Answers a query on `snapshots`, now or soon. Never waits."""
+        """Answer a query on `snapshots`, now or soon. Never waits."""
         if request.size:
-            self._compact_snapshots.offer(request)
+            self._compact.offer(request)
         else:
             request.reply(self._responses.snapshot())
 
     def offer_program(self, model: bytes) -> None:
-        """Has the policy program ready for those who ask."""
-        self.program_hash = program_hash(model)
-        self._responses.offer_program(Program(hash=self.program_hash, model=np.frombuffer(model, np.uint8)))
+        """Hold the policy program ready for those who ask."""
+        self._program_hash = program_hash(model)
+        self._responses.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
-    def is_due(self, policy_version: int, rollouts: int, live: int) -> bool:
-        """Whether to publish a version that was made of so many rollouts, while so many actors take part.
+    def publish_if_due(self, policy_version: int, weights: dict[str, np.ndarray], rollouts: int) -> None:
+        """Publish a version that was made of so many rollouts, if enough actors would play it.
 
-        An actor takes one snapshot a rollout. Of a small fleet each update is published; a large one has it in vain
-        before a quarter of it has had its turn, and pays for it: a thousand actors get a thousand copies. What is
-        played must stay well within the policy lag that is learned from, though.
+        An actor takes one snapshot a rollout. In a small fleet every update is published. With a large fleet, publish
+        after a quarter of the actors have contributed: each snapshot is sent to all of them. The versions that are
+        played must stay well within the policy lag that is learned from.
         """
-        self._unpublished += rollouts
+        self._unpublished_rollouts += rollouts
+        with self._lock:
+            live = len(self._fleet.live)
         ages = 4 * (policy_version - self.version) >= self._spec.training.policy_lag_bound
-        return self._spec.algorithm.synchronous or ages or 4 * self._unpublished >= live
+        if self._spec.algorithm.synchronous or ages or 4 * self._unpublished_rollouts >= live:
+            self.publish(policy_version, weights)
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
-        """Encodes a snapshot once, for those who follow and for those who ask."""
+        """Encode a snapshot once, for subscribers and for queries."""
         snapshot = encode(
             Snapshot(
                 learner_epoch=self._epoch,
                 policy_version=policy_version,
-                program=self.program_hash,
+                program=self._program_hash,
                 weights=weights,
             )
         )
         self._responses.offer_snapshot(snapshot)
-        self.version, self._unpublished = policy_version, 0
+        self.version, self._unpublished_rollouts = policy_version, 0
         self._push(snapshot)
         self._fleet.pushed_bytes += len(snapshot)
+        self._counters.snapshots_published += 1
 
-    def _push(self, news: bytes) -> None:
-        with contextlib.suppress(TransportError):  # in a session that is being replaced: who needs it asks for it
-            self._transport.publish(self._key, news)
+    def newest(self) -> bytes:
+        """Return the snapshot that was published last, encoded."""
+        return self._responses.snapshot()
+
+    def _push(self, payload: bytes) -> None:
+        with contextlib.suppress(TransportError):  # the session is being replaced; actors ask for what they miss
+            self._transport.publish(self._key, payload)
+
+    def _count_compact(self, name: str, size: int) -> None:
+        """Called on the compact snapshot server's thread."""
+        with self._lock:
+            actor = self._fleet.actors.get(name)
+            if actor is not None:
+                actor.compact_snapshots, actor.answered_bytes = True, actor.answered_bytes + size

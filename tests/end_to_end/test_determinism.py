@@ -23,7 +23,13 @@ def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
     network, stop = MemoryNetwork(), threading.Event()
     run_directory.create(directory, spec)
     service = LearnerService(
-        spec, directory, MemoryTransport(network), stop, Progress(io.StringIO(), spec.training.env_steps), started=0.0
+        spec,
+        directory,
+        MemoryTransport(network),
+        stop,
+        Progress(io.StringIO(), spec.training.env_steps),
+        [],
+        started=0.0,
     )
     outcomes: list[Outcome] = []
     threads = [threading.Thread(target=lambda: outcomes.append(service.run()), daemon=True)]

@@ -12,7 +12,6 @@ from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -40,7 +39,7 @@ REPORT = EvaluationReport(
 )
 
 
-def no_status(fleet: Fleet) -> RunStatus:
+def no_status() -> RunStatus:
     raise AssertionError("nobody asked for it")
 
 
@@ -86,10 +85,10 @@ def test_rollouts_of_the_version_that_a_batch_makes_are_welcome_as_soon_as_it_is
         actor.query(keys.join("r"), encode(join), timeout=LIMIT)
         assert verdict(0, version=1) == "rejected"
         assert verdict(1, version=0) == "accepted"
-        assert len(server.take_batch(0)) == 1
+        assert len(server.rollouts.take_batch(0)) == 1
         assert verdict(2, version=updates + 1) == "rejected"
         assert verdict(3, version=updates) == "accepted"
-        assert len(server.take_batch(updates)) == 1
+        assert len(server.rollouts.take_batch(updates)) == 1
     finally:
         server.close("the test is over")
     assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
@@ -116,8 +115,8 @@ def asker(network: MemoryNetwork, server: ActorServer) -> Asker:
 
 
 def offer_policy(server: ActorServer) -> None:
-    server.offer_program(b"program", 0)
-    server.publish(3, {"w": np.zeros(2, np.float32)})
+    server.offer_policy(b"program", 0)
+    server.publisher.publish(3, {"w": np.zeros(2, np.float32)})
 
 
 def codes(asker: Asker) -> list[str]:
@@ -129,11 +128,11 @@ def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(server:
     asker.send(encode(EvaluationRequest(evaluator="e")))
     asker.send(encode(REPORT))
     assert asker.answers == []
-    (first, asked), (_, told) = server.take_evaluations()
+    (first, asked), (_, told) = server.evaluations.take()
     assert asked == EvaluationRequest(evaluator="e")
     assert isinstance(told, EvaluationReport)
-    assert server.take_evaluations() == []
-    first.reply(server.newest_snapshot())
+    assert server.evaluations.take() == []
+    first.reply(server.publisher.newest())
     (answer,) = asker.answers
     assert isinstance(answer, Snapshot)
     assert answer.policy_version == 3
@@ -142,7 +141,7 @@ def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(server:
 def test_before_there_is_a_policy_nothing_can_be_evaluated(server: ActorServer, asker: Asker) -> None:
     asker.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(asker) == ["not_ready"]
-    assert server.take_evaluations() == []
+    assert server.evaluations.take() == []
 
 
 def test_evaluators_beyond_measure_are_told_to_ask_later(server: ActorServer, asker: Asker) -> None:
@@ -152,7 +151,7 @@ def test_evaluators_beyond_measure_are_told_to_ask_later(server: ActorServer, as
     assert asker.answers == []
     asker.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(asker) == ["not_ready"]
-    assert len(server.take_evaluations()) == 64
+    assert len(server.evaluations.take()) == 64
 
 
 @pytest.mark.parametrize(
@@ -170,7 +169,7 @@ def test_what_is_no_question_of_an_evaluators_own_is_refused(server: ActorServer
     offer_policy(server)
     asker.send(payload)
     assert codes(asker) == ["malformed"]
-    assert server.take_evaluations() == []
+    assert server.evaluations.take() == []
 
 
 def test_a_report_beyond_measure_is_refused(server: ActorServer, asker: Asker) -> None:
@@ -209,7 +208,7 @@ def test_many_at_once_are_all_held(server: ActorServer, network: MemoryNetwork) 
         thread.start()
     for thread in threads:
         thread.join()
-    taken = {message.evaluator for _, message in server.take_evaluations()}
+    taken = {message.evaluator for _, message in server.evaluations.take()}
     assert taken == {f"e{number}" for number in range(16)}
 
 
@@ -228,7 +227,7 @@ class Silent(MemoryTransport):
 def test_a_reception_that_hears_nobody_has_its_session_reopened(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 0.02)
+    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 0.02)
     transport, counters = Silent(network), RunCounters(10)
     server = ActorServer(
         "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
@@ -242,12 +241,12 @@ def test_a_reception_that_hears_nobody_has_its_session_reopened(
 
 
 def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daedalus.learner.serving.actor_server._SILENCE_SECONDS", 1000.0)
+    monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 1000.0)
     server = made(network, run_spec(), RunCounters(10))
     try:
-        before = server._heard_at
+        before = server._watchdog._heard_at
         MemoryTransport(network).query(keys.snapshots("r"), timeout=LIMIT)
-        assert server._heard_at > before
+        assert server._watchdog._heard_at > before
     finally:
         server.close("the test is over")
 
@@ -264,7 +263,7 @@ def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(n
         )
         actor.query(keys.rollouts("r", "a"), encode(make_rollout(identity("a"))), timeout=LIMIT)
         del server.fleet.actors["a"]
-        assert server.take_batch(5) == []
+        assert server.rollouts.take_batch(5) == []
         assert counters.rollouts_rejected == {"stale": 1}
     finally:
         server.close("the test is over")
@@ -295,7 +294,7 @@ def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
         for sequence in range(held + 1):
             payload = encode(make_rollout(identity("a", sequence)))
             actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
-        until(lambda: counters.rollouts_accepted == held and server.queue_bytes == 0)
+        until(lambda: counters.rollouts_accepted == held and server.rollouts.queue_bytes == 0)
         for sequence in range(held + 1, held + most + 3):
             payload = encode(make_rollout(identity("a", sequence)))
             actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
@@ -332,9 +331,9 @@ def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
     news: list[int] = []
     inbox = actors.subscribe(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
     for version in range(1, 7):
-        server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
     assert news == published
-    assert server.published_version == (published or [0])[-1]
+    assert server.publisher.version == (published or [0])[-1]
 
 
 def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
@@ -343,8 +342,8 @@ def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
     with_fleet(network, server, 400)
     published = set()
     for version in range(1, 41):  # of 32 batches at most
-        server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
-        published.add(server.published_version)
+        server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        published.add(server.publisher.version)
     assert published == {0, 8, 16, 24, 32, 40}
 
 
@@ -353,8 +352,8 @@ def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> No
     try:
         with_fleet(network, server, 40)
         for version in (1, 2):
-            server.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
-            assert server.published_version == version
+            server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            assert server.publisher.version == version
     finally:
         server.close("the test is over")
 
@@ -363,7 +362,7 @@ def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, server
     """Of one that is not published an actor would ask for in vain."""
     offer_policy(server)
     actors = with_fleet(network, server, 40)
-    server.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    server.publisher.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
     rollout = make_rollout(identity("a0", 0), version=0)
     (answer,) = actors.query(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
     acknowledgement = decode(answer, Limits())

@@ -14,6 +14,7 @@ from processes import until
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.service import LearnerService
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -64,7 +65,10 @@ class House:
         transport = MemoryTransport(self._network)
         progress = Progress(io.StringIO(), self.spec.training.env_steps)
         try:
-            LearnerService(self.spec, self.directory, transport, self.stop, progress, started=time.monotonic()).run()
+            writers = [lambda: CsvWriter(self.directory / "metrics.csv")]
+            LearnerService(
+                self.spec, self.directory, transport, self.stop, progress, writers, started=time.monotonic()
+            ).run()
         finally:
             transport.close()
 

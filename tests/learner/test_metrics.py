@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from daedalus.learner.reporting.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, TensorBoardWriter
+from daedalus.learner.reporting.csv_writer import CsvWriter
+from daedalus.learner.reporting.metrics import COLUMNS, Details
+from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 
 NONE = Details()
@@ -85,25 +87,6 @@ def test_tensorboard_shows_distributions_and_what_the_network_sees(tmp_path: Pat
     assert events.Histograms("action")[0].histogram_value.bucket == [2.0, 0.0, 5.0]
     (image,) = events.Images("what_the_network_sees")
     assert (image.step, image.width, image.height) == (100, 8, 6)
-
-
-def test_several_writers_get_all_that_one_gets() -> None:
-    tape: list[object] = []
-
-    class Tape:
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def write(self, row: object, details: object) -> None:
-            tape.append((self.name, row, details))
-
-        def close(self) -> None:
-            tape.append((self.name, "closed"))
-
-    writers = MetricsWriters([Tape("one"), Tape("two")])
-    writers.write({"updates": 1}, NONE)
-    writers.close()
-    assert tape == [("one", {"updates": 1}, NONE), ("two", {"updates": 1}, NONE), ("one", "closed"), ("two", "closed")]
 
 
 def test_what_the_learner_measures_has_its_columns() -> None:

@@ -12,7 +12,8 @@ from log_lines import LINES
 from processes import until
 
 from daedalus.learner.reporting import recorder
-from daedalus.learner.reporting.metrics import CsvWriter, Details
+from daedalus.learner.reporting.csv_writer import CsvWriter
+from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import Recorder
 
@@ -34,8 +35,27 @@ def env_steps(directory: Path) -> list[str]:
         return [line["env_steps"] for line in csv.DictReader(file)]
 
 
+def test_every_writer_gets_every_row_and_is_closed() -> None:
+    tape: list[object] = []
+
+    class Tape:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def write(self, row: Mapping[str, float], details: Details) -> None:
+            tape.append((self.name, row["env_steps"]))
+
+        def close(self) -> None:
+            tape.append((self.name, "closed"))
+
+    recording = Recorder([lambda: Tape("one"), lambda: Tape("two")], Progress(io.StringIO(), 100))
+    recording.record(row(7), Details())
+    recording.close()
+    assert tape == [("one", 7), ("two", 7), ("one", "closed"), ("two", "closed")]
+
+
 def test_rows_are_written_in_their_order(tmp_path: Path) -> None:
-    recording = Recorder(tmp_path, Progress(io.StringIO(), 100))
+    recording = Recorder([lambda: CsvWriter(tmp_path / "metrics.csv")], Progress(io.StringIO(), 100))
     for number in range(5):
         recording.record(row(number), Details())
     recording.close()
@@ -55,8 +75,7 @@ def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_ro
             super().write(row, details)
 
     monkeypatch.setattr(recorder, "_RETRY_SECONDS", 0.0)
-    monkeypatch.setattr(recorder, "CsvWriter", OnThisDisk)
-    recording = Recorder(tmp_path, Progress(io.StringIO(), 100))
+    recording = Recorder([lambda: OnThisDisk(tmp_path / "metrics.csv")], Progress(io.StringIO(), 100))
     recording.record(row(1), Details())
     recording.record(row(2), Details())
     recording.record(row(3), Details())

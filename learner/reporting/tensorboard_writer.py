@@ -1,0 +1,92 @@
+"""Metrics as TensorBoard's event files."""
+
+import io
+import itertools
+import os
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daedalus.learner.reporting.metrics import Details
+
+
+class TensorBoardWriter:
+    """Scalars, distributions and pictures against env_steps, in TensorBoard's own files.
+
+    Its record writer without its event writer: that one writes on a thread which dies of a full disk, and which waits
+    for an hour where the clock is set back by one.
+    """
+
+    _numbers = itertools.count()
+
+    def __init__(self, directory: Path) -> None:
+        # Loaded here: a quarter of a second that no run should wait for before it has begun.
+        from tensorboard.compat.proto import event_pb2, summary_pb2
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        # protobuf makes these classes when it is loaded: no type checker finds them
+        self._event: Any = vars(event_pb2)["Event"]
+        self._summary: Any = vars(summary_pb2)["Summary"]
+        self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
+        now = time.time()
+        name = f"events.out.tfevents.{int(now):010d}.{socket.gethostname()}.{os.getpid()}.{next(self._numbers)}"
+        self._writer = RecordWriter(open(directory / name, "ab"))  # noqa: SIM115 - closed in close()
+        self._add(self._event(wall_time=now, file_version="brain.Event:2"))
+
+    def write(self, row: Mapping[str, float], details: Details) -> None:
+        """See MetricsWriter."""
+        values: list[Any] = [
+            self._summary.Value(tag=name, simple_value=float(value))
+            for name, value in row.items()
+            if name != "env_steps"
+        ]
+        values += [
+            self._summary.Value(tag=tag, histo=self._histogram(*np.histogram(numbers, bins=30), numbers))
+            for tag, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
+            if len(numbers)
+        ]
+        if sum(details.action_counts):
+            chosen = np.array(details.action_counts)
+            edges = np.arange(len(chosen) + 1) - 0.5
+            values.append(self._summary.Value(tag="action", histo=self._histogram(chosen, edges, ())))
+        if details.picture is not None:
+            values.append(self._summary.Value(tag="what_the_network_sees", image=self._image(details.picture)))
+        self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))
+
+    def _add(self, event: Any) -> None:
+        self._writer.write(event.SerializeToString())
+        self._writer.flush()
+
+    def _histogram(self, counts: np.ndarray, edges: np.ndarray, numbers: Sequence[float]) -> Any:
+        """TensorBoard's histogram of counts between edges; sums are of the numbers themselves where there are any."""
+        middles = (edges[1:] + edges[:-1]) / 2
+        exact = np.array(numbers, np.float64) if len(numbers) else np.repeat(middles, counts)
+        return self._histogram_proto(
+            min=float(exact.min()),
+            max=float(exact.max()),
+            num=float(counts.sum()),
+            sum=float(exact.sum()),
+            sum_squares=float(np.square(exact).sum()),
+            bucket_limit=edges[1:].tolist(),
+            bucket=counts.astype(float).tolist(),
+        )
+
+    def _image(self, picture: np.ndarray) -> Any:
+        from PIL import Image  # a requirement of TensorBoard's
+
+        png = io.BytesIO()
+        Image.fromarray(picture).save(png, "png")
+        return self._summary.Image(
+            height=picture.shape[0],
+            width=picture.shape[1],
+            colorspace=1 if picture.ndim == 2 else 3,
+            encoded_image_string=png.getvalue(),
+        )
+
+    def close(self) -> None:
+        """See MetricsWriter."""
+        self._writer.close()

@@ -1,0 +1,172 @@
+"""A rollout's way from the network to a batch: a bounded queue, a thread that judges, a buffer.
+
+    transport's threads   `offer`: put the undecoded rollout on the queue, or answer busy
+    intake thread         decodes and judges rollouts, answers them, fills the buffer
+    learner's thread      `take_batch`: takes complete batches out of the buffer
+
+One condition, shared with the actor server, guards the fleet, the buffer, the counters and the version that rollouts
+are judged against.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
+from daedalus.learner.serving.request_queue import RequestQueue
+from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.spec import RunSpec
+from daedalus.transport.interface import Request
+
+HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+_CLOSE_SECONDS = 4.0  # for the intake thread to answer what is queued
+
+
+class RolloutIntake:
+    """Serves the `rollouts` keys from `open` to `close`."""
+
+    def __init__(
+        self,
+        spec: RunSpec,
+        lock: threading.Condition,
+        fleet: Fleet,
+        counters: RunCounters,
+        published_version: Callable[[], int],
+        *,
+        learner_epoch: int,
+        start_version: int,
+    ) -> None:
+        """`published_version` returns the newest policy version that actors can have."""
+        self._spec, self._lock, self._fleet, self._counters = spec, lock, fleet, counters
+        self._published_version = published_version
+        self._version = start_version  # rollouts of it are on-policy
+        self._intake = Intake(spec, learner_epoch, fleet)
+        self._buffer = _buffer(spec)
+        self._requests = _queue(spec)
+        self._over = False
+        self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
+
+    def open(self) -> None:
+        """Start to judge."""
+        self._thread.start()
+
+    def end(self) -> None:
+        """Answer every rollout `finished` from now on. Called with the lock held."""
+        self._over = True
+
+    def close(self) -> None:
+        """Answer what is queued, and stop. Called after `end`, without the lock."""
+        self._requests.close()
+        if self._thread.is_alive():
+            self._thread.join(timeout=_CLOSE_SECONDS)
+
+    @property
+    def queue_bytes(self) -> int:
+        """How much waits to be judged."""
+        return self._requests.bytes
+
+    def expect_state_size(self, state_size: int) -> None:
+        """Say how many numbers of memory a rollout comes with; before any actor has the program."""
+        self._intake.state_size = state_size
+
+    def offer(self, request: Request) -> None:
+        """Take in a rollout, or answer busy. Never waits."""
+        if self._over:
+            request.reply(encode(Acknowledgement(verdict="finished")))
+        elif not self._requests.offer(request):
+            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
+            with self._lock:
+                actor = self._fleet.actors.get(keys.last_chunk(request.key))
+                if actor is not None:
+                    actor.busy += 1
+
+    # ------------------------------------------------------------------------------------ the learner's thread
+
+    def take_batch(self, version: int) -> list[Rollout]:
+        """Return the rollouts of the next update, counted; none if no batch is complete within a heartbeat.
+
+        `version` is the newest; from here on, rollouts of the version that this batch makes are on-policy.
+        """
+        with self._lock:
+            taken = self._take(version)
+            if not taken.rollouts and not taken.stale:
+                self._lock.wait(HEARTBEAT_SECONDS)
+                taken = self._take(version)
+            self._count(taken, version)
+            self._lock.notify_all()
+        return taken.rollouts
+
+    def _take(self, version: int) -> TakenRollouts:
+        return self._buffer.take(self._fleet.live, version)
+
+    def _count(self, taken: TakenRollouts, version: int) -> None:
+        actors = self._fleet.actors  # one that was absent for long may have been evicted
+        for rollout in taken.stale:
+            self._counters.rollouts_rejected["stale"] += 1
+            if rollout.identity.actor in actors:
+                actors[rollout.identity.actor].rejected["stale"] += 1
+        if not taken.rollouts:
+            return
+        updates = self._spec.training.updates_per_batch
+        self._counters.trained(taken.rollouts, version, updates)
+        for rollout in taken.rollouts:
+            if rollout.identity.actor in actors:
+                actors[rollout.identity.actor].env_steps += int(np.count_nonzero(rollout.valid))
+        self._version = version + updates
+
+    # --------------------------------------------------------------------------------------- the intake thread
+
+    def _judge_requests(self) -> None:
+        while (request := self._requests.take()) is not None:
+            sender, payload = keys.last_chunk(request.key), request.payload
+            content = self._intake.read(sender, payload)
+            with self._lock:
+                answer = self._judge(sender, content, len(payload))
+            request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
+
+    def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
+        if self._is_surplus(content):
+            content = Rejected(verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor")
+        verdict = self._intake.judge(sender, content, self._version, time.monotonic())
+        self._fleet.received(sender, size)
+        if isinstance(verdict, Rollout):
+            self._store(verdict, size)
+        else:
+            self._counters.rollouts_rejected[verdict.cause] += 1
+        return acknowledgement(verdict, self._published_version())
+
+    def _is_surplus(self, content: Rollout | Rejected) -> bool:
+        """Whether a barrier holds a rollout of the same actor already: waiting for room would wait for that actor."""
+        synchronous = self._spec.algorithm.synchronous
+        return synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content)
+
+    def _store(self, rollout: Rollout, size: int) -> None:
+        """Put a rollout into the buffer, waiting for room: the late answer is what holds its sender back."""
+        while not self._buffer.has_room_for(rollout) and not self._over:
+            self._lock.wait(HEARTBEAT_SECONDS)
+        self._buffer.add(rollout)
+        self._counters.accepted(rollout, size)
+        self._lock.notify_all()
+
+
+def _queue(spec: RunSpec) -> RequestQueue:
+    """Return a queue as long as its last rollout can still be learned from when its turn comes.
+
+    Rollouts beyond that are answered busy: waiting here they would only grow too old, and their senders would give up
+    waiting for the answers.
+    """
+    batches = spec.training.policy_lag_bound // spec.training.updates_per_batch + 1
+    return RequestQueue(spec.service.queue_bytes, max(batches * spec.batch_rollouts, 2 * spec.collection.actors))
+
+
+def _buffer(spec: RunSpec) -> RolloutBuffer:
+    if spec.algorithm.synchronous:
+        return BarrierBuffer(spec.collection.actors)
+    return StreamBuffer(spec.batch_rollouts, spec.training.policy_lag_bound)

@@ -1,0 +1,76 @@
+"""Saves a run's checkpoints while it learns; a disk that refuses costs a warning, not the run."""
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daedalus.learner.reporting.report import Health
+from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.training.checkpoint import save_checkpoint
+from daedalus.learner.training.learner import Learner
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+
+_logger = logging.getLogger(__name__)
+
+
+class Checkpointer:
+    """Saves one learner's state into its run directory."""
+
+    def __init__(
+        self,
+        directory: Path,
+        spec: RunSpec,
+        spaces: Spaces,
+        learner: Learner,
+        program: bytes,
+        *,
+        counters: Callable[[], dict[str, Any]],
+        evaluations: Evaluations,
+        health: Health,
+    ) -> None:
+        """Construct the checkpointer.
+
+        Args:
+          directory: of the run.
+          spec, spaces, program: stored with every checkpoint.
+          learner: whose state is saved.
+          counters: returns the run's counters as of now.
+          evaluations: its checkpoints are kept while they are played.
+          health: is told when a checkpoint was saved, and why one was not.
+        """
+        self._directory, self._spec, self._spaces = directory, spec, spaces
+        self._learner, self._program = learner, program
+        self._counters, self._evaluations, self._health = counters, evaluations, health
+
+    def save(self) -> Path | None:
+        """Save a checkpoint and return its directory; None if the disk refuses."""
+        try:
+            directory = save_checkpoint(
+                self._directory,
+                spec=self._spec,
+                spaces=self._spaces,
+                policy_version=self._learner.policy_version,
+                program=self._program,
+                parameters=self._learner.weights(),
+                state=self._learner.state(),
+                counters=self._counters(),
+                keep=self._spec.service.keep_checkpoints,
+                also_keep=self._evaluations.kept,
+            )
+        except OSError as error:
+            if not self._health.save_fault:
+                _logger.warning(
+                    "no checkpoint could be saved (%s); the last one stays, training goes on, and saving is tried "
+                    "again every %g s",
+                    error.strerror,
+                    self._spec.service.checkpoint_seconds,
+                )
+            self._health.save_fault = error.strerror or type(error).__name__
+            return None
+        if self._health.save_fault:
+            _logger.info("checkpoints are saved again")
+        self._health.saved, self._health.save_fault = time.monotonic(), ""
+        return directory
