@@ -59,9 +59,9 @@ def test_a_client_that_is_killed_is_absent(start: Start, address: str, router: T
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("--listen", "localhost"), "no address"),
+        (("--listen", "localhost"), "not an address"),
         (("--listen", "tls/127.0.0.1:0"), "in the clear"),
-        (("--listen", "tcp/0.0.0.0:0"), "could take part, unseen and unchecked"),
+        (("--listen", "tcp/0.0.0.0:0"), "is unencrypted and open to every host"),
         (("--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
     ],
     ids=str,

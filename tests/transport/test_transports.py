@@ -390,6 +390,38 @@ def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[T
         acts[act]()
 
 
+def raise_fault(*_arguments: object) -> None:
+    raise RuntimeError("a fault of ours")
+
+
+@pytest.mark.parametrize("callback", ["handler", "answer", "subscriber", "presence"])
+def test_exception_in_a_callback_reaches_the_threads_excepthook(
+    callback: str, closing: Callable[[Transport], Transport], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = Tape()
+    monkeypatch.setattr(threading, "excepthook", faults)
+    endpoint, router = listen_somewhere()
+    closing(router)
+    client = closing(connect([endpoint]))
+    if callback == "handler":
+        client.serve("d/r/join", raise_fault)
+        settle(client, router)
+        assert router.query("d/r/join", timeout=WAIT) == []
+    elif callback == "answer":
+        client.query_async("d/r/join", b"", timeout=WAIT, on_answer=raise_fault)
+    elif callback == "subscriber":
+        client.subscribe("d/r/snapshots", raise_fault)
+        settle(client, router)
+        router.publish("d/r/snapshots", b"x")
+    else:
+        client.watch_presence("d/r/actors/*", raise_fault)
+        router.declare_presence("d/r/actors/a")
+    fault = faults.next()
+    assert (fault.exc_type, str(fault.exc_value)) == (RuntimeError, "a fault of ours")
+    assert fault.exc_traceback.tb_next.tb_frame.f_code.co_name in ("raise_fault", "on_query", "on_end", "on_sample")
+    assert fault.thread is not None
+
+
 # ------------------------------------------------------------------------------------------- reopening
 
 
