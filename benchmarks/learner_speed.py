@@ -22,8 +22,9 @@ from pathlib import Path
 import torch
 from running import machine, table
 
+from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.learner.training.allocator import keep_freed_memory
-from daedalus.learner.training.optimizers import Adam, FlatParameters
+from daedalus.learner.training.optimizers import Adam
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec

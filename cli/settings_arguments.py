@@ -7,6 +7,7 @@ from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spec import RunSpec
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -39,8 +40,7 @@ def add_settings(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--algorithm",
         metavar="NAME",
-        help="a2c (synchronous), a3c (asynchronous), impala (asynchronous, corrected for lag), "
-        "appo (as impala, several passes over each batch)",
+        help=", ".join(f"{algorithm.name} ({algorithm.summary})" for algorithm in ALGORITHMS.values()),
     )
     options.add_argument(
         "--actors",

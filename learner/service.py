@@ -203,7 +203,7 @@ class LearnerService:
             if self._server.fleet.live:
                 self._health.attended = now
             learning = {
-                **learner.take_metrics(),
+                **learner.metrics.take_means(),
                 **self._evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
@@ -216,8 +216,8 @@ class LearnerService:
         return Details(
             returns=returns,
             lengths=lengths,
-            action_counts=learner.take_action_counts(),
-            picture=learner.take_observation_image(),
+            action_counts=learner.metrics.take_action_counts(),
+            picture=learner.metrics.take_observation_image(),
         )
 
     def _status(self, fleet: Fleet) -> RunStatus:

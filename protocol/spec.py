@@ -7,8 +7,9 @@ specification and sends it whole to every actor that joins. This file does not k
 
 from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import AfterValidator, Field, JsonValue, model_validator
 
+from daedalus.protocol.algorithms import ALGORITHMS, Algorithm, check_algorithm
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # fast: CarRacing-v3 with a cheaper renderer
@@ -68,7 +69,7 @@ class CollectionSpec(Specification):
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
-    algorithm: Literal["a2c", "a3c", "impala", "appo"] = "impala"
+    algorithm: Annotated[str, AfterValidator(check_algorithm)] = "impala"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     env_steps: PositiveInt = 1_000_000  # the budget
     target_return: float | None = None  # solved when the mean of the last `target_episodes` reaches it
@@ -106,7 +107,7 @@ class TrainingSpec(Specification):
     @property
     def updates_per_batch(self) -> int:
         """How many policy versions one batch makes."""
-        return self.passes * self.minibatches if self.algorithm == "appo" else 1
+        return self.passes * self.minibatches if ALGORITHMS[self.algorithm].passes_over_batch else 1
 
     @property
     def policy_lag_bound(self) -> int:
@@ -150,9 +151,10 @@ class RunSpec(Specification):
 
     @model_validator(mode="after")
     def _one_batch_fits_the_barrier(self) -> "RunSpec":
-        if self.training.algorithm == "a2c" and self.training.batch_rollouts is not None:
+        if self.algorithm.synchronous and self.training.batch_rollouts is not None:
             raise ValueError(
-                "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
+                f"training.batch_rollouts has no meaning for {self.algorithm.name}: "
+                "its batch is one rollout of every live actor"
             )
         return self
 
@@ -167,6 +169,11 @@ class RunSpec(Specification):
         return self
 
     @property
-    def synchronous(self) -> bool:
-        """Whether actors wait for each update (a2c) or never do."""
-        return self.training.algorithm == "a2c"
+    def algorithm(self) -> Algorithm:
+        """How the run's updates are scheduled."""
+        return ALGORITHMS[self.training.algorithm]
+
+    @property
+    def batch_rollouts(self) -> int:
+        """How many rollouts make a batch where no barrier decides it."""
+        return self.training.batch_rollouts or self.algorithm.batch_rollouts or self.collection.actors

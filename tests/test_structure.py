@@ -79,7 +79,7 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
     }
     assert users == {
         ("metrics.py", "time.time"),
-        ("logs.py", "time.strftime"),  # the time of a log record
+        ("logs.py", "time.strftime"),  # only dates log records
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are good from one day to another
     }

@@ -48,7 +48,7 @@ class ClientPlayer:
 
     def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
         """See Player."""
-        if spec.synchronous:
+        if spec.algorithm.synchronous:
             raise ActorError(
                 "a run with a2c has its actors wait for each update, a client cannot: use another algorithm"
             )

@@ -114,7 +114,7 @@ class ActorService:
         else:
             self._upload_session.begin(welcome.run, self._join, welcome.spec.collection.window)
             self._learner_epoch, self._sequence = welcome.learner_epoch, 0
-        if self._config.link == "wan" and not welcome.spec.synchronous:
+        if self._config.link == "wan" and not welcome.spec.algorithm.synchronous:
             self._feed.use_compact_snapshots()
         _logger.info(f"joined run {welcome.run!r} as {self._config.name!r}: {count} x {welcome.spec.environment.id}")
         self._play(confirmed, spaces)
@@ -135,7 +135,7 @@ class ActorService:
         while True:
             self._upload_session.await_room()  # before playing: what is played now is of the newest policy
             self._tell_if_in_vain()
-            if not welcome.spec.synchronous:
+            if not welcome.spec.algorithm.synchronous:
                 snapshot = self._newest_snapshot()
             if snapshot.policy_version != loaded:
                 player.load(snapshot)
@@ -153,7 +153,7 @@ class ActorService:
                 self._upload_session.fit_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
             self._upload_session.send(self._sequence, payload)
             self._sequence += 1
-            if welcome.spec.synchronous:
+            if welcome.spec.algorithm.synchronous:
                 snapshot = self._await_snapshot(newer_than=loaded)
 
     def _runtime(self, welcome: Welcome, spaces: Spaces) -> PolicyRuntime:
@@ -175,7 +175,7 @@ class ActorService:
             self._upload_session.await_word(pause)
             self._feed.read()
             pause = min(2 * pause, _DOUBT_SECONDS)
-        if self._config.link == "auto" and not welcome.spec.synchronous:
+        if self._config.link == "auto" and not welcome.spec.algorithm.synchronous:
             self._measure_link(welcome, time.monotonic() - began, len(program[1]))
         return program[1]
 

@@ -15,7 +15,7 @@ from daedalus.transport.addresses import AddressError, check_listening
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 from daedalus.transport.zenoh_transport import connect
 
-_logger = logging.getLogger(__name__)
+_logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
 LISTEN = "tcp/127.0.0.1:7448"
 

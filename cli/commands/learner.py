@@ -19,6 +19,8 @@ from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spec import RunSpec
@@ -28,7 +30,7 @@ from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from daedalus.transport.zenoh_transport import listen
 
-_logger = logging.getLogger(__name__)
+_logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -86,7 +88,7 @@ def main() -> int:
             restored=restored,
         )
         return _status(service.run(), spec)
-    except (ValueError, SettingsError, TransportError) as error:  # another network's checkpoint, a rival
+    except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
     finally:

@@ -180,7 +180,7 @@ def _watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stoppin
             except FailedError as error:
                 actors.remove(actor)
                 playing = sum(other.name != _EVALUATOR for other in actors)
-                needed = not playing or spec.synchronous  # a2c waits for all at its start
+                needed = not playing or spec.algorithm.synchronous  # a2c waits for all at its start
                 if needed and actor.name != _EVALUATOR:
                     raise
                 _say(f"{error}; going on without it")

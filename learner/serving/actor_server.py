@@ -274,7 +274,11 @@ class ActorServer:
             sender = keys.last_chunk(request.key)
             content = self._intake.read(sender, request.payload)
             with self.lock:
-                if self._spec.synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content):
+                if (
+                    self._spec.algorithm.synchronous
+                    and isinstance(content, Rollout)
+                    and not self._buffer.has_room_for(content)
+                ):
                     content = Rejected(
                         verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor"
                     )
@@ -303,15 +307,10 @@ def _queue(spec: RunSpec) -> RequestQueue:
     waiting for the answer.
     """
     batches = spec.training.policy_lag_bound // spec.training.updates_per_batch + 1
-    return RequestQueue(spec.service.queue_bytes, max(batches * _batch_rollouts(spec), 2 * spec.collection.actors))
-
-
-def _batch_rollouts(spec: RunSpec) -> int:
-    default = 1 if spec.training.algorithm == "a3c" else spec.collection.actors
-    return spec.training.batch_rollouts or default
+    return RequestQueue(spec.service.queue_bytes, max(batches * spec.batch_rollouts, 2 * spec.collection.actors))
 
 
 def _buffer(spec: RunSpec) -> RolloutBuffer:
-    if spec.training.algorithm == "a2c":
+    if spec.algorithm.synchronous:
         return BarrierBuffer(spec.collection.actors)
-    return StreamBuffer(_batch_rollouts(spec), spec.training.policy_lag_bound)
+    return StreamBuffer(spec.batch_rollouts, spec.training.policy_lag_bound)

@@ -38,7 +38,7 @@ class Intake:
         self._epoch = learner_epoch
         self._fleet = fleet
         # On-policy learning takes nothing but the newest version.
-        self._max_lag = 0 if spec.synchronous else spec.training.policy_lag_bound
+        self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
         self.state_size = 0  # of the policy's memory; known before any actor has the program
 
     def read(self, sender: str, data: bytes) -> Rollout | Rejected:

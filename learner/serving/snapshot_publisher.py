@@ -70,7 +70,7 @@ class Publisher:
         """
         self._unpublished += rollouts
         ages = 4 * (policy_version - self.version) >= self._spec.training.policy_lag_bound
-        return self._spec.synchronous or ages or 4 * self._unpublished >= live
+        return self._spec.algorithm.synchronous or ages or 4 * self._unpublished >= live
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Encodes a snapshot once, for those who follow and for those who ask."""

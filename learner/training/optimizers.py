@@ -1,37 +1,16 @@
-"""The two optimisers, over one flat vector of all parameters.
+"""The two optimisers, over one flat vector of all parameters (daedalus/algorithms/flat_parameters.py).
 
-One vector instead of many small tensors: a step is a handful of operations whatever the network, the gradient's
-norm is one, and a checkpoint is a vector for each statistic. (Torch's optimisers, as objects, also load its compiler
-when they are first made, which takes as long as all of a CartPole run; as functions they do not.)
+A checkpoint holds one vector for each statistic. Torch's optimiser classes import its compiler when the first one is
+constructed, which takes as long as a whole CartPole run; its functions do not.
 """
 
-from collections.abc import Iterable
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.adam import adam
 
-
-class FlatParameters:
-    """All parameters of a module as views into one vector, and their gradients as views into another."""
-
-    def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
-        parameters = list(parameters)
-        self.values = torch.cat([parameter.detach().flatten() for parameter in parameters])  # [P]
-        self.gradients = torch.zeros_like(self.values)  # [P]
-        start = 0
-        for parameter in parameters:
-            end = start + parameter.numel()
-            parameter.data = self.values[start:end].view_as(parameter)
-            parameter.grad = self.gradients[start:end].view_as(parameter)
-            start = end
-
-    def clip_gradients(self, max_norm: float) -> Tensor:
-        """Scales the gradients so that their norm is at most `max_norm`; returns the norm they had."""
-        norm = self.gradients.norm()
-        self.gradients.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
-        return norm
+from daedalus.protocol.spec import TrainingSpec
 
 
 class Optimizer(Protocol):
@@ -94,3 +73,10 @@ class RmsProp:
         square = self.statistics["square"]
         square.mul_(self._decay).addcmul_(gradients, gradients, value=1.0 - self._decay)
         values.addcdiv_(gradients, square.add(self._epsilon).sqrt_(), value=-learning_rate)
+
+
+def build_optimizer(spec: TrainingSpec, values: Tensor) -> Optimizer:
+    """Return the optimiser that the run names, for a vector of parameters [P]."""
+    if spec.optimizer == "adam":
+        return Adam(values, spec.optimizer_epsilon)
+    return RmsProp(values, spec.optimizer_epsilon, spec.rmsprop_decay)

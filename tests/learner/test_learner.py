@@ -13,7 +13,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
-from daedalus.learner.training.learner import METRICS, Learner
+from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.learner.training.learner import Learner
+from daedalus.learner.training.update_metrics import METRICS
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace
@@ -92,7 +94,7 @@ def test_updates_are_those_of_the_plain_implementation(
         rollouts, progress = make_rollouts(step, state_size=learner.state_size), step / STEPS
         learner.step(rollouts, progress)
         metrics = plain.step(join(rollouts), rate=0.02 - 0.01 * progress, bonus=0.1 - 0.1 * progress)
-        taken = learner.take_metrics()
+        taken = learner.metrics.take_means()
         assert {name: taken[name] for name in metrics} == pytest.approx(metrics, rel=1e-3, abs=1e-4)
         for name, parameter in plain.network.named_parameters():
             assert_close(torch.from_numpy(learner.weights()[name]), parameter.detach(), rtol=1e-4, atol=1e-5)
@@ -142,7 +144,7 @@ def test_on_policy_the_first_gradient_is_the_same_for_all_algorithms(policy: Pol
     assert gradients["impala"].abs().max() > 1e-3
     assert_close(gradients["appo"], gradients["impala"], rtol=1e-4, atol=1e-6)
     assert_close(gradients["a2c"], gradients["impala"], rtol=1e-4, atol=1e-6)
-    assert learners["appo"].take_metrics()["clipped_fraction"] == 0.0
+    assert learners["appo"].metrics.take_means()["clipped_fraction"] == 0.0
 
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
@@ -164,7 +166,7 @@ def test_a_batch_makes_as_many_versions_as_there_are_passes_and_minibatches(
         learner.step(make_rollouts(step, state_size=learner.state_size), 0.0)
         assert learner.policy_version == step * passes * count
     assert all(np.isfinite(array).all() for array in weights(learner).values())
-    assert all(np.isfinite(value) for value in learner.take_metrics().values())
+    assert all(np.isfinite(value) for value in learner.metrics.take_means().values())
 
 
 def test_the_smallest_batch_makes_as_many_versions_as_any() -> None:
@@ -172,11 +174,11 @@ def test_the_smallest_batch_makes_as_many_versions_as_any() -> None:
     before = weights(learner)
     learner.step([make_rollout(rows=1, environments=1, valid=np.ones((1, 1), np.bool_))], 0.0)
     assert learner.policy_version == 8
-    assert learner.take_metrics()
+    assert learner.metrics.take_means()
     assert not np.array_equal(before["policy_head.weight"], weights(learner)["policy_head.weight"])
     learner.step([make_rollout(rows=1, environments=1, valid=np.zeros((1, 1), np.bool_))], 0.0)
     assert learner.policy_version == 16
-    assert learner.take_metrics() == {}
+    assert learner.metrics.take_means() == {}
 
 
 # --------------------------------------------------------------------------------------------- the rest
@@ -233,7 +235,7 @@ def test_what_a_reset_row_holds_changes_no_weight(algorithm: str, normalize: boo
     for each in (clean, garbage):
         learner = make_learner(policy, algorithm=algorithm, normalize_advantages=normalize)
         learner.step(each, 0.0)
-        results.append((weights(learner), learner.take_metrics()))
+        results.append((weights(learner), learner.metrics.take_means()))
     assert_same(results[0][0], results[1][0])
     assert results[0][1] == results[1][1]
 
@@ -243,11 +245,11 @@ def test_metrics_are_means_since_they_were_last_taken() -> None:
     taken = []
     for step in range(3):
         apart.step(make_rollouts(step), 0.0)
-        taken.append(apart.take_metrics())
+        taken.append(apart.metrics.take_means())
         together.step(make_rollouts(step), 0.0)
     means = {name: float(np.mean([row[name] for row in taken])) for name in METRICS}
-    assert together.take_metrics() == pytest.approx(means, rel=1e-5)
-    assert together.take_metrics() == {}
+    assert together.metrics.take_means() == pytest.approx(means, rel=1e-5)
+    assert together.metrics.take_means() == {}
 
 
 def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
@@ -263,18 +265,18 @@ def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
     )
     learner = make_learner(algorithm="a2c", discount_factor=0.0)
     learner.step([rollout], 0.0)
-    assert learner.take_metrics()["advantage_std"] == pytest.approx(rewards.std(), rel=1e-4)
+    assert learner.metrics.take_means()["advantage_std"] == pytest.approx(rewards.std(), rel=1e-4)
 
 
 def test_action_counts_are_of_the_batches_since_they_were_last_taken() -> None:
     learner = make_learner()
-    assert learner.take_action_counts() == [0] * 4
+    assert learner.metrics.take_action_counts() == [0] * 4
     rollouts = make_rollouts(1) + make_rollouts(2)
     learner.step(rollouts[:2], 0.0)
     learner.step(rollouts[2:], 0.0)
     actions = np.concatenate([rollout.actions[rollout.valid] for rollout in rollouts])  # the others were ignored
-    assert learner.take_action_counts() == np.bincount(actions, minlength=4).tolist()
-    assert learner.take_action_counts() == [0] * 4
+    assert learner.metrics.take_action_counts() == np.bincount(actions, minlength=4).tolist()
+    assert learner.metrics.take_action_counts() == [0] * 4
 
 
 @pytest.mark.parametrize(
@@ -285,16 +287,16 @@ def test_the_picture_is_the_stack_side_by_side_where_there_are_images(
 ) -> None:
     space = ArraySpace(shape=shape, dtype="uint8", frames=3)
     learner = Learner(learner_spec(), POLICY, SPACES.model_copy(update={"observation": space}))
-    assert learner.take_observation_image() is None
+    assert learner.metrics.take_observation_image() is None
     frames = np.random.default_rng(0).integers(0, 256, (6 + 3, 3, *shape), np.uint8)
     learner.step([make_rollout(frames=frames)], 0.0)
-    picture = learner.take_observation_image()
+    picture = learner.metrics.take_observation_image()
     if size is None:
         assert picture is None
         return
     assert picture is not None
     np.testing.assert_array_equal(picture, np.concatenate(list(frames[:3, 0]), axis=1).reshape(size))
-    assert learner.take_observation_image() is None
+    assert learner.metrics.take_observation_image() is None
 
 
 # --------------------------------------------------------------------------------------------- restarts
@@ -363,14 +365,14 @@ def test_the_random_state_is_restored(tmp_path: Path) -> None:
 def test_parameters_of_another_network_are_refused(tmp_path: Path) -> None:
     checkpoint = saved(make_learner(), tmp_path)
     for other in (PolicySpec(hidden=(9,)), PolicySpec(hidden=(8, 8)), RECURRENT):
-        with pytest.raises(ValueError, match="another network"):
+        with pytest.raises(CheckpointMismatchError, match="another network"):
             restored(make_learner(other), checkpoint)
 
 
 @pytest.mark.parametrize(("wrote", "reads"), [("rmsprop", "adam"), ("adam", "rmsprop")])
 def test_statistics_of_another_optimiser_are_refused(wrote: str, reads: str, tmp_path: Path) -> None:
     checkpoint = saved(make_learner(optimizer=wrote), tmp_path)
-    with pytest.raises(ValueError, match="another optimiser"):
+    with pytest.raises(CheckpointMismatchError, match="another optimiser"):
         restored(make_learner(optimizer=reads), checkpoint)
 
 
@@ -383,7 +385,7 @@ def test_an_update_whose_gradient_is_not_finite_is_skipped_and_counted(algorithm
     """Intake lets no nan in; what is finite may still be too large to learn from."""
     learner = make_learner(algorithm=algorithm, passes=2, minibatches=1)
     learner.step(make_rollouts(1), 0.0)
-    learner.take_metrics()
+    learner.metrics.take_means()
     before, state, version = weights(learner), learner.state(), learner.policy_version
     state = {name: value.clone() for name, value in state.items()}
     rewards = np.full_like(make_rollout().rewards, reward)
@@ -393,9 +395,9 @@ def test_an_update_whose_gradient_is_not_finite_is_skipped_and_counted(algorithm
     after = learner.state()
     for name in state.keys() - {"torch_random_state"}:
         assert_close(after[name], state[name], rtol=0, atol=0)
-    assert learner.take_metrics() == {}
+    assert learner.metrics.take_means() == {}
     skipped = learner.updates_skipped
     learner.step(make_rollouts(2), 0.0)
     assert learner.updates_skipped == skipped
     assert all(np.isfinite(array).all() for array in learner.weights().values())
-    assert all(np.isfinite(value) for value in learner.take_metrics().values())
+    assert all(np.isfinite(value) for value in learner.metrics.take_means().values())

@@ -8,7 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from daedalus.learner.reporting.metrics import COLUMNS, CsvWriter, Details, MetricsWriters, TensorBoardWriter
-from daedalus.learner.training.learner import METRICS
+from daedalus.learner.training.update_metrics import METRICS
 
 NONE = Details()
 

@@ -8,7 +8,8 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from daedalus.learner.training.optimizers import Adam, FlatParameters, RmsProp
+from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.learner.training.optimizers import Adam, RmsProp
 
 
 def network() -> nn.Sequential:

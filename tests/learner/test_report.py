@@ -11,7 +11,7 @@ from building import EPOCH, joined_fleet, make_rollout, run_spec
 from daedalus.learner.reporting.metrics import COLUMNS
 from daedalus.learner.reporting.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.training.learner import METRICS
+from daedalus.learner.training.update_metrics import METRICS
 
 EVERYTHING = np.ones((6, 3), np.bool_)
 

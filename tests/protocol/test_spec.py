@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
@@ -27,8 +28,8 @@ def run(**sections: Any) -> RunSpec:
 
 def test_an_environment_alone_makes_a_run() -> None:
     assert run().training == TrainingSpec()
-    assert not run().synchronous
-    assert run(training={"algorithm": "a2c"}).synchronous
+    assert not run().algorithm.synchronous
+    assert run(training={"algorithm": "a2c"}).algorithm.synchronous
 
 
 @pytest.mark.parametrize(
@@ -214,3 +215,10 @@ def test_a_stack_longer_than_a_rollout_is_refused_and_the_way_out_named() -> Non
 def test_the_lag_bound_counts_batches_unless_it_is_given(fields: dict[str, Any], updates: int, bound: int) -> None:
     spec = TrainingSpec.model_validate(fields)
     assert (spec.updates_per_batch, spec.policy_lag_bound) == (updates, bound)
+
+
+def test_every_algorithm_has_its_mathematics() -> None:
+    """A record without losses, or losses without a record, would fail only when a run names it."""
+    from daedalus.algorithms.registry import BUILDERS
+
+    assert BUILDERS.keys() == ALGORITHMS.keys()

@@ -1,0 +1,51 @@
+"""APPO: asynchronous proximal policy optimisation with V-trace targets, several passes over each batch."""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.algorithm import Forward, Losses
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, normalized
+from daedalus.algorithms.minibatches import Minibatch, minibatches
+from daedalus.algorithms.targets import vtrace_corrected_targets
+from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.protocol.spec import TrainingSpec
+
+
+class Appo:
+    """Schulman et al. (2017), algorithm 1, on rollouts that lag: targets are made once for all passes of a batch."""
+
+    def __init__(self, spec: TrainingSpec) -> None:
+        self._spec = spec
+
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
+        """See Algorithm."""
+        with torch.no_grad():
+            logits, values = forward(batch.observations, batch.initial_state, batch.starts)
+            log_probs, _ = categorical_log_probs(logits[:-1], batch.actions)
+            targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
+        for _ in range(self._spec.passes):
+            for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
+                # A batch of fewer rows than minibatches leaves some of them empty.
+                yield self._minibatch_losses(minibatch, forward) if minibatch.actions.numel() else None
+
+    def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
+        logits, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)
+        log_probs, entropies = categorical_log_probs(logits, minibatch.actions)
+        log_ratios = log_probs - minibatch.log_probs
+        clip_range, valid = self._spec.clip_range, minibatch.valid
+        return Losses(
+            policy_loss=clipped_policy_loss(log_ratios, self._weights(minibatch), valid, clip_range),
+            entropies=entropies,
+            values=values,
+            targets=minibatch.targets,
+            advantages=minibatch.advantages,
+            valid=valid,
+            clipped_fraction=clipped_fraction(log_ratios.detach(), valid, clip_range),
+        )
+
+    def _weights(self, minibatch: Minibatch) -> Tensor:
+        advantages = minibatch.advantages
+        return normalized(advantages, minibatch.valid) if self._spec.normalize_advantages else advantages

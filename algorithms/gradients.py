@@ -1,0 +1,71 @@
+"""Batch -> gradients of its updates, at the network's present parameters. Applying them is somebody else's part."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.algorithm import Losses
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.algorithms.losses import explained_variance, masked_mean, value_loss
+from daedalus.algorithms.precision import autocast
+from daedalus.algorithms.registry import build_algorithm
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.spec import TrainingSpec
+
+
+class Terms(NamedTuple):
+    """What one update's losses were: scalars without gradients."""
+
+    policy_loss: Tensor
+    value_loss: Tensor
+    entropy: Tensor
+    explained_variance: Tensor
+    value_mean: Tensor
+    advantage_std: Tensor
+    clipped_fraction: Tensor
+
+
+class GradientComputer:
+    """Computes an algorithm's gradients for one network."""
+
+    def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
+        self._spec, self._network = spec, network
+        self._algorithm = build_algorithm(spec)
+        self.parameters = FlatParameters(network.parameters())
+
+    def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms | None]:
+        """Leave the gradient of each update of a batch in `parameters.gradients`, and yield what its losses were.
+
+        The caller applies the gradient before it asks for the next. None: an update without a row to learn from.
+        """
+        for losses in self._algorithm.losses(batch, self._forward):
+            if losses is None:
+                yield None
+                continue
+            value_term = value_loss(losses.values, losses.targets, losses.valid, self._spec.value_loss)
+            entropy = masked_mean(losses.entropies, losses.valid)
+            loss = losses.policy_loss + self._spec.value_coefficient * value_term - entropy_bonus * entropy
+            self.parameters.gradients.zero_()
+            loss.backward()
+            yield _terms(losses, value_term, entropy)
+
+    def _forward(self, observations: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        with autocast(self._spec.precision, observations.device, self._network.convolutional):
+            return self._network(observations, state, starts)
+
+
+@torch.no_grad()
+def _terms(losses: Losses, value_term: Tensor, entropy: Tensor) -> Terms:
+    centred = losses.advantages - masked_mean(losses.advantages, losses.valid)
+    return Terms(
+        policy_loss=losses.policy_loss.detach(),
+        value_loss=value_term.detach(),
+        entropy=entropy.detach(),
+        explained_variance=explained_variance(losses.values, losses.targets, losses.valid),
+        value_mean=masked_mean(losses.values, losses.valid),
+        advantage_std=masked_mean(centred.square(), losses.valid).sqrt(),
+        clipped_fraction=losses.clipped_fraction,
+    )

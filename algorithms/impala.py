@@ -1,0 +1,12 @@
+"""IMPALA: asynchronous actor-critic, corrected for policy lag by V-trace."""
+
+from daedalus.algorithms.policy_gradient import PolicyGradient
+from daedalus.algorithms.targets import vtrace_corrected_targets
+from daedalus.protocol.spec import TrainingSpec
+
+
+class Impala(PolicyGradient):
+    """Espeholt et al. (2018), section 4."""
+
+    def __init__(self, spec: TrainingSpec) -> None:
+        super().__init__(spec, vtrace_corrected_targets)

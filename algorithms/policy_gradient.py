@@ -1,0 +1,37 @@
+"""One update from each batch by the policy gradient: what a2c, a3c and impala share."""
+
+from collections.abc import Iterator
+
+import torch
+
+from daedalus.algorithms.algorithm import Forward, Losses
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.losses import normalized, policy_gradient_loss
+from daedalus.algorithms.targets import TargetsFunction
+from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.protocol.spec import TrainingSpec
+
+
+class PolicyGradient:
+    """An Algorithm of a single pass; how its targets are corrected is the caller's choice."""
+
+    def __init__(self, spec: TrainingSpec, targets: TargetsFunction) -> None:
+        self._spec, self._targets = spec, targets
+
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
+        """See Algorithm."""
+        logits, values = forward(batch.observations, batch.initial_state, batch.starts)  # [T+1, B, ...]
+        log_probs, entropies = categorical_log_probs(logits[:-1], batch.actions)
+        with torch.no_grad():
+            targets = self._targets(self._spec, batch, log_probs, values)
+        advantages = targets.advantages
+        weights = normalized(advantages, batch.valid) if self._spec.normalize_advantages else advantages
+        yield Losses(
+            policy_loss=policy_gradient_loss(log_probs, weights, batch.valid),
+            entropies=entropies,
+            values=values[:-1],
+            targets=targets.values,
+            advantages=advantages,
+            valid=batch.valid,
+            clipped_fraction=torch.zeros((), device=values.device),
+        )

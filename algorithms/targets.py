@@ -1,0 +1,43 @@
+"""Value targets and advantages of a batch, as its algorithm corrects them."""
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.returns import Targets, actor_critic_targets, vtrace_targets
+from daedalus.protocol.spec import TrainingSpec
+
+TargetsFunction = Callable[[TrainingSpec, Batch, Tensor, Tensor], Targets]
+
+
+def uncorrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
+    """Return lambda-returns and their advantages, as if the behaviour policy were the target policy.
+
+    Args:
+      log_probs: [T, B], log pi(a_t | s_t) of the target policy; not used.
+      values: [T+1, B] under the weights being learned.
+    """
+    discounts = spec.discount_factor * (~batch.terminated)
+    return actor_critic_targets(batch.rewards, discounts, values[:-1], values[1:], batch.truncated, spec.trace_lambda)
+
+
+def vtrace_corrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
+    """Return V-trace targets and advantages, corrected for the lag of the behaviour policy.
+
+    Args:
+      log_probs: [T, B], log pi(a_t | s_t) of the target policy.
+      values: [T+1, B] under the weights being learned.
+    """
+    discounts = spec.discount_factor * (~batch.terminated)
+    return vtrace_targets(
+        log_probs - batch.behaviour_log_probs,
+        batch.rewards,
+        discounts,
+        values[:-1],
+        values[1:],
+        batch.truncated,
+        spec.trace_lambda,
+        spec.rho_clip,
+        spec.trace_clip,
+    )

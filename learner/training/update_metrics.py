@@ -1,0 +1,66 @@
+"""What the updates were like, and what the batches held, since somebody last asked. State; no I/O."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.gradients import Terms
+from daedalus.protocol.spaces import ArraySpace, Spaces
+
+GRADIENT_NORM = "gradient_norm"
+METRICS = (*Terms._fields, GRADIENT_NORM)
+
+
+class UpdateMetrics:
+    """Sums over updates, kept on the learner's device: reading them there would wait for each update."""
+
+    def __init__(self, spaces: Spaces, device: torch.device) -> None:
+        self._observation = spaces.observation
+        self._sums = torch.zeros(len(METRICS), device=device)
+        self._updates = 0
+        self._action_counts = torch.zeros(spaces.action.count, dtype=torch.int64, device=device)
+        self._newest: Tensor | None = None  # the first observation of the newest batch
+
+    def add_update(self, terms: Terms, gradient_norm: Tensor) -> None:
+        """Count an update that changed the parameters."""
+        self._sums += torch.stack([*terms, gradient_norm])
+        self._updates += 1
+
+    def add_batch(self, batch: Batch) -> None:
+        """Count the actions of a batch, and remember one of its observations."""
+        self._newest = batch.observations[0, 0]
+        chosen = torch.bincount(batch.actions.flatten(), batch.valid.flatten(), len(self._action_counts))
+        self._action_counts += chosen.to(torch.int64)
+
+    def take_means(self) -> dict[str, float]:
+        """Return means over the updates since the last call; empty if there were none."""
+        if not self._updates:
+            return {}
+        means = (self._sums / self._updates).tolist()
+        self._sums.zero_()
+        self._updates = 0
+        return dict(zip(METRICS, means, strict=True))
+
+    def take_action_counts(self) -> list[int]:
+        """Return how often each action was chosen in the batches since the last call."""
+        counts = self._action_counts.tolist()
+        self._action_counts.zero_()
+        return counts
+
+    def take_observation_image(self) -> np.ndarray | None:
+        """Return an observation of the newest batch, its stack side by side: uint8 [H, W] or [H, W, 3].
+
+        None where observations are no images, or there was no batch since the last call.
+        """
+        newest, self._newest = self._newest, None
+        return None if newest is None else _image(newest, self._observation)
+
+
+def _image(observation: Tensor, space: ArraySpace) -> np.ndarray | None:
+    colours = space.shape[2:] in ((1,), (3,))
+    if space.dtype != "uint8" or not (len(space.shape) == 2 or colours):
+        return None
+    frames = observation.cpu().numpy().reshape(space.frames, *space.shape)
+    side_by_side = np.concatenate(list(frames), axis=1)  # [H, k * W, ...]
+    return side_by_side[..., 0] if space.shape[2:] == (1,) else side_by_side

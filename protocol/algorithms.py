@@ -1,0 +1,47 @@
+"""The algorithms by name: what a process must know of one to schedule its work, without any mathematics.
+
+The learner's buffers, the actors and the command line read these records; the losses are in daedalus/algorithms.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Algorithm:
+    """How an algorithm's updates are scheduled.
+
+    Attributes:
+      name: as in `training.algorithm`.
+      summary: one line for `--help`.
+      synchronous: actors wait for each update; a batch is one rollout of every live actor (a barrier).
+      corrected: targets are corrected for policy lag (V-trace).
+      passes_over_batch: a batch makes `training.passes` x `training.minibatches` updates, not one.
+      batch_rollouts: rollouts in a batch where the run does not say; None: one per actor.
+    """
+
+    name: str
+    summary: str
+    synchronous: bool = False
+    corrected: bool = False
+    passes_over_batch: bool = False
+    batch_rollouts: int | None = None
+
+
+ALGORITHMS = {
+    algorithm.name: algorithm
+    for algorithm in (
+        Algorithm(name="a2c", summary="synchronous", synchronous=True),
+        Algorithm(name="a3c", summary="asynchronous", batch_rollouts=1),
+        Algorithm(name="impala", summary="asynchronous, corrected for policy lag", corrected=True),
+        Algorithm(
+            name="appo", summary="as impala, several passes over each batch", corrected=True, passes_over_batch=True
+        ),
+    )
+}
+
+
+def check_algorithm(name: str) -> str:
+    """Return `name` if there is such an algorithm. Raises ValueError, naming all of them, if not."""
+    if name not in ALGORITHMS:
+        raise ValueError(f"must be one of {', '.join(ALGORITHMS)}")
+    return name
