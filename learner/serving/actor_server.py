@@ -27,7 +27,7 @@ from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer
 from daedalus.learner.serving.snapshot_publisher import Publisher
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import EVALUATION_LIMITS
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -45,7 +45,6 @@ _logger = logging.getLogger(__name__)
 
 HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _WAITING_EVALUATIONS = 64  # at once; evaluators beyond that ask again later
-_EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)
 _SILENCE_SECONDS = 10.0  # without a word from anybody for so long, the session may be dead
 _RIVAL_SECONDS = 2.0  # for another learner of this run to say that it is there
 _HINT_SECONDS = 3.0  # without an actor for so long, say how to start one
@@ -231,7 +230,7 @@ class ActorServer:
     def _on_evaluation(self, request: Request) -> None:
         sender = keys.last_chunk(request.key)
         try:
-            message = decode(request.payload, _EVALUATION_LIMITS)
+            message = decode(request.payload, EVALUATION_LIMITS)
         except ProtocolError as error:
             request.reply(encode(Refusal(code="malformed", reason=str(error))))
             return

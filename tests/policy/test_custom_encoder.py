@@ -145,7 +145,7 @@ def test_shared_weights_and_constants_are_exported(build: Building) -> None:
     ("returned", "said"),
     [
         ("torch.linalg.eigvals(x[:, :4, None] * torch.ones(4)).real", "cannot be exported to ONNX"),
-        ("torch.atan(x.double()).float()", "of no use to actors: the program cannot be run"),
+        ("torch.atan(x.double()).float()", "actors cannot run the program of the encoder: the program cannot be run"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(build: Building, returned: str, said: str) -> None:

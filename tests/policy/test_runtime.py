@@ -16,7 +16,6 @@ from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import (
-    LOGITS,
     NEXT_STATE,
     OBSERVATIONS,
     STATE,
@@ -25,6 +24,7 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     program_hash,
 )
+from daedalus.policy.acting.sampling import LOGITS
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 
@@ -202,7 +202,7 @@ def test_a_program_from_elsewhere_runs_if_its_names_are_right() -> None:
 
 @pytest.mark.parametrize(("inputs", "output"), [(("pixels",), LOGITS), ((OBSERVATIONS,), "values")])
 def test_a_program_with_other_ends_is_refused(inputs: tuple[str, ...], output: str) -> None:
-    with pytest.raises(PolicyError, match="must turn 'observations' into 'logits'"):
+    with pytest.raises(PolicyError, match="must compute 'logits' from 'observations'"):
         OnnxRuntime(other_program(inputs, output))
 
 
