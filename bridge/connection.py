@@ -122,7 +122,8 @@ class ClientConnection:
     def _read(self, size: int, *, begun: bool) -> bytes:
         """Return exactly `size` bytes.
 
-        Returns b"" if the client disconnects before the first byte and the packet was not `begun`. Raises PacketError if the client stalls or disconnects within a packet.
+        Returns b"" if the client disconnects before the first byte and the packet was not `begun`. Raises PacketError
+        if the client stalls or disconnects within a packet.
         """
         data = bytearray()
         while len(data) < size:

@@ -18,9 +18,7 @@ class TorchRuntime:
         """Raise PolicyError if the network cannot be built, or has an encoder that the user supplies."""
         if ":" in spec.encoder:
             # The name came over the wire; importing it would execute code that another process chose.
-            raise PolicyError(
-                f"the encoder {spec.encoder!r} is custom code, not imported here: use --runtime onnx"
-            )
+            raise PolicyError(f"the encoder {spec.encoder!r} is custom code, not imported here: use --runtime onnx")
         torch.set_num_threads(1)
         try:
             self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
