@@ -6,11 +6,12 @@ learner computes it, at its newest weights, from a rollout of older ones: uncorr
 
 from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.targets import uncorrected_targets
+from daedalus.policy.network.distributions import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
 class A3c(PolicyGradient):
     """Mnih et al. (2016), algorithm S3, with the difference that this file's header states."""
 
-    def __init__(self, spec: TrainingSpec) -> None:
-        super().__init__(spec, uncorrected_targets)
+    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
+        super().__init__(spec, distribution, uncorrected_targets)

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 
-# The network on R rows of B environments: observations [R, B, ...], state [B, S], starts [R, B] -> logits [R, B, A],
-# values [R, B].
+# The network on R rows of B environments: observations [R, B, ...], state [B, S], starts [R, B] -> parameters of
+# the action distributions [R, B, P], values [R, B].
 Forward = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 

@@ -33,7 +33,7 @@ class GradientComputer:
 
     def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
         self._spec, self._network = spec, network
-        self._algorithm = build_algorithm(spec)
+        self._algorithm = build_algorithm(spec, network.distribution)
         self.parameters = FlatParameters(network.parameters())
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms | None]:

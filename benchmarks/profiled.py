@@ -63,7 +63,7 @@ def main() -> None:
     for name in ("encode", "decode"):
         setattr(codec, name, timed("codec", getattr(codec, name)))
     for owner, names in (
-        (zenoh_transport.ZenohTransport, ("send", "publish", "ask")),
+        (zenoh_transport.ZenohTransport, ("query_async", "publish", "query")),
         (zenoh_transport._ZenohRequest, ("reply",)),
         (zenoh_transport._ZenohInbox, ("take",)),
     ):

@@ -1,16 +1,20 @@
-"""What every process of the system does alike: stop when told to, and not outlive the one that started it."""
+"""What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
+import logging
 import os
 import signal
 import sys
 import threading
 import time
+import traceback
+
+_logger = logging.getLogger(__name__)
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and SIGINT set. Main thread only.
+    """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
-    The handlers only set the event, so a process ends by its own orderly path.
+    The signal handlers only set the event, so that the process closes its resources before it ends.
     """
     stop = threading.Event()
 
@@ -23,7 +27,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_with_parent(stop: threading.Event) -> None:
-    """Sets `stop` when standard input ends, which the parent holds open for as long as it lives."""
+    """Set `stop` when standard input ends: the parent holds it open as long as it lives."""
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -33,8 +37,30 @@ def exit_with_parent(stop: threading.Event) -> None:
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
 
 
+def exit_on_thread_exceptions() -> None:
+    """Make an exception in any thread end the process with status 1, with its traceback on standard error.
+
+    An exception that no thread handles is a fault of ours. Without this hook only its thread would end and the process
+    would idle; with it a supervisor restarts the process. Call this at the start of a command.
+    """
+
+    def end_process(arguments: threading.ExceptHookArgs) -> None:
+        name = arguments.thread.name if arguments.thread else "unknown"
+        try:
+            print(f"exception in thread {name}:", file=sys.stderr)
+            traceback.print_exception(arguments.exc_type, arguments.exc_value, arguments.exc_traceback)
+            sys.stderr.flush()
+            _logger.critical("exception in thread %s: %s: the process ends", name, arguments.exc_type.__name__)
+            sys.stdout.flush()
+        finally:
+            # Not sys.exit, which would end only this thread, nor an orderly end, which could wait for it for ever.
+            os._exit(1)
+
+    threading.excepthook = end_process
+
+
 def process_started() -> float:
-    """When this process began, on the monotonic clock; on systems that do not tell, now."""
+    """Return the start of this process on the monotonic clock, or the present time where the system does not tell."""
     now = time.monotonic()
     try:
         with (

@@ -11,15 +11,13 @@ from collections.abc import Callable
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.compact import Bits, bits_of, float32
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import LEARNER_LIMITS, SNAPSHOT_PART_LIMITS
 from daedalus.protocol.messages import CompactSnapshot, Message, Snapshot, SnapshotPart, SnapshotRequest
 from daedalus.transport.interface import Transport, TransportError
 
 _ANSWER_SECONDS = 60.0  # the learner makes a snapshot small first, and the link takes its time
 _AT_ONCE = 4  # parts under way: enough to fill a link of 4 Mbit/s whose answers take 200 ms
 _MOST_PARTS = 1 << 15
-_PART_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=1)
-_WHOLE_LIMITS = Limits(max_bytes=1 << 30)
 _RETRY_SECONDS = 1.0  # after a fetch that failed
 
 
@@ -91,7 +89,7 @@ class CompactSnapshotFetcher:
         if fetch != self._fetch or not self._busy:
             return none
         try:
-            message = None if data is None else decode(data, _PART_LIMITS)
+            message = None if data is None else decode(data, SNAPSHOT_PART_LIMITS)
         except ProtocolError:
             message = None
         if not isinstance(message, SnapshotPart):
@@ -113,7 +111,7 @@ class CompactSnapshotFetcher:
     def _assembled(self, encoded: bytes) -> Snapshot | None:
         """The snapshot that all the parts make; None if they make none."""
         try:
-            message = decode(encoded, _WHOLE_LIMITS)
+            message = decode(encoded, LEARNER_LIMITS)
             if not isinstance(message, CompactSnapshot):
                 return None
             base = None

@@ -9,7 +9,7 @@ import time
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -26,7 +26,6 @@ from daedalus.transport.interface import Transport, TransportError
 
 _logger = logging.getLogger(__name__)
 
-_LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
 _ANSWER_SECONDS = 5.0  # a query without an answer by then has none
 _UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
@@ -152,7 +151,7 @@ class LearnerQueries:
         Raises ActorError if the learner is of another version.
         """
         try:
-            return decode(data, _LIMITS)
+            return decode(data, LEARNER_LIMITS)
         except VersionMismatchError as error:
             raise ActorError(str(error)) from None
         except ProtocolError as error:

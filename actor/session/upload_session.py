@@ -11,11 +11,10 @@ from daedalus.actor.session.learner_queries import ActorError, LearnerLostError,
 from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Join
 from daedalus.transport.interface import Transport, TransportError
 
-_ANSWER_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
 _ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
 _SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
@@ -172,7 +171,7 @@ class UploadSession:
         answer = None
         if data is not None:
             try:
-                answer = decode(data, _ANSWER_LIMITS)
+                answer = decode(data, ACKNOWLEDGEMENT_LIMITS)
             except ProtocolError:
                 answer = None
         with self._changed:

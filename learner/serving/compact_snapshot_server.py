@@ -6,11 +6,10 @@ from collections.abc import Callable
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS
 from daedalus.protocol.messages import Refusal, SnapshotRequest
 from daedalus.transport.interface import Request
 
-_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)
 _WAITING_BYTES, _WAITING = 256 << 10, 4096
 _LEAVING_SECONDS = 0.5  # for an answer under way; its reader may be frozen, and others wait to leave as well
 
@@ -43,7 +42,7 @@ class CompactSnapshotServer:
     def _work(self) -> None:
         while (request := self._requests.take()) is not None:
             try:
-                message = decode(request.payload, _REQUEST_LIMITS)
+                message = decode(request.payload, SNAPSHOT_REQUEST_LIMITS)
             except ProtocolError as error:
                 request.reply(encode(Refusal(code="malformed", reason=str(error))))
                 continue

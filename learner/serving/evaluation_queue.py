@@ -5,12 +5,11 @@ from collections import deque
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import EVALUATION_LIMITS
 from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.transport.interface import Request
 
 _MAX_WAITING = 64  # evaluators beyond that ask again later
-_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)
 
 
 class EvaluationQueue:
@@ -35,7 +34,7 @@ class EvaluationQueue:
     def offer(self, request: Request) -> None:
         """Take in a message of an evaluator, or refuse it. Never waits."""
         try:
-            message = decode(request.payload, _LIMITS)
+            message = decode(request.payload, EVALUATION_LIMITS)
         except ProtocolError as error:
             request.reply(encode(Refusal(code="malformed", reason=str(error))))
             return

@@ -8,11 +8,9 @@ import threading
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import Join, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
-
-_JOIN_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
 
 
 class QueryResponses:
@@ -41,7 +39,7 @@ class QueryResponses:
     def join(self, data: bytes, now: float) -> bytes:
         """The answer to a Join: Welcome, or Refusal with the reason. Wakes who waits for actors."""
         try:
-            message = decode(data, _JOIN_LIMITS)
+            message = decode(data, JOIN_LIMITS)
         except ProtocolError as error:
             return encode(Refusal(code="mismatch", reason=str(error)))
         if not isinstance(message, Join):

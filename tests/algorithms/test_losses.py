@@ -16,7 +16,8 @@ from daedalus.algorithms.losses import (
     policy_gradient_loss,
     value_loss,
 )
-from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.policy.network.distributions import Categorical
+from daedalus.protocol.spaces import DiscreteSpace
 
 ROWS, COLUMNS = 5, 3
 CELLS = [(t, b) for t in range(ROWS) for b in range(COLUMNS)]
@@ -66,7 +67,7 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     logits = normal(random, ROWS, COLUMNS, 4).requires_grad_()
     actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
     advantages = normal(random)
-    log_probs, _ = categorical_log_probs(logits, actions)
+    log_probs, _ = Categorical(DiscreteSpace(count=4)).log_prob_and_entropy(logits, actions)
     policy_gradient_loss(log_probs, advantages, valid).backward()
     chosen = torch.nn.functional.one_hot(actions, 4)
     expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)

@@ -123,7 +123,7 @@ def test_a_damaged_best_is_named_and_the_newest_played(tmp_path: Path, capsys: p
     (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
     assert main([str(run), "--episodes", "1"]) == 0
     captured = capsys.readouterr()
-    assert "passed over" in captured.err
+    assert "skipped a damaged checkpoint" in captured.err
     assert "best_3.0_0000000001" in captured.err
     assert "gymnasium's counting_environment:Counting-v0, policy version 2: return 3." in captured.out
 
@@ -244,7 +244,7 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
     for name in ("returns", "policy_version", "seed"):
         assert of_the_run[name] == of_the_shipped[name]
     line = refused(1, "--pretrained", "cartpole")
-    assert "no pretrained policy 'cartpole': did you mean cartpole-1? there are cartpole-1" in line
+    assert "no pretrained policy 'cartpole': did you mean cartpole-1? choose from cartpole-1" in line
     assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
 
 

@@ -56,7 +56,7 @@ def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, a
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("router", "--listen", "tcp/0.0.0.0:0"), "could take part, unseen and unchecked"),
+        (("router", "--listen", "tcp/0.0.0.0:0"), "is unencrypted and open to every host"),
         (("router", "--listen", "tls/127.0.0.1:0"), "needs certificates: --tls DIR"),
         (("router", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
         (("exporter", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),

@@ -53,7 +53,7 @@ def test_an_actor_that_is_not_on_the_list_is_told_what_may_be_the_matter(
     assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
     late = start("actor", "--connect", tls, "--tls", certificates / "actor-late", "--timeout", 3)
     assert late.wait() == 1
-    late.expect("no learner answered .* does it .or its router. know the actor 'late'.* when it starts")
+    late.expect("no learner answered .* actor 'late' authorised by it .or by its router..* is read at start")
 
 
 def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certificates: Path, tmp_path: Path) -> None:
@@ -62,19 +62,19 @@ def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certi
     learner.expect("actors join with")
     to = ("actor", "--connect", tls)
     for arguments, status, message in (
-        ((*to, "--tls", strange / "actor-arm"), 1, "the two are of different CAs"),
-        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner: actor was expected"),
+        ((*to, "--tls", strange / "actor-arm"), 1, "the two ends use different CAs"),
+        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner, but actor is required"),
         ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': --name arm or arm.ANY"),
         (to, 2, "needs certificates: --tls DIR"),
-        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "wants --tls"),
+        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "requires --tls"),
         (
             ("actor", "--connect", "tls/nowhere.invalid:1", "--tls", certificates / "actor-arm", "--timeout", 0.1),
             1,
-            "resolves to no address",
+            "cannot be resolved to an address",
         ),
-        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
-        (("train", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
-        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner was expected"),
+        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "is unencrypted and open to every host"),
+        (("train", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "is unencrypted and open to every host"),
+        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner is required"),
     ):
         failed = start(*arguments)
         assert failed.wait() == status, failed.output

@@ -14,7 +14,6 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.distributions import categorical_log_probs
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Rollout, RolloutIdentity
@@ -58,8 +57,8 @@ def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had
         assert isinstance(rollout, Rollout)
         batch = join([rollout], spaces.observation)
         with torch.no_grad():
-            logits, _ = network(batch.observations, batch.initial_state, batch.starts)
-            log_probs, _ = categorical_log_probs(logits[:-1], batch.actions)
+            parameters, _ = network(batch.observations, batch.initial_state, batch.starts)
+            log_probs, _ = network.distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
         valid = rollout.valid
         assert np.ptp(log_probs.numpy()[valid]) > 0.1
         np.testing.assert_allclose(log_probs.numpy()[valid], rollout.behaviour_log_probs[valid], atol=1e-4)
