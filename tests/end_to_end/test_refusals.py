@@ -105,7 +105,7 @@ def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address:
         until(lambda: router.query(keys.join("run"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
         assert second.wait() == 1
-        second.expect("another learner serves run 'run' there already: stop it, or name this one otherwise")
+        second.expect("another learner serves run 'run' there already: stop it, or give this run another name")
         assert first.process.poll() is None
     finally:
         router.close()
