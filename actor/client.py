@@ -23,7 +23,7 @@ from typing import Any
 
 import gymnasium
 
-from daedalus.actor.collecting.client_player import ClientPlayer
+from daedalus.actor.collecting.client_collector import ClientPlayer
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys

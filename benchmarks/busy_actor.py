@@ -5,7 +5,7 @@ Says "busy" once it is. Part of learner_speed.py.
 
 import threading
 
-from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.processes import exit_with_parent
 from daedalus.learner.run.settings import read_preset, run_spec

@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
-from daedalus.actor.collecting.player import EnvironmentPlayer
+from daedalus.actor.collecting.collector import EnvironmentPlayer
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.cli.processes import stop_on_signals
 from daedalus.learner.run.settings import read_preset, run_spec

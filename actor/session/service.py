@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from daedalus.actor.collecting.player import EnvironmentPlayer, Player
+from daedalus.actor.collecting.collector import EnvironmentPlayer, Player
 from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries, RunOverError
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.upload_session import UploadSession

@@ -7,8 +7,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from daedalus.actor.session.in_flight_rollouts import Uploader
 from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
-from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits

@@ -18,8 +18,8 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
+from daedalus.actor.session.in_flight_rollouts import Uploader
 from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits

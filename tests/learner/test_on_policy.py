@@ -8,7 +8,7 @@ import pytest
 import torch
 from building import join
 
-from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime

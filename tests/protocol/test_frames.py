@@ -11,7 +11,7 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import Collector
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spec import EnvironmentSpec

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from daedalus.actor.collecting.player import Wait
+from daedalus.actor.collecting.collector import Wait
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.session.learner_queries import ActorError

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from daedalus.actor.session.uploader import Uploader
+from daedalus.actor.session.in_flight_rollouts import Uploader
 from daedalus.protocol.messages import Acknowledgement
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from processes import LIMIT, until
 
-from daedalus.actor.collecting.client_player import _HELD_ROLLOUTS, ClientPlayer
-from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.client_collector import _HELD_ROLLOUTS, ClientPlayer
+from daedalus.actor.collecting.environment_collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.program import export_program
