@@ -1,9 +1,9 @@
-"""A loop that owns its clock, trained from: `python examples/own_loop.py tcp/127.0.0.1:7447`.
+"""Train from a loop that the caller owns: `python examples/own_loop.py tcp/127.0.0.1:7447`.
 
-The learner, in another terminal, on any machine:
+Start the learner in another terminal, on any machine:
     daedalus learner cartpole --actors 1 --set collection.rollout_length=64 --set training.batch_rollouts=4
 
-CartPole stands for a robot here: what matters is that the loop calls the policy, and not the other way round.
+CartPole stands for a robot here: the loop calls the policy, instead of the actor stepping the environment.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The evaluator against a learner that is played by the test, over the memory transport."""
+"""Evaluator against a scripted learner, over the memory transport."""
 
 import contextlib
 import queue
@@ -53,15 +53,15 @@ MODEL = export_program(NETWORK, SPACES.observation)
 
 
 class ScriptedLearner:
-    """Welcomes evaluators and has a program; hands what they ask and tell to the test, which answers it."""
+    """A learner that welcomes evaluators and has a program; the test answers their requests and reports."""
 
     def __init__(self, network: MemoryNetwork, spec: RunSpec, epoch: int = 1) -> None:
         self.transport = MemoryTransport(network)
         self.epoch, self.spec = epoch, spec
         self.joins: queue.Queue[Join] = queue.Queue()
-        self.told: queue.Queue[Request] = queue.Queue()
+        self.received: queue.Queue[Request] = queue.Queue()
         self.present: list[str] = []
-        self.transport.serve(keys.evaluations("r", "*"), self.told.put)
+        self.transport.serve(keys.evaluations("r", "*"), self.received.put)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
         self.transport.serve(keys.join("r"), self._join)
@@ -76,7 +76,7 @@ class ScriptedLearner:
         request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
 
     def snapshot(self, version: int, action: int = 0, epoch: int | None = None) -> Snapshot:
-        """A policy that always plays one action, without a doubt but with others still possible."""
+        """A policy whose most probable action is always the same; other actions are possible too."""
         weights = {name: np.zeros(tuple(value.shape), np.float32) for name, value in NETWORK.named_parameters()}
         weights["policy_head.bias"][action] = 1.0
         return Snapshot(
@@ -87,12 +87,12 @@ class ScriptedLearner:
         )
 
     def receive(self) -> tuple[Message, Request]:
-        request = self.told.get(timeout=LIMIT)
+        request = self.received.get(timeout=LIMIT)
         assert request.key == keys.evaluations("r", "e")
         return decode(request.payload, Limits()), request
 
     def give(self, message: Message) -> None:
-        """Answers the next request for a policy."""
+        """Answer the next request for a policy."""
         asked, request = self.receive()
         assert asked == EvaluationRequest(evaluator="e")
         request.reply(encode(message))
@@ -120,17 +120,17 @@ class RunningEvaluator:
             self.error = error
 
     def join(self) -> None:
-        """Waits for its end, while nobody is there who would have to answer it."""
+        """Wait for the evaluator's end; no learner has to answer it."""
         self._thread.join(LIMIT)
         assert not self._thread.is_alive()
 
     def end(self, learner: ScriptedLearner) -> None:
-        """Stops it, whatever it may just have asked a learner."""
+        """Stop the evaluator, and answer what it may just have asked the learner."""
         self.stop.set()
         learner.transport.close()
         while self._thread.is_alive():
             with contextlib.suppress(queue.Empty):
-                learner.told.get(timeout=0.01).reply(encode(Refusal(code="finished", reason="")))
+                learner.received.get(timeout=0.01).reply(encode(Refusal(code="finished", reason="")))
 
 
 @pytest.fixture
@@ -150,17 +150,17 @@ def evaluator(network: MemoryNetwork, learner: ScriptedLearner) -> Iterator[Runn
     running.end(learner)
 
 
-def test_it_asks_plays_greedily_and_reports(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_evaluator_plays_greedily_and_reports(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(learner.snapshot(version=5, action=3))
     report = learner.receive_report()
     assert (report.evaluator, report.learner_epoch, report.policy_version) == ("e", 1, 5)
-    # Two environments play their first episode: rewards 0, 1 and 2, and 0.3 for the action at each step.
+    # Two environments play their first episode: rewards 0, 1 and 2, plus 0.3 for the action at each step.
     np.testing.assert_allclose(report.returns, [3.9, 3.9], rtol=1e-6)
     assert report.lengths.tolist() == [3, 3]
 
 
-def test_it_samples_where_the_run_says_so(network: MemoryNetwork) -> None:
-    """The policy nearly always plays 0; greedily it always would."""
+def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
+    """The greedy action is always 0; samples are nearly always 0."""
     spec = run_spec()
     sampling = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"actions": "sampled"})})
     learner = ScriptedLearner(network, sampling)
@@ -176,27 +176,25 @@ def test_it_samples_where_the_run_says_so(network: MemoryNetwork) -> None:
     assert seen - {0.0}
 
 
-def test_it_evaluates_again_with_the_policy_that_it_is_given_then(
-    learner: ScriptedLearner, evaluator: RunningEvaluator
-) -> None:
+def test_each_evaluation_uses_the_policy_given_then(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     for version, action in ((5, 3), (6, 1), (8, 0)):
         learner.give(learner.snapshot(version, action))
         report = learner.receive_report()
         assert report.policy_version == version
-        # The environments go on: a reset begins the episode after the last.
+        # The environments are reused: a reset begins the episode after the last.
         actions = (report.returns * 10).round() % 10
         assert actions.tolist() == [(action * report.lengths[0]) % 10] * 2
 
 
-def test_it_is_no_actor(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_evaluator_does_not_join_as_an_actor(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(learner.snapshot(0))
     learner.receive_report()
     assert learner.joins.get(timeout=LIMIT) == Join(actor="e", incarnation=7)
-    assert learner.joins.empty()  # once, and without spaces: it is not counted in
+    assert learner.joins.empty()  # once, and without spaces: it is no actor
     assert learner.present == []
 
 
-def test_it_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:
+def test_evaluator_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network, run_spec(episodes=150))  # more than there are environments
     evaluator = RunningEvaluator(network)
     learner.give(learner.snapshot(0))
@@ -204,29 +202,29 @@ def test_it_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> No
     evaluator.end(learner)
 
 
-def test_a_report_that_is_not_taken_is_told_and_the_next_is_played(
+def test_rejected_report_is_logged_and_the_next_evaluation_follows(
     learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
     learner.give(learner.snapshot(1))
     learner.receive_report("rejected", "no such version")
     learner.give(learner.snapshot(2))
     assert learner.receive_report().policy_version == 2
-    assert "the learner did not take the evaluation: no such version" in LINES
+    assert "the learner rejected the evaluation: no such version" in LINES
 
 
 # ----------------------------------------------------------------------------------------- losing the learner
 
 
-def test_a_learner_that_has_no_policy_yet_is_asked_again(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_learner_without_a_policy_is_asked_again(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(Refusal(code="not_ready", reason="no policy yet"))
     learner.give(learner.snapshot(1))
     assert learner.receive_report().policy_version == 1
 
 
-def test_the_policy_of_another_life_is_not_played_before_it_has_joined_that(
+def test_policy_of_another_learner_epoch_is_not_evaluated_before_joining_it(
     learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
-    learner.epoch = 2  # it lives anew, and has the same keys
+    learner.epoch = 2  # the learner restarted, with the same keys
     learner.give(learner.snapshot(9))
     assert [learner.joins.get(timeout=LIMIT) for _ in range(2)] == [Join(actor="e", incarnation=7)] * 2
     learner.give(learner.snapshot(3))
@@ -234,14 +232,14 @@ def test_the_policy_of_another_life_is_not_played_before_it_has_joined_that(
     assert (report.learner_epoch, report.policy_version) == (2, 3)
 
 
-def test_it_looks_for_a_learner_that_went_away(
+def test_evaluator_looks_for_a_learner_that_went_away(
     network: MemoryNetwork, learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
     learner.give(learner.snapshot(9))
     asked = learner.receive()
     learner.transport.close()
-    asked[1].reply(b"what a learner that dies might send")
-    while not any(text.startswith("ignored a message") for text in LINES):
+    asked[1].reply(b"a dying learner's answer")
+    while not any(text.startswith("ignored a damaged message") for text in LINES):
         evaluator.stop.wait(0.001)
     second = ScriptedLearner(network, run_spec(), epoch=2)
     second.give(second.snapshot(0))
@@ -250,7 +248,7 @@ def test_it_looks_for_a_learner_that_went_away(
     evaluator.end(second)
 
 
-def test_it_may_be_there_before_the_learner(network: MemoryNetwork) -> None:
+def test_evaluator_may_start_before_the_learner(network: MemoryNetwork) -> None:
     evaluator = RunningEvaluator(network)
     learner = ScriptedLearner(network, run_spec())
     learner.give(learner.snapshot(4))
@@ -258,7 +256,7 @@ def test_it_may_be_there_before_the_learner(network: MemoryNetwork) -> None:
     evaluator.end(learner)
 
 
-def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
+def test_evaluator_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:
     evaluator = RunningEvaluator(network, timeout=0.05)
     evaluator.join()
     assert isinstance(evaluator.error, ActorError)
@@ -271,14 +269,16 @@ def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
 @pytest.mark.parametrize(
     "answer", [RunEnded(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
 )
-def test_it_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message) -> None:
+def test_evaluator_ends_when_the_run_is_over(
+    learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message
+) -> None:
     learner.give(answer)
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "the run is over"
 
 
-def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
+def test_evaluator_stops_between_evaluations(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network, run_spec(seconds=1e6))
     evaluator = RunningEvaluator(network)
     learner.joins.get(timeout=LIMIT)
@@ -286,11 +286,11 @@ def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "stopped"
-    assert learner.told.empty()
+    assert learner.received.empty()
 
 
 class Endless:
-    """Environments whose episodes do not end; they tell the test that one is being played."""
+    """Environments whose episodes do not end, and that report when they are stepped."""
 
     count, spaces = 2, SPACES
 
@@ -317,7 +317,7 @@ class Brief(Endless):
     over = True
 
 
-def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
+def test_evaluator_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     network: MemoryNetwork, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endless = Endless()
@@ -330,10 +330,10 @@ def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     assert evaluator.error is None
     assert LINES[-1] == "stopped"
     assert endless.closed.is_set()
-    assert learner.told.empty()  # half an evaluation is none
+    assert learner.received.empty()  # an unfinished evaluation is not reported
 
 
-def test_every_evaluation_plays_other_episodes_and_the_same_ones_after_a_restart(
+def test_evaluations_have_different_seeds_and_the_same_ones_after_a_restart(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seeds = []

@@ -1,4 +1,4 @@
-"""The actor against a learner that is played by the test, over the memory transport."""
+"""ActorService against a scripted learner, over the memory transport."""
 
 import queue
 import threading
@@ -10,8 +10,9 @@ import pytest
 from log_lines import LINES
 from processes import LIMIT, until
 
-from daedalus.actor.session import learner_queries, service
-from daedalus.actor.session import upload_session as conversation
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.session import learner_queries, service, session_monitor
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
@@ -28,6 +29,7 @@ from daedalus.protocol.messages import (
     Program,
     Refusal,
     Rollout,
+    RolloutIdentity,
     RunEnded,
     Snapshot,
     SnapshotRequest,
@@ -46,7 +48,7 @@ SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=Disc
 
 @dataclass(frozen=True)
 class Policy:
-    """What a learner of it would send."""
+    """A network and the program that a learner would send."""
 
     network: ActorCritic
     model: bytes
@@ -61,7 +63,7 @@ POLICY = Policy.of(PolicySpec(), SPACES)
 
 
 class ScriptedLearner:
-    """Answers joins and programs; hands every rollout to the test, which answers it."""
+    """A learner that answers joins and programs, and leaves every rollout to the test to acknowledge."""
 
     def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY) -> None:
         self.transport = MemoryTransport(network)
@@ -116,12 +118,18 @@ def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
 
 
 class RunningActor:
-    def __init__(self, network: MemoryNetwork, timeout: float | None = None, link: LinkChoice = "auto") -> None:
+    def __init__(
+        self,
+        network: MemoryNetwork,
+        timeout: float | None = None,
+        link: LinkChoice = "auto",
+        collector: Collector | None = None,
+    ) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
         self.transport = MemoryTransport(network)
         config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
-        self._service = ActorService(config, self.transport, self.stop)
+        self._service = ActorService(config, self.transport, self.stop, collector)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -149,7 +157,7 @@ def actor(network: MemoryNetwork) -> Iterator[RunningActor]:
     running.join()
 
 
-def test_it_joins_twice_first_to_ask_then_with_what_it_found(network: MemoryNetwork) -> None:
+def test_actor_joins_without_spaces_and_then_with_them(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     asked, counted_in = learner.joins.get(timeout=LIMIT), learner.joins.get(timeout=LIMIT)
@@ -160,18 +168,18 @@ def test_it_joins_twice_first_to_ask_then_with_what_it_found(network: MemoryNetw
     assert actor.error is None
 
 
-def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_actor_keeps_a_window_of_numbered_rollouts_in_flight(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(3)
     first, second = learner.receive(), learner.receive()
     assert [first[0].identity.sequence, second[0].identity.sequence] == [0, 1]
     assert first[0].policy_version == 3
-    assert learner.rollouts.empty()  # two are unanswered: no third, however long this test thinks
+    assert learner.rollouts.empty()  # two are not acknowledged: there is no third, however long this test takes
     acknowledge(first[1], "accepted")
     assert learner.receive()[0].identity.sequence == 2
 
 
-def test_over_a_slow_link_more_are_under_way_before_the_first_answer(network: MemoryNetwork) -> None:
+def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(network: MemoryNetwork) -> None:
     actor = RunningActor(network, link="wan")
     learner = ScriptedLearner(network)
     learner.publish(3)
@@ -182,7 +190,7 @@ def test_over_a_slow_link_more_are_under_way_before_the_first_answer(network: Me
     actor.join()
 
 
-def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
+def test_actor_never_subscribes_on_a_link_measured_as_slow(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     followed: list[object] = []
@@ -192,13 +200,13 @@ def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
     learner.publish(3)
     actor = RunningActor(network)
     assert learner.receive()[0].policy_version == 3
-    assert any("a slow link" in text for text in LINES)
+    assert any(text.startswith("slow link: ") for text in LINES)
     assert followed == []
     actor.stop.set()
     actor.join()
 
 
-def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_rollout_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(3)
     first, second = learner.receive(), learner.receive()
@@ -207,7 +215,7 @@ def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetw
     assert [second[0].policy_version, learner.receive()[0].policy_version] == [3, 4]
 
 
-def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
+def test_frame_stack_and_memory_follow_the_run(network: MemoryNetwork) -> None:
     policy = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
     environment = SPEC.environment.model_copy(update={"frame_stack": 3})
     spec = SPEC.model_copy(update={"environment": environment, "policy": policy})
@@ -232,7 +240,7 @@ def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
     assert second.initial_state.any()
 
 
-def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_busy_rollout_is_sent_again(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     rollout, request = learner.receive()
@@ -243,7 +251,7 @@ def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, act
     np.testing.assert_array_equal(again.frames, rollout.frames)
 
 
-def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_actor_collects_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     versions = []
@@ -257,7 +265,64 @@ def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: Runnin
     assert versions[-1] >= 5
 
 
-def test_it_asks_for_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
+class SlowClient(EnvironmentCollector):
+    """A collector whose rollouts are complete only after weights of version 1 came."""
+
+    def has_rollout(self) -> bool:
+        return self._policy_version >= 1
+
+    def collect(self, identity: RolloutIdentity) -> Rollout | None:  # type: ignore[override] - as Collector has it
+        return super().collect(identity) if self.has_rollout() else None
+
+
+def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    actor = RunningActor(network, collector=SlowClient())
+    until(lambda: any("joined run" in text for text in LINES))
+    assert learner.rollouts.empty()
+    learner.publish(1)
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoding megabytes must not hold the lock that the transport's threads need."""
+    decoding, released = threading.Event(), threading.Event()
+
+    def slow_decode(data: bytes, limits: Limits) -> Message:
+        message = decode(data, limits)
+        if isinstance(message, Snapshot) and message.policy_version == 1:
+            decoding.set()
+            assert released.wait(LIMIT)
+        return message
+
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    monkeypatch.setattr(learner_queries, "decode", slow_decode)
+    try:
+        learner.publish(1)
+        assert decoding.wait(LIMIT)
+        answering = threading.Thread(target=acknowledge, args=(request, "accepted", 1), daemon=True)
+        answering.start()
+        answering.join(5.0)
+        assert not answering.is_alive(), "the transport's thread waited for the decoder"
+    finally:
+        released.set()
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_actor_requests_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     rollout, request = learner.receive()
@@ -268,7 +333,9 @@ def test_it_asks_for_a_snapshot_whose_push_was_lost(network: MemoryNetwork, acto
     assert rollout.policy_version == 1
 
 
-def test_fenced_by_the_same_learner_it_joins_again_and_goes_on(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_actor_fenced_by_the_same_learner_epoch_continues_its_sequence(
+    network: MemoryNetwork, actor: RunningActor
+) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -280,10 +347,10 @@ def test_fenced_by_the_same_learner_it_joins_again_and_goes_on(network: MemoryNe
         rollout, request = learner.receive()
         acknowledge(request, "accepted")
         sequences.append(rollout.identity.sequence)
-    assert sequences[-1] >= 3  # counted on: the learner knows the earlier ones
+    assert sequences[-1] >= 3  # the learner knows the earlier ones
 
 
-def test_synchronous_it_waits_for_the_next_version_and_asks_if_the_push_was_lost(network: MemoryNetwork) -> None:
+def test_synchronous_actor_requests_the_next_version_if_its_push_was_lost(network: MemoryNetwork) -> None:
     spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
     learner = ScriptedLearner(network, spec)
     actor = RunningActor(network)
@@ -296,7 +363,7 @@ def test_synchronous_it_waits_for_the_next_version_and_asks_if_the_push_was_lost
     actor.join()
 
 
-def test_synchronous_a_rejected_rollout_is_replaced_under_the_same_version(network: MemoryNetwork) -> None:
+def test_synchronous_actor_replaces_a_rejected_rollout_under_the_same_version(network: MemoryNetwork) -> None:
     spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
     learner = ScriptedLearner(network, spec)
     actor = RunningActor(network)
@@ -310,7 +377,7 @@ def test_synchronous_a_rejected_rollout_is_replaced_under_the_same_version(netwo
 
 
 @pytest.mark.parametrize("how", ["fenced", "left"])
-def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+def test_actor_joins_again_after_the_learner_restarted(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
     first = ScriptedLearner(network)
     first.publish(4)
     _, request = first.receive()
@@ -330,7 +397,7 @@ def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, acto
 
 
 @pytest.mark.parametrize("how", ["run_ended", "finished"])
-def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -344,7 +411,7 @@ def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningAc
     assert LINES[-1].startswith("the run is over")
 
 
-def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -353,10 +420,10 @@ def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, ac
     _, request = learner.receive()
     acknowledge(request, "accepted")
     learner.receive()
-    assert any("ignored a message" in text for text in LINES)
+    assert any("ignored a damaged message" in text for text in LINES)
 
 
-def test_a_refusal_ends_it_with_the_reason(network: MemoryNetwork) -> None:
+def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network)
     learner.refusal = Refusal(code="mismatch", reason="its environment has 3 choices")
     actor = RunningActor(network)
@@ -365,7 +432,7 @@ def test_a_refusal_ends_it_with_the_reason(network: MemoryNetwork) -> None:
     assert "its environment has 3 choices" in str(actor.error)
 
 
-def test_two_learners_ask_for_a_choice(network: MemoryNetwork) -> None:
+def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
         welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
@@ -375,13 +442,13 @@ def test_two_learners_ask_for_a_choice(network: MemoryNetwork) -> None:
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
 
 
-def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
+def test_actor_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:
     actor = RunningActor(network, timeout=0.05)
     actor.join()
     assert "no learner answered within 0.05 s" in str(actor.error)
 
 
-def test_in_quarantine_it_ends_with_the_reason(network: MemoryNetwork) -> None:
+def test_quarantine_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     learner.publish(0)
@@ -389,12 +456,10 @@ def test_in_quarantine_it_ends_with_the_reason(network: MemoryNetwork) -> None:
     request.reply(encode(Acknowledgement(verdict="quarantined", reason="3 unfit rollouts in a row")))
     actor.join()
     assert isinstance(actor.error, ActorError)
-    assert "takes nothing more of this actor: 3 unfit rollouts in a row" in str(actor.error)
+    assert "quarantined this actor: 3 unfit rollouts in a row" in str(actor.error)
 
 
-def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
-    network: MemoryNetwork, actor: RunningActor
-) -> None:
+def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     for count in range(60):
@@ -405,32 +470,33 @@ def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
             request.reply(encode(Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")))
         if count < 15:
             assert not any("rejected" in line for line in LINES)
-    told = [line for line in LINES if "rejected the last" in line]
-    assert len(told) == 1
-    assert "policy lag 31, at most 30 is allowed" in told[0]
-    assert "max_policy_lag" in told[0]
+    (warning,) = [line for line in LINES if "rejected the last" in line]
+    assert "policy lag 31, at most 30 is allowed" in warning
+    assert "max_policy_lag" in warning
 
 
-def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to_be_heard(
+def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
     network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(conversation, "_SILENCE_SECONDS", 0.1)
+    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 0.1)
     learner = ScriptedLearner(network)
     learner.publish(0)
     held = [learner.receive(), learner.receive()]  # never answered
     assert learner.joins.get(timeout=LIMIT).spaces is None
     assert learner.joins.get(timeout=LIMIT).spaces == SPACES
     for _ in range(3):
-        assert learner.joins.get(timeout=LIMIT).spaces is None  # it asks, and is answered: the learner takes its time
+        assert learner.joins.get(timeout=LIMIT).spaces is None  # the probe is answered: the learner is only slow
     assert not any("went away" in text for text in LINES)
-    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # nothing that makes sense
+    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # no valid message
     until(lambda: any("went away" in text for text in LINES))
     learner.transport.serve(keys.join("r"), learner._join)
     again = learner.receive()
-    assert again[0].identity in [rollout.identity for rollout, _ in held]  # sent again, to be taken at most once
+    assert again[0].identity in [rollout.identity for rollout, _ in held]  # the same rollout again
 
 
-def test_while_nobody_answers_it_tries_other_sessions(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actor_reopens_its_transport_while_nobody_answers(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
     reopened = threading.Semaphore(0)
 
