@@ -28,6 +28,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
 from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import authorization_hint, credentials_to_connect
 
 
@@ -61,9 +62,8 @@ class Client:
         Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
         credentials = credentials_to_connect([connect], tls, "actor")
-        host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
         config = ActorConfig(
-            name=keys.check_name(name or f"{host}.{os.getpid()}", "actor name"),
+            name=keys.check_name(name or _default_name(credentials), "actor name"),
             incarnation=secrets.randbits(62),
             run=run,
             link=link,
@@ -143,3 +143,8 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _default_name(credentials: Credentials | None) -> str:
+    host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
+    return f"{host}.{os.getpid()}"

@@ -75,8 +75,8 @@ def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, Enviro
             **limit,
             **spec.kwargs,
         )
-    except Exception as error:  # broad: ALE raises exceptions of many kinds for its options, and names no base class
-        raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be created: {first_line(error)}") from None
+    except Exception as error:  # broad: ALE's options raise many kinds of exception without a common base
+        raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be created: {first_line(error)}") from error
     return AleEnvironments(environment), spec.model_copy(update={"action_repeat": 1, "grey": False, "resize": None})
 
 

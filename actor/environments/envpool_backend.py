@@ -130,12 +130,10 @@ def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments
         return bare, spec
     except EnvironmentSetupError:
         raise
-    except (
-        Exception
-    ) as error:  # broad: envpool raises exceptions of many kinds for its options, and names no base class
+    except Exception as error:  # broad: envpool's options raise many kinds of exception without a common base
         raise EnvironmentSetupError(
             f"environment {spec.id} of envpool cannot be created: {first_line(error)}"
-        ) from None
+        ) from error
 
 
 def _make_atari(envpool: Any, spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:

@@ -165,7 +165,7 @@ def make_gymnasium(
         remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
         raise EnvironmentSetupError(f"environment {spec.id} needs a package that is not installed: {remedy}") from None
     except Exception as error:  # broad: the constructor of a user's environment may raise anything
-        raise EnvironmentSetupError(f"environment {spec.id} cannot be created: {first_line(error)}") from None
+        raise EnvironmentSetupError(f"environment {spec.id} cannot be created: {first_line(error)}") from error
     if environment.metadata.get("autoreset_mode") is not AutoresetMode.NEXT_STEP:
         environment.close()
         raise EnvironmentSetupError(

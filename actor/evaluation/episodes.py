@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_counter import EpisodeCounter
+from daedalus.actor.collecting.episode_counter import EpisodeCounter, FinishedEpisodes
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import FrameStack
@@ -59,17 +59,13 @@ def play_episodes(
       progress: called after every step with the number of episodes counted and their mean return (NaN at first).
     """
     count = environments.count
-    share = np.full(count, episodes // count)
-    share[: episodes % count] += 1
     environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
     random = np.random.default_rng(action_seed) if sampled else None
-    counter = EpisodeCounter(count)
-    returns, lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
-    mean = float("nan")
+    counter, counted = EpisodeCounter(count), _CountedEpisodes(episodes, count)
     stack = FrameStack(environments.spaces.observation, count)
     state = np.zeros((count, runtime.state_size), np.float32)
     stack.push(environments.reset(int(environment_seed)), np.ones(count, np.bool_))
-    while share.any():
+    while not counted.complete:
         valid = counter.valid
         actions, _, next_state = runtime.act(stack.observations, state, random)
         frames, rewards, terminated, truncated = environments.step(actions)
@@ -79,11 +75,30 @@ def play_episodes(
         counter.step(rewards, terminated, truncated)
         ended = terminated | truncated
         if ended.any():
-            finished = counter.take_finished()
-            counted = share[ended] > 0
-            returns = np.concatenate([returns, finished.returns[counted]])
-            lengths = np.concatenate([lengths, finished.lengths[counted]])
-            share[ended] = np.maximum(share[ended] - 1, 0)
-            mean = float(returns.mean(dtype=np.float64)) if len(returns) else mean
-        progress(len(returns), mean)
-    return Evaluation(returns=returns, lengths=lengths)
+            counted.add(ended, counter.take_finished())
+        progress(len(counted.returns), counted.mean_return)
+    return Evaluation(returns=counted.returns, lengths=counted.lengths)
+
+
+class _CountedEpisodes:
+    """The results of the episodes that count: of each environment, its share from its first episode on."""
+
+    def __init__(self, episodes: int, count: int) -> None:
+        self._missing = np.full(count, episodes // count)  # [E] episodes of each environment's share
+        self._missing[: episodes % count] += 1
+        self.returns, self.lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
+        self.mean_return = float("nan")
+
+    @property
+    def complete(self) -> bool:
+        """Whether every environment has played its share."""
+        return not self._missing.any()
+
+    def add(self, ended: np.ndarray, finished: FinishedEpisodes) -> None:
+        """Add the episodes that finished in the environments `ended` [E] bool, those beyond a share excepted."""
+        counted = self._missing[ended] > 0
+        self.returns = np.concatenate([self.returns, finished.returns[counted]])
+        self.lengths = np.concatenate([self.lengths, finished.lengths[counted]])
+        self._missing[ended] = np.maximum(self._missing[ended] - 1, 0)
+        if len(self.returns):
+            self.mean_return = float(self.returns.mean(dtype=np.float64))
