@@ -353,7 +353,7 @@ def test_a_signal_ends_it(start: Start, tmp_path: Path) -> None:
         (["RUN", "--episodes", 0], 2, "--episodes must be at least 1, not 0"),
         (["RUN", "--envs", 0], 2, "--envs must be from 1 to 4096, not 0"),
         (["RUN", "--seed", -1], 2, "--seed must not be negative"),
-        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, not as 'x.avi'"),
+        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, unlike 'x.avi'"),
         (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
         (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot go together"),
         (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),

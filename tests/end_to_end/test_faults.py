@@ -118,7 +118,7 @@ def test_an_actor_that_sends_what_no_healthy_one_would_is_shut_out_and_says_why(
     learner = start("learner", "--env", "nan_environment:Broken-v0", "--listen", address, "--run-dir", "run", *ENDLESS)
     actor = start("actor", "--connect", address, "--name", "broken")
     assert actor.wait() == 1
-    assert "takes nothing more of this actor: 3 unfit rollouts in a row, the last: rewards has a value" in actor.output
+    assert "quarantined this actor: 3 unfit rollouts in a row, the last: rewards has a value" in actor.output
     told = actor_status(status(), "broken")
     assert told["quarantined"].endswith("rewards has a value that is not finite")
     assert told["rollouts_rejected"]["unfit"] == 3  # beside what was in flight and not looked at

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from building import join
+from collectors import started_collector
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
@@ -48,12 +48,16 @@ def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had
     with torch.no_grad():
         network.policy_head.weight.mul_(100.0)  # far from uniform, so that what was seen shows
     weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
-    collector = Collector(
-        environments, make_runtime(runtime, POLICIES[policy], spaces, network), spec, rollout_length=5, seed=2
+    collector = started_collector(
+        spec,
+        make_runtime(runtime, POLICIES[policy], spaces, network),
+        rollout_length=5,
+        seed=2,
+        weights=weights,
+        environments=environments,
     )
-    collector.load(weights)
     for _ in range(6):
-        rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY, 0)), Limits()))
+        rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY)), Limits()))
         assert isinstance(rollout, Rollout)
         batch = join([rollout], spaces.observation)
         with torch.no_grad():

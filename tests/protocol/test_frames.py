@@ -6,12 +6,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from collectors import started_collector
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits
@@ -103,10 +103,10 @@ class Spectator:
 def collected(films: Films, rows: int, count: int) -> tuple[list[Rollout], np.ndarray]:
     """Rollouts as they reach the learner, and the observations that their actions were chosen from."""
     spectator = Spectator()
-    collector = Collector(films, spectator, EnvironmentSpec(id="Film-v0"), rollout_length=rows, seed=1)
+    collector = started_collector(EnvironmentSpec(id="Film-v0"), spectator, rollout_length=rows, environments=films)
     rollouts = []
     for _ in range(count):
-        came = decode(encode(collector.collect(IDENTITY, 0)), Limits())
+        came = decode(encode(collector.collect(IDENTITY)), Limits())
         assert isinstance(came, Rollout)
         rollouts.append(came)
     return rollouts, np.stack(spectator.seen)
