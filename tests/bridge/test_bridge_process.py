@@ -51,7 +51,7 @@ def test_presence_of_a_killed_client_ends(start: Start, address: str, router: Tr
         client.sendall(GREETING + encode_packet(Packet(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing/7")))
         until(lambda: present.get("daedalus/r/actors/wing/7"))
     until(lambda: present["daedalus/r/actors/wing/7"] is False)
-    bridge.expect(" went")
+    bridge.expect(" disconnected$")
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_both_runtimes_choose_the_same_actions(
         np.testing.assert_allclose(state, torch_state, atol=2e-5, rtol=0)
 
 
-def test_the_state_comes_back_to_what_it_was_made_from(policy: Policy) -> None:
+def test_state_is_carried_from_row_to_row(policy: Policy) -> None:
     rows = 5
     for runtime in policy.runtimes():
         runtime.load(policy.weights())
