@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
-from daedalus.protocol.algorithms import ALGORITHMS, Algorithm, check_algorithm
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
@@ -238,7 +238,7 @@ class RunSpec(Specification):
         return self
 
     @property
-    def algorithm(self) -> Algorithm:
+    def algorithm(self) -> AlgorithmRecord:
         """How the run's updates are scheduled."""
         return ALGORITHMS[self.training.algorithm]
 
