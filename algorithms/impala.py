@@ -6,7 +6,7 @@ from daedalus.protocol.spec import TrainingSpec
 
 
 class Impala(PolicyGradient):
-    """Espeholt et al. (2018), section 4."""
+    """Actor-critic with V-trace targets: Espeholt et al. (2018), section 4."""
 
     def __init__(self, spec: TrainingSpec) -> None:
         super().__init__(spec, vtrace_corrected_targets)

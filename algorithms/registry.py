@@ -1,4 +1,4 @@
-"""The algorithms by name. A record of the same name in daedalus/protocol/algorithms.py says how each is scheduled."""
+"""Algorithms by name. The record of the same name in daedalus/protocol/algorithms.py describes the scheduling."""
 
 from collections.abc import Callable
 
@@ -13,5 +13,5 @@ BUILDERS: dict[str, Callable[[TrainingSpec], Algorithm]] = {"a2c": A2c, "a3c": A
 
 
 def build_algorithm(spec: TrainingSpec) -> Algorithm:
-    """Return the algorithm that the run names."""
+    """Return the algorithm named by `spec.algorithm`."""
     return BUILDERS[spec.algorithm](spec)
