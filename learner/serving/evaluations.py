@@ -22,7 +22,7 @@ class Evaluations:
     newest: dict[str, float] = field(default_factory=dict)  # as columns of learner/reporting/metrics.py, until taken
 
     @property
-    def kept(self) -> set[Path]:
+    def checkpoints_in_use(self) -> set[Path]:
         """The checkpoints that must not be pruned."""
         return {directory for directory, _, _ in self.playing.values()}
 

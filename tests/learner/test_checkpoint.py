@@ -82,11 +82,11 @@ def test_a_damaged_newest_is_named_and_the_one_before_it_is_used(tmp_path: Path)
 
 
 def test_without_a_whole_one_there_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DamagedError, match="no checkpoint"):
+    with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
     for version in (1, 2):
         flip(save(tmp_path, version) / "seal", 0)
-    with pytest.raises(DamagedError, match="no checkpoint"):
+    with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
     assert len(LINES) == 2
 

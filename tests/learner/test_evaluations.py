@@ -35,7 +35,7 @@ class Run:
             state={},
             counters={},
             keep=keep,
-            also_keep=self.evaluations.kept,
+            also_keep=self.evaluations.checkpoints_in_use,
         )
 
     def begin(self, version: int, evaluator: str = "e") -> Path:
@@ -258,4 +258,4 @@ def test_evaluators_that_never_report_hold_a_bounded_number_of_checkpoints(tmp_p
     evaluations = Evaluations(learner_epoch=1)
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
-    assert evaluations.kept == {tmp_path / str(number) for number in range(84, 100)}
+    assert evaluations.checkpoints_in_use == {tmp_path / str(number) for number in range(84, 100)}

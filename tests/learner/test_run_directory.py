@@ -86,7 +86,7 @@ def test_a_new_run_directory_says_what_the_run_is_and_what_it_ran_on(tmp_path: P
 def test_an_existing_run_directory_is_refused_and_left_alone(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     run_directory.create(directory, run_spec(seed=1))
-    with pytest.raises(SettingsError, match=r"exists: continue it with `daedalus resume .*run`"):
+    with pytest.raises(SettingsError, match=r"exists: continue the run with `daedalus resume .*run`"):
         run_directory.create(directory, run_spec(seed=2))
     assert run_directory.read_config(directory).training.seed == 1
 

@@ -44,7 +44,7 @@ def test_an_unknown_preset_is_answered_with_the_nearest() -> None:
 
 
 def test_a_preset_like_no_other_is_answered_with_all_of_them() -> None:
-    with pytest.raises(SettingsError, match=rf"there are {', '.join(preset_names())}"):
+    with pytest.raises(SettingsError, match=rf"the presets are {', '.join(preset_names())}"):
         read_preset("zzz")
 
 
@@ -59,7 +59,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         read_preset(str(tmp_path / "missing.toml"))
     for content in (b"= nonsense", b"a = '\xff'"):
         (tmp_path / "bad.toml").write_bytes(content)
-        with pytest.raises(SettingsError, match=r"bad\.toml is not TOML"):
+        with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
             read_file(tmp_path / "bad.toml")
 
 
@@ -119,7 +119,7 @@ def test_an_unknown_setting_is_answered_with_the_nearest() -> None:
 
 
 def test_an_unknown_setting_like_no_other_is_answered_with_all_of_its_section() -> None:
-    assert "there are activation, encoder, hidden" in complaint("policy.zzz=1")
+    assert "the settings are activation, encoder, hidden" in complaint("policy.zzz=1")
 
 
 @pytest.mark.parametrize(
