@@ -366,6 +366,6 @@ def test_a_service_without_actors_says_so_by_its_exit_status(start: Start, addre
 
     def unhealthy() -> bool:
         asked = start("status", "--connect", address, "--quiet")
-        return asked.wait() == 3 and "no actor has taken part for" in asked.output
+        return asked.wait() == 3 and "no live actor for" in asked.output
 
     until(unhealthy)

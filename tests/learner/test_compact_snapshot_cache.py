@@ -131,7 +131,7 @@ def test_what_is_said_instead_of_a_snapshot_is_passed_on(instead: Message) -> No
 
 def test_what_it_keeps_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compact_cache, "_HELD_BYTES", 4 * 2 * (60_000 + 7))
-    monkeypatch.setattr(compact_cache, "_MOST_READERS", 3)
+    monkeypatch.setattr(compact_cache, "_MAX_READERS", 3)
     cache = CompactSnapshotCache(5)
     for version in range(10):
         fetch(cache, snapshot(version), actor=f"a{version}")

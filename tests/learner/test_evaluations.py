@@ -146,7 +146,7 @@ def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, m
     answer, text = run.report(2, 9.0)
     monkeypatch.undo()
     assert answer.verdict == "accepted"
-    assert text.endswith("the best so far, but it could not be kept (No space left on device)")
+    assert text.endswith("the best so far, but its checkpoint was not kept: No space left on device")
     best = best_checkpoints(run.directory)[0]
     assert best.name == "best_5.0_0000000001"
     run.save(3)
@@ -202,12 +202,12 @@ def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str,
 
 def test_an_evaluator_that_was_given_nothing_is_rejected(run: Run) -> None:
     run.save(1)
-    assert_not_taken(run, *run.report(1, 9.0), "rejected", "'e' was not given version 1 to play")
+    assert_not_taken(run, *run.report(1, 9.0), "rejected", "evaluator 'e' has no evaluation of policy version 1")
 
 
 def test_another_version_is_rejected_and_the_right_one_still_awaited(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(2, 9.0), "rejected", "was not given version 2")
+    assert_not_taken(run, *run.report(2, 9.0), "rejected", "no evaluation of policy version 2")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 
@@ -220,7 +220,7 @@ def test_a_report_counts_once(run: Run) -> None:
 
 def test_another_life_of_the_learner_is_fenced(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another life")
+    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another learner epoch")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 

@@ -84,7 +84,7 @@ def test_who_comes_without_spaces_only_asks_what_is_played() -> None:
     fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 3.0)
     assert fleet.join(Join(actor="a", incarnation=2), 9.0) is None
     actor = fleet.actors["a"]
-    assert (actor.incarnation, actor.lives, actor.last_seen, actor.environments) == (1, 1, 3.0, 2)
+    assert (actor.incarnation, actor.incarnations, actor.last_seen, actor.environments) == (1, 1, 3.0, 2)
 
 
 def test_the_first_actor_with_spaces_decides_them() -> None:
@@ -122,17 +122,17 @@ def test_a_number_of_environments_out_of_range_is_refused() -> None:
 def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected() -> None:
     fleet = joined_fleet("a")
     actor = fleet.actors["a"]
-    assert fleet.expected(identity("a")) is actor
+    assert fleet.find(identity("a")) is actor
     actor.sequences.add(0)
     fleet.set_present("a", 1, False)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
-    assert fleet.expected(identity("a")) is actor  # who only asks what is played replaces nobody
-    assert fleet.expected(identity("a", incarnation=2)) is None
+    assert fleet.find(identity("a")) is actor  # who only asks what is played replaces nobody
+    assert fleet.find(identity("a", incarnation=2)) is None
     assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=3), 0.0) is None
-    assert fleet.expected(identity("a")) is None
-    assert fleet.expected(identity("a", incarnation=2)) is actor
+    assert fleet.find(identity("a")) is None
+    assert fleet.find(identity("a", incarnation=2)) is actor
     assert 0 not in actor.sequences
-    assert actor.lives == 2
+    assert actor.incarnations == 2
 
 
 def test_joining_again_in_the_same_life_forgets_nothing() -> None:
@@ -140,8 +140,8 @@ def test_joining_again_in_the_same_life_forgets_nothing() -> None:
     fleet.actors["a"].sequences.add(0)
     assert fleet.join(Join(actor="a", incarnation=1), 1.0) is None
     assert 0 in fleet.actors["a"].sequences
-    assert fleet.actors["a"].lives == 1
-    assert fleet.expected(identity("a")) is not None
+    assert fleet.actors["a"].incarnations == 1
+    assert fleet.find(identity("a")) is not None
 
 
 def test_lives_without_end_are_not_all_remembered() -> None:
@@ -153,7 +153,7 @@ def test_lives_without_end_are_not_all_remembered() -> None:
 
 
 def test_an_actor_never_heard_of_is_not_expected() -> None:
-    assert joined_fleet("a").expected(identity("b")) is None
+    assert joined_fleet("a").find(identity("b")) is None
 
 
 def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
@@ -189,7 +189,7 @@ def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_a
         fleet.set_present(f"a{number}", 1, True)
     refusal = join(most)
     assert refusal is not None
-    assert (refusal.code, refusal.reason) == ("full", f"{most} actors take part already")
+    assert (refusal.code, refusal.reason) == ("full", f"{most} actors have already joined")
     for away in (7, 5, 9):
         fleet.set_present(f"a{away}", 1, False)
     assert join(most) is None
@@ -211,7 +211,7 @@ def test_a_name_is_taken_for_as_long_as_the_life_that_bears_it_is_there() -> Non
     fleet.set_present("a", 1, False)
     assert fleet.join(other, 4.0) is None
     assert fleet.live == {"a"}
-    assert fleet.actors["a"].lives == 2
+    assert fleet.actors["a"].incarnations == 2
 
 
 def test_the_name_of_one_that_is_shut_out_is_free() -> None:

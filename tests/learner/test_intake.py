@@ -32,7 +32,7 @@ class Harness:
     def memory(self) -> list[Any]:
         """All that the fleet knows, but for what a rejection is to leave: when it was, and the count of it."""
         told = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
-        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None, "unfit": None} for each in told]]
+        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None, "consecutive_unfit": None} for each in told]]
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_what_is_no_message_is_malformed(harness: Harness, data: bytes) -> None:
 
 
 def test_another_message_is_no_rollout(harness: Harness) -> None:
-    assert_rejected(harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "not a rollout")
+    assert_rejected(harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "the message is not a rollout")
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_another_message_is_no_rollout(harness: Harness) -> None:
     ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
 def test_other_numbers_of_rows_and_environments_are_malformed(harness: Harness, rollout: Rollout) -> None:
-    reason = f"it has {rollout.rows} rows of {rollout.environments} environments, this run has {ROWS} of"
+    reason = f"the rollout has {rollout.rows} rows of {rollout.environments} environments, expected {ROWS} rows of"
     assert_rejected(harness, encode(rollout), "unfit", reason)
 
 
@@ -142,7 +142,7 @@ def test_other_numbers_of_rows_and_environments_are_malformed(harness: Harness, 
 def test_other_frames_are_malformed_and_both_are_named(harness: Harness, rollout: Rollout) -> None:
     theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
     verdict = assert_rejected(harness, encode(rollout), "unfit", theirs)
-    assert f"this run has float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
+    assert f"expected float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
 
 def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(harness: Harness) -> None:
@@ -174,12 +174,12 @@ def test_a_log_probability_that_rounding_put_above_0_is_accepted(harness: Harnes
 
 
 def test_a_policy_version_yet_to_come_is_malformed(harness: Harness) -> None:
-    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "yet to come")
+    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "is newer than the learner's version")
 
 
 @pytest.mark.parametrize("size", [1, 7])
 def test_a_memory_where_the_policy_has_none_is_malformed(harness: Harness, size: int) -> None:
-    reason = f"its policy remembers {size} numbers, this run's 0"
+    reason = f"initial_state has size {size}, expected 0"
     assert_rejected(harness, encode(good(state_size=size)), "unfit", reason)
 
 
@@ -188,7 +188,7 @@ def test_a_memory_of_another_size_is_malformed(harness: Harness, size: int) -> N
     harness.intake.state_size = 5
     verdict = harness.receive(encode(good(state_size=size)))
     assert isinstance(verdict, Rejected)
-    assert verdict.reason == f"its policy remembers {size} numbers, this run's 5"
+    assert verdict.reason == f"initial_state has size {size}, expected 5"
     assert isinstance(harness.receive(encode(good(state_size=5))), Rollout)
 
 
@@ -400,7 +400,7 @@ def test_rewards_beyond_what_they_are_clipped_to_are_unfit(harness: Harness) -> 
     assert isinstance(harness.receive(encode(within)), Rollout)
     verdict = harness.receive(encode(beyond))
     assert isinstance(verdict, Rejected)
-    assert verdict.reason == "rewards has a value beyond the 0.5 that they are clipped to"
+    assert verdict.reason == "rewards has a value outside the clip range of +-0.5"
 
 
 def test_an_episode_without_a_step_is_unfit(harness: Harness) -> None:

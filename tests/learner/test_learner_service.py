@@ -120,7 +120,7 @@ def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> No
     finally:
         house.end()
     assert "the best so far" in "\n".join(LINES)
-    assert "could not be kept" not in "\n".join(LINES)
+    assert "was not kept" not in "\n".join(LINES)
 
 
 def test_the_evaluator_is_no_part_of_the_training(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_ro
     recording.record(row(1), Details())
     recording.record(row(2), Details())
     recording.record(row(3), Details())
-    until(lambda: any("cannot be written" in line for line in LINES))
+    until(lambda: any("metrics not written" in line for line in LINES))
     until(lambda: recording._rows.empty())
     full.clear()
     recording.record(row(4), Details())
@@ -87,7 +87,7 @@ def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_ro
     recording.close()
     told = [line for line in LINES if "metrics" in line]
     assert told == [
-        "metrics cannot be written (No space left on device); training goes on",
+        "metrics not written: No space left on device; training continues, and writing is retried every 0 s",
         "metrics are written again",
     ]
     assert env_steps(tmp_path)[-2:] == ["4", "5"]

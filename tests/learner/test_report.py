@@ -35,14 +35,14 @@ def test_rates_are_since_the_last_look() -> None:
     assert meter.rates == {}
     counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4, 1)
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
-    assert meter.look(counters, joined_fleet(), 12.0) == expected
+    assert meter.measure(counters, joined_fleet(), 12.0) == expected
     assert meter.rates == expected
-    assert set(meter.look(counters, joined_fleet(), 13.0).values()) == {0.0}
+    assert set(meter.measure(counters, joined_fleet(), 13.0).values()) == {0.0}
 
 
 def test_two_looks_at_once_divide_by_no_0() -> None:
     meter = RateMeter(trained_counters(), 10.0)
-    assert meter.look(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
+    assert meter.measure(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
 
 
 def test_episode_statistics_are_those_of_the_newest_episodes() -> None:
@@ -62,7 +62,7 @@ def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False)
-    rates = RateMeter(counters, 0.0).look(counters, fleet, 1.0)
+    rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
     learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
@@ -80,7 +80,7 @@ def test_a_row_at_the_start_leaves_out_what_is_unknown() -> None:
 def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    health = Health(started=10.0, updated=24.0, attended=24.0, saved=20.0)
+    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0)
     status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
@@ -90,18 +90,18 @@ def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
     assert [actor.actor for actor in status.actors] == ["a", "b"]
 
 
-HEALTHY = Health(started=0.0, updated=100.0, attended=100.0)
+HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
 
 
 @pytest.mark.parametrize(
     ("changed", "live", "problems"),
     [
         ({}, 2, ()),
-        ({"attended": 97.0}, 0, ()),
-        ({"attended": 90.0}, 0, ("no actor has taken part for 15 s",)),
-        ({"attended": 90.0}, 1, ()),
+        ({"actor_seen": 97.0}, 0, ()),
+        ({"actor_seen": 90.0}, 0, ("no live actor for 15 s",)),
+        ({"actor_seen": 90.0}, 1, ()),
         ({"updated": 44.0}, 1, ("no update for 61 s",)),
-        ({"updated": 44.0, "attended": 44.0}, 0, ("no actor has taken part for 61 s",)),
+        ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
         ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
         ({"save_fault": "No space left"}, 1, ("checkpoints cannot be saved: No space left",)),
     ],
@@ -116,10 +116,10 @@ def test_the_meter_tells_each_actor_its_own_rate() -> None:
     counters, fleet = trained_counters(), joined_fleet("a", "b")
     meter = RateMeter(counters, 10.0)
     fleet.actors["a"].env_steps = 40
-    meter.look(counters, fleet, 12.0)
+    meter.measure(counters, fleet, 12.0)
     assert [fleet.actors[name].env_steps_per_second for name in ("a", "b")] == [20.0, 0.0]
     fleet.actors["a"].env_steps = 50
-    meter.look(counters, fleet, 13.0)
+    meter.measure(counters, fleet, 13.0)
     assert fleet.actors["a"].env_steps_per_second == 10.0
 
 
