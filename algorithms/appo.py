@@ -15,20 +15,23 @@ from daedalus.protocol.spec import TrainingSpec
 
 
 class Appo:
-    """Schulman et al. (2017), algorithm 1, on rollouts that lag: targets are made once for all passes of a batch."""
+    """PPO for rollouts with policy lag: Schulman et al. (2017), algorithm 1, with V-trace targets.
+
+    The targets of a batch are computed once, before its first pass.
+    """
 
     def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
         self._spec, self._distribution = spec, distribution
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
-        """See Algorithm."""
+        """Yield the losses of each minibatch of each pass. See Algorithm."""
         with torch.no_grad():
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
             log_probs, _ = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
             targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
         for _ in range(self._spec.passes):
             for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
-                # A batch of fewer rows than minibatches leaves some of them empty.
+                # A batch with fewer rows than minibatches yields empty minibatches.
                 yield self._minibatch_losses(minibatch, forward) if minibatch.actions.numel() else None
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:

@@ -7,7 +7,7 @@ from daedalus.protocol.spec import TrainingSpec
 
 
 class Impala(PolicyGradient):
-    """Espeholt et al. (2018), section 4."""
+    """Actor-critic with V-trace targets: Espeholt et al. (2018), section 4."""
 
     def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
         super().__init__(spec, distribution, vtrace_corrected_targets)

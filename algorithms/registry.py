@@ -1,4 +1,4 @@
-"""The algorithms by name. A record of the same name in daedalus/protocol/algorithms.py says how each is scheduled."""
+"""Algorithms by name. The record of the same name in daedalus/protocol/algorithms.py describes the scheduling."""
 
 from collections.abc import Callable
 
@@ -15,5 +15,5 @@ BUILDERS: dict[str, Builder] = {"a2c": A2c, "a3c": A3c, "impala": Impala, "appo"
 
 
 def build_algorithm(spec: TrainingSpec, distribution: ActionDistribution) -> Algorithm:
-    """Return the algorithm that the run names, for a policy of these action distributions."""
+    """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions."""
     return BUILDERS[spec.algorithm](spec, distribution)

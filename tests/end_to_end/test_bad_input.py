@@ -60,7 +60,7 @@ def test_a_device_that_is_not_there_is_told_in_one_line(start: Start, monkeypatc
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # wherever this runs
     running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
     assert running.wait() == 1
-    running.expect("daedalus learner: training.device is cuda, but torch sees none here: install")
+    running.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
     assert "Traceback" not in running.output
 
 
@@ -69,7 +69,7 @@ def test_a_run_directory_that_exists_is_refused_and_left_alone(start: Start, tmp
     (tmp_path / "run" / "precious").write_text("kept")
     running = start("train", "cartpole", "--run-dir", "run")
     assert running.wait() == 2
-    running.expect("run directory run exists: continue it with `daedalus resume run`")
+    running.expect("run directory run exists: continue the run with `daedalus resume run`")
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
 
 

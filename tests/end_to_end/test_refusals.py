@@ -90,7 +90,7 @@ def test_of_two_actors_of_one_name_the_second_is_refused_until_the_first_has_lef
     second = start("actor", "--connect", address, "--name", "arm")
     second.expect("waiting for the other actor of this name to leave")
     assert second.wait() == 1
-    second.expect("an actor named 'arm' takes part already: give this one another --name")
+    second.expect("actor name 'arm' is already in use: choose another --name")
     third = start("actor", "--connect", address, "--name", "arm")
     third.expect("waiting for the other actor of this name to leave")
     first.end()
@@ -105,7 +105,7 @@ def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address:
         until(lambda: router.query(keys.join("run"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
         assert second.wait() == 1
-        second.expect("another learner serves run 'run' there already: stop it, or give this run another name")
+        second.expect("another learner already serves run 'run': stop that learner, or rename this run")
         assert first.process.poll() is None
     finally:
         router.close()

@@ -36,7 +36,7 @@ def make_runtime(kind: str, policy: PolicySpec, spaces: Spaces, network: ActorCr
 @pytest.mark.parametrize("runtime", ["onnx", "torch"])
 @pytest.mark.parametrize("stack", [1, 3])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had(
+def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
     policy: str, stack: int, runtime: str
 ) -> None:
     # Episodes of 3, 2 and 1 steps: some begin, end and go on in every rollout of 5 rows.
