@@ -1,6 +1,6 @@
 """Pong with one actor far away: what training loses over a slow link, and what compact snapshots buy there.
 
-    python -m benchmarks.compact_snapshots --rounds 2
+    python -m benchmarks.slow_link --rounds 2
 
 1 Mbit/s up, 4 Mbit/s down, 100 ms each way, beside loopback: one after the other, each with a learner and an actor of
 its own. Over the slow link twice: as an actor does it that has measured its link, and as one that is told that the link
@@ -100,7 +100,7 @@ def measure(slow: bool, link: LinkChoice, warm_up: float, duration: float) -> tu
         here.start("learner", "pong", "--listen", here.address, "--run-dir", "run", *settings, *ENDLESS)
         here.wait("the learner", here.status)
         with link_to(here, slow) as (address, carried):
-            actor = here.run([sys.executable, "-m", "benchmarks.compact_snapshots", "--play", address, "--link", link])
+            actor = here.run([sys.executable, "-m", "benchmarks.slow_link", "--play", address, "--link", link])
             here.wait_for_training("far")
             time.sleep(warm_up)
             first, carried_before, lines = _status(here), dict(carried), len(actor.lines)

@@ -20,6 +20,12 @@ LEARNER_FAULTS = {
     "a Zenoh thread that answers a join": "daedalus.learner.serving.query_responses:QueryResponses.join",
 }
 
+ACTOR_FAULTS = {
+    "a Zenoh thread that brings an answer": "daedalus.actor.session.in_flight_rollouts:InFlightRollouts.acknowledge",
+    "a Zenoh thread that reports the learner": "daedalus.actor.session.learner_presence:LearnerPresence.on_presence",
+    "a Zenoh thread that brings a snapshot": "daedalus.actor.session.learner_presence:LearnerPresence.heard",
+}
+
 
 class Faulty:
     """A command in which one function raises."""
@@ -59,6 +65,14 @@ def test_an_exception_in_a_thread_of_the_learner_ends_it(
     actor = start("actor", "--connect", address, "--link", "wan" if thread == "compact snapshots" else "lan")
     learner.assert_crashes()
     assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart
+
+
+@pytest.mark.parametrize("thread", ACTOR_FAULTS)
+def test_an_exception_in_a_thread_of_an_actor_ends_it(thread: str, start: Start, address: str, tmp_path: Path) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**12)
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+    Faulty(tmp_path, "actor", ACTOR_FAULTS[thread], "--connect", address).assert_crashes()
+    assert learner.process.poll() is None
 
 
 def test_a_command_of_one_process_has_the_hook_too(tmp_path: Path) -> None:
