@@ -1,5 +1,6 @@
 """The actor-critic network, built from its specification. Needs torch: actors do not import this file."""
 
+import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.distributions import distribution_for
@@ -51,7 +52,10 @@ class ActorCritic(nn.Module):
         """
         features = self.encoder(observations.flatten(0, 1)).unflatten(0, starts.shape)  # [R, B, F]
         remembered = self.memory.unroll(features, state, starts)
-        return self.policy_head(remembered).float(), self.value_head(remembered).squeeze(-1).float()
+        # Both heads in full precision: bfloat16 would round values and logits to 8 bits, which is much of a TD error.
+        with torch.autocast(remembered.device.type, enabled=False):
+            remembered = remembered.float()
+            return self.policy_head(remembered), self.value_head(remembered).squeeze(-1)
 
     def act(self, observations: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute one row: observations [N, *stacked_shape], state [N, S] -> parameters [N, P], next state [N, S]."""

@@ -13,7 +13,7 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.encoders import MultilayerPerceptron, build_encoder
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.memory import Gru
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
 ENCODERS = ("small", "nature", "impala", "article")
@@ -257,3 +257,18 @@ def test_smallest_accepted_images() -> None:
     assert encoder_of("nature", (36, 36)).features == 512
     assert encoder_of("impala", (1, 1)).features == 256
     assert encoder_of("article", (2, 2)).features == 32
+
+
+def test_values_near_100_that_differ_by_a_tenth_stay_distinct_under_autocast() -> None:
+    """A head that ran in bfloat16 would keep 8 bits: steps of 0.5 between 64 and 128."""
+    spaces = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=DiscreteSpace(count=2))
+    network = ActorCritic(PolicySpec(hidden=()), spaces)
+    with torch.no_grad():
+        for head in (network.policy_head, network.value_head):
+            head.weight.fill_(1.0)
+    seen = (100.0 + torch.arange(10) / 10).reshape(1, 10, 1)
+    state, starts = torch.zeros(10, 0), torch.zeros(1, 10, dtype=torch.bool)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        logits, values = network(seen, state, starts)
+    assert torch.equal(values[0], seen[0, :, 0])
+    assert torch.equal(logits[0, :, 0], seen[0, :, 0])
