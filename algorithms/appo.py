@@ -40,7 +40,7 @@ class Appo:
         log_ratios = log_probs - minibatch.log_probs
         clip_range, valid = self._spec.clip_range, minibatch.valid
         return Losses(
-            policy_loss=clipped_policy_loss(log_ratios, self._weights(minibatch), valid, clip_range),
+            policy_loss=clipped_policy_loss(log_ratios, self._weighted_advantages(minibatch), valid, clip_range),
             entropies=entropies,
             values=values,
             targets=minibatch.targets,
@@ -49,6 +49,7 @@ class Appo:
             clipped_fraction=clipped_fraction(log_ratios.detach(), valid, clip_range),
         )
 
-    def _weights(self, minibatch: Minibatch) -> Tensor:
+    def _weighted_advantages(self, minibatch: Minibatch) -> Tensor:
         advantages = minibatch.advantages
-        return normalized(advantages, minibatch.valid) if self._spec.normalize_advantages else advantages
+        scaled = normalized(advantages, minibatch.valid) if self._spec.normalize_advantages else advantages
+        return minibatch.weights * scaled

@@ -24,6 +24,7 @@ class Minibatch:
     log_probs: Tensor  # [R, B], log pi(a_t | s_t) before the first update of the batch
     targets: Tensor  # [R, B], value targets
     advantages: Tensor  # [R, B]
+    weights: Tensor  # [R, B], of the rows in the policy gradient
     valid: Tensor  # [R, B] float32
 
 
@@ -49,6 +50,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
                 log_probs=log_probs[:, part],
                 targets=targets.values[:, part],
                 advantages=targets.advantages[:, part],
+                weights=targets.weights[:, part],
                 valid=batch.valid[:, part],
             )
         return
@@ -68,5 +70,6 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
             log_probs=select(log_probs, part),
             targets=select(targets.values, part),
             advantages=select(targets.advantages, part),
+            weights=select(targets.weights, part),
             valid=select(batch.valid, part),
         )

@@ -25,9 +25,9 @@ class PolicyGradient:
         with torch.no_grad():
             targets = self._targets(self._spec, batch, log_probs, values)
         advantages = targets.advantages
-        weights = normalized(advantages, batch.valid) if self._spec.normalize_advantages else advantages
+        scaled = normalized(advantages, batch.valid) if self._spec.normalize_advantages else advantages
         yield Losses(
-            policy_loss=policy_gradient_loss(log_probs, weights, batch.valid),
+            policy_loss=policy_gradient_loss(log_probs, targets.weights * scaled, batch.valid),
             entropies=entropies,
             values=values[:-1],
             targets=targets.values,

@@ -13,10 +13,16 @@ from torch import Tensor
 
 
 class Targets(NamedTuple):
-    """Value targets, and advantages of the actions over the value. Both [T, B], without gradients."""
+    """Value targets, and advantages of the actions over the value. All [T, B], without gradients.
+
+    The policy gradient descends -weights * A * log pi, where A are the advantages, normalised or not. The weights are
+    V-trace's rho, and 1 where nothing is corrected. They are apart from the advantages, because a normalised rho * A
+    would move a row with rho near 0, which says nothing about the target policy.
+    """
 
     values: Tensor
     advantages: Tensor
+    weights: Tensor
 
 
 def lambda_returns(
@@ -69,7 +75,7 @@ def actor_critic_targets(
     Schulman et al. (2016), equation 16, is the same advantage written as a sum.
     """
     returns = lambda_returns(rewards, discounts, next_values, truncated, trace_lambda)
-    return Targets(returns, returns - values)
+    return Targets(returns, returns - values, torch.ones_like(returns))
 
 
 def vtrace_targets(
@@ -89,7 +95,7 @@ def vtrace_targets(
         c_t     = lambda min(trace_clip, pi(a_t|s_t) / mu(a_t|s_t))
         delta_t = rho_t (r_t + d_t V(s_{t+1}) - V(s_t))
         v_t     = V(s_t) + delta_t + d_t c_t (v_{t+1} - V(s_{t+1}))
-        A_t     = rho_t (r_t + d_t ((1 - lambda) V(s_{t+1}) + lambda v_{t+1}) - V(s_t))
+        A_t     = r_t + d_t ((1 - lambda) V(s_{t+1}) + lambda v_{t+1}) - V(s_t),  weighted by rho_t
 
     with v_{t+1} = V(s_{t+1}) where the rollout ends or a limit cut the episode. On-policy (ratios of 1, clips
     of at least 1) v_t is the lambda-return.
@@ -109,8 +115,8 @@ def vtrace_targets(
     corrections = _accumulate(deltas, discounts * traces, torch.zeros_like(values[0]))  # v_t - V(s_t)
     # v_{t+1} - V(s_{t+1}), which is 0 past a cut
     following = torch.cat([corrections[1:], torch.zeros_like(corrections[:1])]) * (~truncated)
-    advantages = rhos * (rewards + discounts * (next_values + trace_lambda * following) - values)
-    return Targets(values + corrections, advantages)
+    advantages = rewards + discounts * (next_values + trace_lambda * following) - values
+    return Targets(values + corrections, advantages, rhos)
 
 
 def _accumulate(constants: Tensor, factors: Tensor, last: Tensor) -> Tensor:

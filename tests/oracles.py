@@ -69,8 +69,8 @@ def vtrace(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s:
 
 
 def vtrace_advantage(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s: int) -> float:
-    """rho_s (r_s + gamma v_{s+1} - V(x_s)), section 4.2; v_{s+1} mixed with V(x_{s+1}) by lambda."""
+    """r_s + gamma v_{s+1} - V(x_s), section 4.2 without its rho_s; v_{s+1} mixed with V(x_{s+1}) by lambda."""
     inside = s + 1 < horizon(x, s)
     following = vtrace(x, gamma, lam, rho_bar, c_bar, s + 1) if inside else bootstrap(x, s + 1)
     mixed = (1.0 - lam) * bootstrap(x, s + 1) + lam * following
-    return rho(x, s, rho_bar) * (x.r[s] + gamma * mixed - x.V[s])
+    return x.r[s] + gamma * mixed - x.V[s]

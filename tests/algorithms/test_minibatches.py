@@ -34,6 +34,7 @@ class Numbered:
                 assert torch.equal(getattr(sample, name)[row, column], getattr(self.batch, name)[t, b])
             assert torch.equal(sample.targets[row, column], self.targets.values[t, b])
             assert torch.equal(sample.advantages[row, column], self.targets.advantages[t, b])
+            assert torch.equal(sample.weights[row, column], self.targets.weights[t, b])
 
 
 def numbered(state_size: int) -> Numbered:
@@ -41,7 +42,9 @@ def numbered(state_size: int) -> Numbered:
     batch = join(make_rollouts(1, state_size=state_size))
     assert not batch.valid.all()
     numbers = torch.arange(ROWS * WIDTH, dtype=torch.float32).reshape(ROWS, WIDTH)
-    return Numbered(batch, numbers, Targets(torch.randn(ROWS, WIDTH), torch.randn(ROWS, WIDTH)))
+    return Numbered(
+        batch, numbers, Targets(torch.randn(ROWS, WIDTH), torch.randn(ROWS, WIDTH), torch.rand(ROWS, WIDTH))
+    )
 
 
 COUNTS = [1, 2, 3, 4, 7, ROWS * WIDTH, ROWS * WIDTH + 5]

@@ -131,7 +131,7 @@ def test_vtrace_with_rho_clip_near_0_returns_the_values(
     data = Columns(columns, gamma)
     targets = vtrace_targets(data.log_ratios, *data.of_targets, lam, 1e-12, c_bar)
     assert torch.where(data.valid, targets.values - data.values, 0.0).abs().max() < 1e-6
-    assert torch.where(data.valid, targets.advantages, 0.0).abs().max() < 1e-6
+    assert torch.where(data.valid, targets.weights, 0.0).abs().max() < 1e-6
 
 
 @given(ROLLOUTS, UNIT, CLIP)
@@ -205,7 +205,7 @@ def test_vtrace_equals_a_hand_worked_example() -> None:
     #   rho = 3/2, 1/2      c_0 = 1
     #   delta_0 = 3/2 * (1 + 1/2 * 8  - 4) = 1.5     delta_1 = 1/2 * (2 + 1/2 * 16 - 8) = 1
     #   v_1 = 8 + 1 = 9                              v_0 = 4 + 1.5 + 1/2 * 1 * 1 = 6
-    #   A_1 = 1/2 * (2 + 1/2 * 16 - 8) = 1           A_0 = 3/2 * (1 + 1/2 * 9 - 4) = 2.25
+    #   A_1 = 2 + 1/2 * 16 - 8 = 2                   A_0 = 1 + 1/2 * 9 - 4 = 1.5
     targets = vtrace_targets(
         column(2, 0.5).log(),
         column(1, 2),
@@ -218,7 +218,8 @@ def test_vtrace_equals_a_hand_worked_example() -> None:
         1.0,
     )
     assert_close(targets.values, column(6, 9))
-    assert_close(targets.advantages, column(2.25, 1))
+    assert_close(targets.advantages, column(1.5, 2))
+    assert_close(targets.weights, column(1.5, 0.5))
 
 
 def test_truncation_bootstraps_and_termination_does_not_within_one_rollout() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 from building import SPACES
-from oracles import Stream, lambda_return, vtrace, vtrace_advantage
+from oracles import Stream, lambda_return, rho, vtrace, vtrace_advantage
 from torch import Tensor, nn
 
 from daedalus.algorithms.batch import Batch
@@ -52,7 +52,7 @@ class PlainLearner:
         self,
         batch: Batch,
         cells: list[Cell],
-        targets: dict[Cell, tuple[float, float]],
+        targets: dict[Cell, tuple[float, float, float]],
         before: Played,
         rate: float,
         bonus: float,
@@ -62,6 +62,7 @@ class PlainLearner:
         advantages = torch.tensor([targets[cell][1] for cell in cells])
         if spec.normalize_advantages:
             advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        advantages = torch.tensor([targets[cell][2] for cell in cells]) * advantages  # rho_t A_t
         predicted = torch.stack([values[cell] for cell in cells])
         goals = torch.tensor([targets[cell][0] for cell in cells])
         entropy = torch.stack([entropies[cell] for cell in cells]).mean()
@@ -121,14 +122,19 @@ class PlainLearner:
             valid=batch.valid[:, b].tolist(),
         )
 
-    def _targets(self, x: Stream, t: int) -> tuple[float, float]:
+    def _targets(self, x: Stream, t: int) -> tuple[float, float, float]:
+        """The value target, the advantage, and the weight of the row in the policy gradient."""
         spec = self.spec
         gamma, lam = spec.discount_factor, spec.trace_lambda
         if spec.algorithm in ("impala", "appo"):
             clips = (spec.rho_clip, spec.trace_clip)
-            return vtrace(x, gamma, lam, *clips, t), vtrace_advantage(x, gamma, lam, *clips, t)
+            return (
+                vtrace(x, gamma, lam, *clips, t),
+                vtrace_advantage(x, gamma, lam, *clips, t),
+                rho(x, t, spec.rho_clip),
+            )
         goal = lambda_return(x, gamma, lam, t)
-        return goal, goal - x.V[t]
+        return goal, goal - x.V[t], 1.0
 
     def _descend(self, rate: float) -> None:
         if self.spec.optimizer == "adam":
