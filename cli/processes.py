@@ -1,4 +1,4 @@
-"""What every process of the system does alike: stop when told to, and not outlive the one that started it."""
+"""Signals and lifetime of processes: stop on SIGTERM and SIGINT, and end with the parent process."""
 
 import os
 import signal
@@ -8,9 +8,9 @@ import time
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and SIGINT set. Main thread only.
+    """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
-    The handlers only set the event, so a process ends by its own orderly path.
+    The handlers only set the event, so that the process can save its state before it ends.
     """
     stop = threading.Event()
 
@@ -23,7 +23,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_with_parent(stop: threading.Event) -> None:
-    """Sets `stop` when standard input ends, which the parent holds open for as long as it lives."""
+    """Set `stop` when standard input ends. The parent process holds standard input open while it runs."""
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -34,7 +34,7 @@ def exit_with_parent(stop: threading.Event) -> None:
 
 
 def process_started() -> float:
-    """When this process began, on the monotonic clock; on systems that do not tell, now."""
+    """Return the start time of this process on the monotonic clock, or the time now where it is not known."""
     now = time.monotonic()
     try:
         with (

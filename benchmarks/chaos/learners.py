@@ -47,7 +47,7 @@ def kills(count: int) -> list[tuple[str, str]]:
             here.wait("the learner", lambda epoch=epoch: _lives_anew(here, epoch))
             here.wait_for_training()
             back.append(time.monotonic() - began)
-            line = [line for line in training.lines if "going on from checkpoint" in line][-1]
+            line = [line for line in training.lines if "resuming from checkpoint" in line][-1]
             version = int(line.split("checkpoint ")[1].split()[0])
             if version < durable:
                 raise FailedError(f"went on from {version}, {durable} was on the disk:\n{training.output}")

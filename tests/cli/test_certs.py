@@ -20,7 +20,7 @@ def test_a_new_ca_makes_the_first_identities(tmp_path: Path, capsys: pytest.Capt
     assert sorted(entry.name for entry in made.iterdir()) == ["ca", "learner", "operator", "router"]
     for role in ("learner", "router", "operator"):
         assert load(made / role, role).role == role
-    assert "reached as gpu-box, " in capsys.readouterr().out
+    assert "valid for gpu-box, " in capsys.readouterr().out
 
 
 def test_keys_are_for_nobody_else(tmp_path: Path) -> None:
@@ -57,9 +57,9 @@ def test_an_actor_may_bear_the_name_of_a_role(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["init", "{certs}"], "is not empty"),
-        (["issue", "actor", "--directory", "{certs}"], "issued by name"),
-        (["issue", "learner", "x", "--directory", "{certs}"], "issued by name"),
-        (["issue", "actor", "a.b", "--directory", "{certs}"], "no '.' in a certificate's name"),
+        (["issue", "actor", "--directory", "{certs}"], "wrong number of names"),
+        (["issue", "learner", "x", "--directory", "{certs}"], "wrong number of names"),
+        (["issue", "actor", "a.b", "--directory", "{certs}"], "'a.b' has a '.': name it 'a'"),
         (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
         (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
         (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a"),

@@ -54,7 +54,7 @@ def test_containers_come_go_and_are_killed_and_cartpole_is_solved(compose: Compo
     compose.wait("the learner is gone", lambda: not compose.state(learner)["Running"] and compose.status() is None)
     compose.up(5)
     compose.wait("it is back", lambda: compose.status())
-    assert "going on from checkpoint" in compose("logs", "learner")
+    assert "resuming from checkpoint" in compose("logs", "learner")
     back = dict.fromkeys(five, 0)
     compose.wait("all five play for it again", lambda: have_gone_on(back, compose.status()))
     assert {actor["lives"] for actor in (compose.status() or {})["actors"]} == {1}  # of those that this learner knew

@@ -35,7 +35,7 @@ Start = Callable[..., Running]
             1,
             r"nothing answers at tcp/127.0.0.1:1 \(for 0.3 s\): is the learner running",
         ),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs must be from 1 to 4096"),
+        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs is 0: choose a number from 1 to 4096"),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
         (["trian"], 2, r"unknown command 'trian': did you mean train"),
     ],

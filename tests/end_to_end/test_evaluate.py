@@ -211,7 +211,7 @@ def test_a_window_is_shown_where_there_is_a_screen(
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert "needs a screen, and there is none here: record the episodes with --video" in refused(2, run, "--render")
+    assert "needs a screen, and this machine has none: record the episodes with --video" in refused(2, run, "--render")
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert evaluate(run, "--render", "--seed", 1)["lengths"] == [5]
@@ -348,19 +348,19 @@ def test_a_signal_ends_it(start: Start, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
-        ([], 2, "name a run directory"),
-        (["RUN", "--pretrained", "x"], 2, "one of them only"),
-        (["RUN", "--episodes", 0], 2, "--episodes must be at least 1, not 0"),
-        (["RUN", "--envs", 0], 2, "--envs must be from 1 to 4096, not 0"),
-        (["RUN", "--seed", -1], 2, "--seed must not be negative"),
+        ([], 2, "name either a run directory"),
+        (["RUN", "--pretrained", "x"], 2, "name either a run directory"),
+        (["RUN", "--episodes", 0], 2, "--episodes is 0: choose at least 1"),
+        (["RUN", "--envs", 0], 2, "--envs is 0: choose a number from 1 to 4096"),
+        (["RUN", "--seed", -1], 2, "--seed is -1: choose 0 or more"),
         (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, not as 'x.avi'"),
         (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
-        (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot go together"),
+        (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot be used together"),
         (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),
         (["RUN", "--video", "x.mp4", "--backend", "envpool"], 2, "leave out --backend envpool"),
-        (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width must be from 16 to 4096, not 3"),
-        (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds must be above 0, not 0"),
-        (["RUN", "--max-seconds", 5], 2, "are for --video FILE"),
+        (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width is 3: choose a number from 16 to 4096"),
+        (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds is 0: choose a number above 0"),
+        (["RUN", "--max-seconds", 5], 2, "need --video FILE"),
         (["RUN", "--backend", "ale"], 1, "unknown environment 'CartPole-v1'"),
         (["nowhere"], 1, "nowhere has no checkpoints: is it a run directory"),
     ],

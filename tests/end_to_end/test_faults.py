@@ -171,7 +171,7 @@ def test_a_killed_learner_comes_back_and_training_reaches_its_end(start: Start, 
         until(lambda victim=victim: set(learners("fallen-run")) - {victim})
     assert training.wait() == 0, training.output
     assert training.output.count("the learner was killed by signal 9; started again") == 2
-    assert training.output.count("going on from checkpoint") == 2
+    assert training.output.count("resuming from checkpoint") == 2
     assert "Traceback" not in training.output
     summary = json.loads((tmp_path / "fallen-run" / "summary.json").read_text())
     assert summary["env_steps"] >= 3_000_000
@@ -188,13 +188,13 @@ def test_a_supervised_learner_goes_on_by_the_same_command(
     first.process.kill()
     first.wait()
     second = learner("--resume", *SAVING)
-    version = int(second.expect(r"going on from checkpoint (\d+)").group(1))
+    version = int(second.expect(r"resuming from checkpoint (\d+)").group(1))
     assert version > 0
     plays_on(status, "loyal")
     assert status()["updates"] > version
     other = learner("--resume", "--seed", 99)
     assert other.wait() == 2
-    assert "begun with other settings" in other.output
+    assert "has other settings" in other.output
 
 
 def test_a_learner_leaves_in_good_order_beside_a_frozen_actor(

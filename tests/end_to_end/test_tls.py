@@ -64,7 +64,7 @@ def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certi
     for arguments, status, message in (
         ((*to, "--tls", strange / "actor-arm"), 1, "the two are of different CAs"),
         ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner: actor was expected"),
-        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': --name arm or arm.ANY"),
+        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': use --name arm or arm.ANY"),
         (to, 2, "needs certificates: --tls DIR"),
         (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "wants --tls"),
         (
