@@ -3,13 +3,12 @@
 import argparse
 import importlib
 from pathlib import Path
-from typing import get_args
 
 import shtab
 
 from daedalus.cli.arguments import command_parser
 from daedalus.learner.run.settings import preset_names
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.algorithms import ALGORITHMS
 
 _DESCRIPTION = "Prints a script that completes commands, options and presets in your shell."
 
@@ -68,7 +67,7 @@ def _complete(action: argparse.Action) -> None:
     if action.dest == "preset":
         action.choices = preset_names()
     elif action.dest == "algorithm":
-        action.choices = get_args(TrainingSpec.model_fields["algorithm"].annotation)
+        action.choices = tuple(ALGORITHMS)
     elif action.type is Path:
         folder = action.metavar in ("DIR", "RUN_DIR")
         vars(action)["complete"] = shtab.DIRECTORY if folder else shtab.FILE

@@ -33,7 +33,7 @@ def supervised(program: str, ended: Set[int] = frozenset({0})) -> Supervised:
     def begin(first: bool) -> subprocess.Popen[bytes]:
         return subprocess.Popen([sys.executable, "-S", "-c", program, str(first)], stdin=subprocess.PIPE)
 
-    return Supervised("it", begin, ended)
+    return Supervised("worker", begin, ended)
 
 
 def message(process: Supervised) -> str:
@@ -51,7 +51,7 @@ def test_a_killed_process_is_restarted_with_the_argument_for_a_restart() -> None
     try:
         assert process.check() is None
         process.process.kill()
-        assert message(process) == "it was killed by signal 9; started again"
+        assert message(process) == "worker was killed by signal 9; started again"
         assert process.process.wait(LIMIT) == 0
         assert process.check() is None
         assert (process.restarts, process.failures) == (1, 0)
@@ -63,9 +63,9 @@ def test_a_process_that_failed_three_times_is_not_restarted() -> None:
     process = supervised("raise SystemExit(7)")
     process.process.wait(LIMIT)
     assert process.failed_at_once
-    assert [message(process), message(process)] == ["it failed with status 7; started again"] * 2
+    assert [message(process), message(process)] == ["worker failed with status 7; started again"] * 2
     assert not process.failed_at_once
-    with pytest.raises(FailedError, match="it failed 3 times"):
+    with pytest.raises(FailedError, match="worker failed 3 times"):
         message(process)
     stop([process.process])
 
@@ -86,7 +86,7 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
     assert process.check() is None
     assert process.restarts == 0
     monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
-    assert message(process) == "it ended before the run; started again"
+    assert message(process) == "worker ended before the run; started again"
     stop([process.process])
 
 
@@ -100,9 +100,9 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
     evaluator.name = "evaluator"
     processes = [*actors, evaluator, learner]
     try:
-        with pytest.raises(FailedError, match="it failed 3 times"):
+        with pytest.raises(FailedError, match="worker failed 3 times"):
             watch(learner, [evaluator, *actors], spec, threading.Event())
-        continued = "it failed 3 times; see the error above; training continues without this process"
+        continued = "worker failed 3 times; see the error above; training continues without this process"
         assert any(continued in message for message in caplog.messages) == continues
     finally:
         stop([each.process for each in processes])

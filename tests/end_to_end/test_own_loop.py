@@ -1,4 +1,4 @@
-"""examples/own_loop.py: a loop that is not ours, trained from by a real learner."""
+"""Test of examples/own_loop.py: a program with its own loop, and a real learner."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ def example(tmp_path: Path, address: str) -> Iterator[Callable[..., Running]]:
         one.end()
 
 
-def test_a_loop_that_owns_its_clock_is_learned_from(
+def test_a_learner_trains_on_a_program_with_its_own_loop(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
     slow = ("--set", "collection.rollout_length=64", "--set", "training.batch_rollouts=4")
@@ -35,7 +35,7 @@ def test_a_loop_that_owns_its_clock_is_learned_from(
     loop.expect("the run is over")
 
 
-def test_what_cannot_be_trained_from_is_told_at_once(
+def test_a_synchronous_algorithm_is_refused_when_the_client_joins(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
     start("learner", "cartpole", "--algorithm", "a2c", "--listen", address, "--run-dir", "run")
