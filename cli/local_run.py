@@ -55,7 +55,7 @@ class LocalRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnd:
-    """How a run ended."""
+    """End of a run: exit status and summary."""
 
     status: int  # 0: target reached, or all steps done without a target to stop at; 3: budget used up before the target
     summary: dict[str, Any]  # summary.json, with the evaluation

@@ -45,7 +45,7 @@ class FailedError(Exception):
 
 @dataclass(slots=True)
 class Supervised:
-    """A process that is restarted when it dies before its work is done."""
+    """Process that is restarted when it dies before its work is done."""
 
     name: str
     begin: Callable[[bool], subprocess.Popen[bytes]]  # starts the process; the argument is True for the first start

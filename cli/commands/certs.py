@@ -122,12 +122,12 @@ def _issue(directory: Path, role: str, names: list[str], hosts: list[str]) -> li
     for name in names or [""]:
         _make(directory, role, name, hosts)
     if role not in _NAMED:
-        known = _read_known(directory)
-        _write_names(directory, known)
+        authorised = _read_authorised(directory)
+        _write_names(directory, authorised)
         return [f"{directory / role}    valid for {', '.join(_hosts(hosts))}"]
-    known = _read_known(directory)
-    known[f"{role}s"] = sorted({*known[f"{role}s"], *names})
-    _write_names(directory, known)
+    authorised = _read_authorised(directory)
+    authorised[f"{role}s"] = sorted({*authorised[f"{role}s"], *names})
+    _write_names(directory, authorised)
     return [
         *(
             f"{directory / f'{role}-{name}'}    copy this folder to the host of the {role} and use --tls {role}-{name}"
@@ -138,14 +138,14 @@ def _issue(directory: Path, role: str, names: list[str], hosts: list[str]) -> li
 
 
 def _revoke(directory: Path, role: str, names: list[str]) -> list[str]:
-    known = _read_known(directory)
-    unknown = set(names) - set(known[f"{role}s"])
+    authorised = _read_authorised(directory)
+    unknown = set(names) - set(authorised[f"{role}s"])
     if unknown:
         raise CredentialsError(
             f"no {role} is named {', '.join(sorted(unknown))}: see names.json in {directory / 'learner'}"
         )
-    known[f"{role}s"] = sorted(set(known[f"{role}s"]) - set(names))
-    _write_names(directory, known)
+    authorised[f"{role}s"] = sorted(set(authorised[f"{role}s"]) - set(names))
+    _write_names(directory, authorised)
     for name in names:
         shutil.rmtree(directory / _folder(role, name), ignore_errors=True)
     return [_RESTART]
@@ -160,7 +160,7 @@ def _hosts(hosts: list[str]) -> list[str]:
     return list(dict.fromkeys([*hosts, socket.gethostname(), "localhost", "127.0.0.1", "::1"]))
 
 
-def _read_known(directory: Path) -> dict[str, list[str]]:
+def _read_authorised(directory: Path) -> dict[str, list[str]]:
     return read_names(directory / "learner")
 
 
@@ -175,9 +175,9 @@ def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
 
 
 def _replace(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    beside.write_text(text, "utf-8")
-    os.replace(beside, path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(text, "utf-8")
+    os.replace(partial, path)
 
 
 def _make(directory: Path, role: str, name: str, hosts: list[str]) -> None:

@@ -15,7 +15,7 @@ from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_ac
 from daedalus.protocol.spec import RunSpec
 
 
-@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="processes have no priorities here")
+@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="this system has no process priorities")
 def test_an_actor_has_a_lower_priority_than_the_learner() -> None:
     actor = supervised_actor(
         "actor-0", "tcp/127.0.0.1:1"
