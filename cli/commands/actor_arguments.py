@@ -48,6 +48,20 @@ def parser() -> argparse.ArgumentParser:
         default="onnx",
         help="library that runs the policy (default: %(default)s, which needs no torch)",
     )
+    _add_connection(options)
+    options.add_argument(
+        "--evaluator",
+        action="store_true",
+        help="play greedily on the schedule of the run and report the returns, instead of sending rollouts",
+    )
+    add_tls(options)
+    add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    return options
+
+
+def _add_connection(options: argparse.ArgumentParser) -> None:
+    """Add the options about the learner, the name and the link."""
     options.add_argument(
         "--run", default=keys.ANY_RUN, metavar="NAME", help="run to join, if several runs share a network"
     )
@@ -69,15 +83,6 @@ def parser() -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="time to look for a learner before giving up (default: no limit)",
     )
-    options.add_argument(
-        "--evaluator",
-        action="store_true",
-        help="play greedily on the schedule of the run and report the returns, instead of sending rollouts",
-    )
-    add_tls(options)
-    add_logging(options)
-    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
-    return options
 
 
 def config(arguments: argparse.Namespace, credentials: Credentials | None) -> ActorConfig:

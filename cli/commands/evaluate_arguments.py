@@ -69,6 +69,14 @@ def parser() -> argparse.ArgumentParser:
         help="your function that takes each gymnasium environment and returns the environment to play",
     )
     options.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    _add_watching(options)
+    add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    return options
+
+
+def _add_watching(options: argparse.ArgumentParser) -> None:
+    """Add the options for videos and windows."""
     watching = options.add_argument_group("watching", "with one environment, on gymnasium's implementation")
     watching.add_argument("--video", type=Path, metavar="FILE", help="record the episodes as FILE.mp4 or FILE.gif")
     watching.add_argument(
@@ -81,9 +89,6 @@ def parser() -> argparse.ArgumentParser:
         "--max-seconds", type=float, metavar="S", help="length of the video. The episodes are still played to their end"
     )
     watching.add_argument("--render", action="store_true", help="show the episodes in a window, at human speed")
-    add_logging(options)
-    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
-    return options
 
 
 def check(arguments: argparse.Namespace) -> None:

@@ -57,9 +57,8 @@ def test_training_survives_killed_containers_and_solves_cartpole(compose: Compos
     assert "resuming from checkpoint" in compose("logs", "learner")
     back = dict.fromkeys(five, 0)
     compose.wait("all five actors play again", lambda: have_continued(back, compose.status()))
-    assert {actor["lives"] for actor in (compose.status() or {})["actors"]} == {
-        1
-    }  # the new learner process counts from 1
+    # The new learner process counts the actors from 1.
+    assert {actor["lives"] for actor in (compose.status() or {})["actors"]} == {1}
 
     compose.wait(
         "the health check of the learner passes", lambda: compose.state(learner)["Health"]["Status"] == "healthy"
