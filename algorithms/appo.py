@@ -10,30 +10,33 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, normalized
 from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.targets import vtrace_corrected_targets
-from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.policy.network.distributions import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
 class Appo:
-    """Schulman et al. (2017), algorithm 1, on rollouts that lag: targets are made once for all passes of a batch."""
+    """PPO for rollouts with policy lag: Schulman et al. (2017), algorithm 1, with V-trace targets.
 
-    def __init__(self, spec: TrainingSpec) -> None:
-        self._spec = spec
+    The targets of a batch are computed once, before its first pass.
+    """
+
+    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
+        self._spec, self._distribution = spec, distribution
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
-        """See Algorithm."""
+        """Yield the losses of each minibatch of each pass. See Algorithm."""
         with torch.no_grad():
-            logits, values = forward(batch.observations, batch.initial_state, batch.starts)
-            log_probs, _ = categorical_log_probs(logits[:-1], batch.actions)
+            parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
+            log_probs, _ = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
             targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
         for _ in range(self._spec.passes):
             for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
-                # A batch of fewer rows than minibatches leaves some of them empty.
+                # A batch with fewer rows than minibatches yields empty minibatches.
                 yield self._minibatch_losses(minibatch, forward) if minibatch.actions.numel() else None
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
-        logits, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)
-        log_probs, entropies = categorical_log_probs(logits, minibatch.actions)
+        parameters, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)
+        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters, minibatch.actions)
         log_ratios = log_probs - minibatch.log_probs
         clip_range, valid = self._spec.clip_range, minibatch.valid
         return Losses(

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 class FlatParameters:
     """All parameters of a module as views into one vector, and their gradients as views into another.
 
-    One vector instead of many small tensors: a step is a handful of operations whatever the network, the gradient's
-    norm is one operation, and a gradient travels as one array.
+    One vector replaces many small tensors: an optimiser step takes a few operations for any network, and the norm of
+    the gradient takes one.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
@@ -25,7 +25,7 @@ class FlatParameters:
             start = end
 
     def clip_gradients(self, max_norm: float) -> Tensor:
-        """Scale the gradients so that their norm is at most `max_norm`; return the norm that they had."""
+        """Scale the gradients so that their norm is at most `max_norm`; return their norm before scaling."""
         norm = self.gradients.norm()
         self.gradients.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
         return norm

@@ -1,4 +1,4 @@
-"""Batch -> gradients of its updates, at the network's present parameters. Applying them is somebody else's part."""
+"""Gradients of the updates of a batch, at the current parameters of the network. The caller applies them."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from daedalus.protocol.spec import TrainingSpec
 
 
 class Terms(NamedTuple):
-    """What one update's losses were: scalars without gradients."""
+    """Loss terms and statistics of one update: scalars without gradients."""
 
     policy_loss: Tensor
     value_loss: Tensor
@@ -29,17 +29,17 @@ class Terms(NamedTuple):
 
 
 class GradientComputer:
-    """Computes an algorithm's gradients for one network."""
+    """Gradient computation of one algorithm for one network."""
 
     def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
         self._spec, self._network = spec, network
-        self._algorithm = build_algorithm(spec)
+        self._algorithm = build_algorithm(spec, network.distribution)
         self.parameters = FlatParameters(network.parameters())
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms | None]:
-        """Leave the gradient of each update of a batch in `parameters.gradients`, and yield what its losses were.
+        """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next. None: an update without a row to learn from.
+        The caller applies the gradient before it asks for the next update. None means an update without valid rows.
         """
         for losses in self._algorithm.losses(batch, self._forward):
             if losses is None:

@@ -1,4 +1,4 @@
-"""The terms of the actor-critic loss. Pure functions; [T, B] in, a scalar out, over the valid rows only."""
+"""Terms of the actor-critic loss. Pure functions from [T, B] tensors to a scalar over the valid rows."""
 
 from typing import Literal
 
@@ -7,18 +7,18 @@ from torch.nn.functional import huber_loss
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
-    """Mean of `values` [T, B] where `valid` [T, B] (float, 1 or 0) is 1; 0 where nothing is."""
+    """Return the mean of `values` [T, B] where `valid` [T, B] (float, 1 or 0) is 1, or 0 without valid rows."""
     return (values * valid).sum() / valid.sum().clamp(min=1.0)
 
 
 def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
-    """Advantages with mean 0 and standard deviation 1 over the valid rows."""
+    """Return advantages with mean 0 and standard deviation 1 over the valid rows."""
     centred = advantages - masked_mean(advantages, valid)
     return centred / (masked_mean(centred.square(), valid).sqrt() + 1e-8)
 
 
 def policy_gradient_loss(log_probs: Tensor, advantages: Tensor, valid: Tensor) -> Tensor:
-    """- mean log pi(a_t|s_t) A_t, with A_t a constant. Its gradient is minus the policy gradient.
+    """Return - mean log pi(a_t|s_t) A_t, with A_t a constant. Its gradient is minus the policy gradient.
 
     Mnih et al. (2016), section 4.
     """
@@ -26,12 +26,18 @@ def policy_gradient_loss(log_probs: Tensor, advantages: Tensor, valid: Tensor) -
 
 
 def clipped_policy_loss(log_ratios: Tensor, advantages: Tensor, valid: Tensor, clip_range: float) -> Tensor:
-    """- mean min(r_t A_t, clip(r_t, 1 - c, 1 + c) A_t): no gain from leaving the trust region, A_t a constant.
+    """Return - mean min(r_t A_t, clip(r_t, 1 - c, 1 + c) A_t), with A_t a constant and c the clip range.
 
-    Schulman et al. (2017), equation 7; r_t compares with the policy that the batch found, not with the behaviour
-    policy: V-trace's rho in A_t accounts for that one (Hilton et al. 2022, section 3).
+    The minimum removes the gain from moving r_t out of the clip range.
 
-    Args (all [T, B]): log_ratios: log pi(a_t|s_t) minus that of the policy at the batch's start; advantages; valid.
+    Schulman et al. (2017), equation 7. The denominator of r_t is the policy before the first update of the batch, not
+    the behaviour policy: V-trace's rho in A_t corrects for the behaviour policy (Hilton et al. 2022, section 3).
+
+    Args:
+      log_ratios: [T, B], log r_t: log pi(a_t|s_t) minus its value before the first update of the batch.
+      advantages: [T, B].
+      valid: [T, B], float, 1 or 0.
+      clip_range: c.
     """
     ratios = log_ratios.exp()
     constants = advantages.detach()
@@ -40,14 +46,17 @@ def clipped_policy_loss(log_ratios: Tensor, advantages: Tensor, valid: Tensor, c
 
 
 def clipped_fraction(log_ratios: Tensor, valid: Tensor, clip_range: float) -> Tensor:
-    """The share of valid rows whose ratio left the trust region: near 0 the passes do little, near 1 too much."""
+    """Return the share of valid rows whose ratio is outside the clip range.
+
+    Near 0 the passes change the policy little, near 1 too much.
+    """
     return masked_mean(((log_ratios.exp() - 1.0).abs() > clip_range).float(), valid)
 
 
 def value_loss(values: Tensor, targets: Tensor, valid: Tensor, kind: Literal["mse", "huber"]) -> Tensor:
-    """Mean of (V - G)^2, or the Huber loss (half of that within 1, linear beyond); G is a constant.
+    """Return the mean of (V - G)^2, or of the Huber loss (half the square within 1, linear beyond); G is a constant.
 
-    The squared error carries no half: the coefficient of 0.5 that is usual belongs to the sum of the losses.
+    The squared error has no factor of 1/2: the usual 0.5 is the weight of the value loss in the sum of the losses.
     """
     if kind == "mse":
         return masked_mean((values - targets.detach()).square(), valid)
@@ -55,7 +64,7 @@ def value_loss(values: Tensor, targets: Tensor, valid: Tensor, kind: Literal["ms
 
 
 def explained_variance(values: Tensor, targets: Tensor, valid: Tensor) -> Tensor:
-    """1 - Var[G - V] / Var[G]: 1 for a perfect critic, 0 for one that only knows the mean, negative for worse."""
+    """Return 1 - Var[G - V] / Var[G]: 1 for a perfect critic, 0 for a constant one, negative for a worse one."""
     residual = targets - values
     variance = masked_mean((targets - masked_mean(targets, valid)).square(), valid)
     unexplained = masked_mean((residual - masked_mean(residual, valid)).square(), valid)

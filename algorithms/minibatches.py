@@ -1,4 +1,4 @@
-"""What appo learns from in one update: a part of a batch, with targets made once for all passes. Pure functions."""
+"""Minibatches of a batch, with targets that are computed once for all passes. Pure functions."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,23 +12,31 @@ from daedalus.algorithms.returns import Targets
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Minibatch:
-    """R rows of B environments; R is 1 where rows are shuffled one by one."""
+    """Part of a batch that one update learns from: R rows of B environments.
+
+    R is T for a policy with memory. Without memory R is 1, and B counts single rows.
+    """
 
     observations: Tensor  # [R, B, *stacked_shape]
     initial_state: Tensor  # [B, S]
     starts: Tensor  # [R, B] bool
     actions: Tensor  # [R, B] int64
-    log_probs: Tensor  # [R, B], of the policy at the batch's start
-    targets: Tensor  # [R, B], of the value
+    log_probs: Tensor  # [R, B], log pi(a_t | s_t) before the first update of the batch
+    targets: Tensor  # [R, B], value targets
     advantages: Tensor  # [R, B]
     valid: Tensor  # [R, B] float32
 
 
 def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -> Iterator[Minibatch]:
-    """One pass over a batch in `count` parts of nearly equal size, shuffled; some are empty in a batch that small.
+    """Yield one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
-    A batch with memory is cut along its environments: rows in their order are what the memory learns from. Without,
-    it is cut into single rows, and those that only reset are left out.
+    With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
+    is split into single rows, and reset rows are omitted. In a batch with fewer parts than `count`, some minibatches
+    are empty.
+
+    Args:
+      log_probs: [T, B], log pi(a_t | s_t) before the first update of the batch.
+      targets: value targets and advantages, [T, B].
     """
     if batch.initial_state.shape[1]:
         order = torch.randperm(batch.actions.shape[1]).to(batch.actions.device)
@@ -48,17 +56,17 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     order = rows[torch.randperm(len(rows)).to(rows.device)]
     observations = batch.observations[:-1].flatten(0, 1)
 
-    def chosen(values: Tensor, part: Tensor) -> Tensor:
+    def select(values: Tensor, part: Tensor) -> Tensor:
         return values.flatten(0, 1)[part].unsqueeze(0)
 
     for part in order.tensor_split(count):
         yield Minibatch(
             observations=observations[part].unsqueeze(0),
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
-            starts=chosen(batch.starts[:-1], part),
-            actions=chosen(batch.actions, part),
-            log_probs=chosen(log_probs, part),
-            targets=chosen(targets.values, part),
-            advantages=chosen(targets.advantages, part),
-            valid=chosen(batch.valid, part),
+            starts=select(batch.starts[:-1], part),
+            actions=select(batch.actions, part),
+            log_probs=select(log_probs, part),
+            targets=select(targets.values, part),
+            advantages=select(targets.advantages, part),
+            valid=select(batch.valid, part),
         )

@@ -1,4 +1,4 @@
-"""One update from each batch by the policy gradient: what a2c, a3c and impala share."""
+"""Policy gradient with one update for each batch, shared by a2c, a3c and impala."""
 
 from collections.abc import Iterator
 
@@ -8,20 +8,20 @@ from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import normalized, policy_gradient_loss
 from daedalus.algorithms.targets import TargetsFunction
-from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.policy.network.distributions import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
 class PolicyGradient:
-    """An Algorithm of a single pass; how its targets are corrected is the caller's choice."""
+    """Actor-critic algorithm with a single pass over each batch. `targets` computes value targets and advantages."""
 
-    def __init__(self, spec: TrainingSpec, targets: TargetsFunction) -> None:
-        self._spec, self._targets = spec, targets
+    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution, targets: TargetsFunction) -> None:
+        self._spec, self._distribution, self._targets = spec, distribution, targets
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
-        """See Algorithm."""
-        logits, values = forward(batch.observations, batch.initial_state, batch.starts)  # [T+1, B, ...]
-        log_probs, entropies = categorical_log_probs(logits[:-1], batch.actions)
+        """Yield the losses of the only update. See Algorithm."""
+        parameters, values = forward(batch.observations, batch.initial_state, batch.starts)  # [T+1, B, ...]
+        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
         with torch.no_grad():
             targets = self._targets(self._spec, batch, log_probs, values)
         advantages = targets.advantages

@@ -1,4 +1,4 @@
-"""Where bfloat16 pays: convolutions on processors and accelerators that multiply it in hardware."""
+"""Choice of mixed precision. bfloat16 is faster for convolutions on hardware that multiplies it natively."""
 
 from pathlib import Path
 from typing import Literal
@@ -9,9 +9,12 @@ import torch
 def autocast(
     precision: Literal["auto", "float32", "bfloat16"], device: torch.device, convolutional: bool
 ) -> torch.autocast:
-    """The context for forward passes: mixed precision where it was asked for, or where it is known to be faster."""
+    """Return the context for forward passes, with mixed precision if it is requested or known to be faster.
+
+    "auto" enables bfloat16 for a convolutional network on a device that multiplies bfloat16 in hardware.
+    """
     enabled = precision == "bfloat16" or (precision == "auto" and convolutional and _multiplies_bfloat16(device))
-    # The cache of cast weights would outlive the update that made them stale, were the context entered only once.
+    # Enter the context for each forward pass: its cache of cast weights must not survive an update of the weights.
     return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
 
 

@@ -1,9 +1,9 @@
 """Targets and advantages from rollouts. Pure functions of tensors, all [T, B], time first.
 
-Row t is observation t, the action from it, the reward it earned. `next_values` is V of the true successor
-of row t: under NEXT_STEP resets that is the value of row t+1's observation at every row, the end of an episode
-included. Rows that only reset take part in the recursions, but nothing flows from them into other rows: the
-row before them ended the episode. The caller masks them afterwards.
+Row t is observation t, the action chosen from it and the reward that the action earned. `next_values` is V of the
+true successor of row t. Under NEXT_STEP resets this is the value of the observation of row t+1, also at the end of an
+episode. Reset rows are part of the recursions, but they do not affect other rows, because the row before a reset row
+ended the episode. The caller masks the reset rows afterwards.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class Targets(NamedTuple):
-    """What the value should become, and how much better than it the action did. Both [T, B], constants."""
+    """Value targets, and advantages of the actions over the value. Both [T, B], without gradients."""
 
     values: Tensor
     advantages: Tensor
@@ -22,13 +22,13 @@ class Targets(NamedTuple):
 def lambda_returns(
     rewards: Tensor, discounts: Tensor, next_values: Tensor, truncated: Tensor, trace_lambda: float
 ) -> Tensor:
-    """Discounted returns, mixed over all horizons within the rollout.
+    """Return discounted returns, mixed over all horizons within the rollout.
 
         G_t = r_t + d_t ((1 - lambda) V(s_{t+1}) + lambda G_{t+1})
 
     with V(s_{t+1}) in place of G_{t+1} where the rollout ends (t = T-1) or a limit cut the episode.
-    Termination needs no flag: its discount is 0. Truncation does: the episode would have gone on.
-    With lambda = 1 these are the n-step returns, with 0 the one-step ones.
+    Termination needs no flag, because its discount is 0. Truncation needs one, because the episode could have
+    continued. With lambda = 1 the result is the n-step return, with lambda = 0 the one-step return.
 
     Args:
       rewards: reward earned by the action of row t.
@@ -45,7 +45,7 @@ def lambda_returns(
 
 
 def n_step_returns(rewards: Tensor, discounts: Tensor, next_values: Tensor, truncated: Tensor) -> Tensor:
-    """Discounted returns, bootstrapped where the rollout or an episode is cut.
+    """Return discounted returns, bootstrapped where the rollout or an episode is cut.
 
         G_t = r_t + d_t (V(s_{t+1}) if truncated_t or t = T-1 else G_{t+1})
 
@@ -62,7 +62,9 @@ def actor_critic_targets(
     truncated: Tensor,
     trace_lambda: float,
 ) -> Targets:
-    """Lambda-returns, and how far they are above the value: A_t = G_t - V(s_t).
+    """Return lambda-returns G_t and advantages A_t = G_t - V(s_t).
+
+    Arguments as in `lambda_returns`, and the values V(s_t), [T, B].
 
     Schulman et al. (2016), equation 16, is the same advantage written as a sum.
     """
@@ -81,7 +83,7 @@ def vtrace_targets(
     rho_clip: float,
     trace_clip: float,
 ) -> Targets:
-    """V-trace: value targets and advantages corrected for the policy's lag.
+    """Return V-trace value targets and advantages, corrected for policy lag.
 
         rho_t   = min(rho_clip, pi(a_t|s_t) / mu(a_t|s_t))
         c_t     = lambda min(trace_clip, pi(a_t|s_t) / mu(a_t|s_t))
@@ -112,7 +114,7 @@ def vtrace_targets(
 
 
 def _accumulate(constants: Tensor, factors: Tensor, last: Tensor) -> Tensor:
-    """Solves x_t = constants_t + factors_t x_{t+1} backwards from x_T = last. [T, B], [T, B], [B] -> [T, B]."""
+    """Solve x_t = constants_t + factors_t x_{t+1} backwards from x_T = last. [T, B], [T, B], [B] -> [T, B]."""
     result = torch.empty_like(constants)
     following = last
     for row in range(len(constants) - 1, -1, -1):

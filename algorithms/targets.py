@@ -1,4 +1,4 @@
-"""Value targets and advantages of a batch, as its algorithm corrects them."""
+"""Value targets and advantages of a batch, with and without correction for policy lag."""
 
 from collections.abc import Callable
 

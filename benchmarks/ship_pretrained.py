@@ -25,7 +25,7 @@ _README = """\
 
     daedalus evaluate --pretrained {name}
     daedalus evaluate --pretrained {name} --video {name}.gif
-    daedalus train config.toml              # train it again
+    daedalus train config.toml              # train with the same settings
 """
 
 

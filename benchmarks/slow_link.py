@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
-from daedalus.actor.collecting.player import EnvironmentPlayer
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.cli.processes import stop_on_signals
 from daedalus.learner.run.settings import read_preset, run_spec
@@ -58,11 +58,11 @@ class Measured:
     published: float  # per minute
 
 
-class PrintingPlayer(EnvironmentPlayer):
-    """Player that prints the version of its weights."""
+class ReportingCollector(EnvironmentCollector):
+    """Collector that prints the policy version of its weights."""
 
     def load(self, snapshot: Snapshot) -> None:
-        """See Player."""
+        """See Collector."""
         super().load(snapshot)
         print(f"{_PLAYS} {snapshot.policy_version}", flush=True)
 
@@ -72,7 +72,7 @@ def play(address: str, link: LinkChoice) -> int:
     transport, stop = connect([address]), stop_on_signals()
     config = ActorConfig(name="far", incarnation=time.monotonic_ns(), link=link)
     try:
-        ActorService(config, transport, stop, PrintingPlayer()).run()
+        ActorService(config, transport, stop, ReportingCollector()).run()
     finally:
         transport.close()
     return 0

@@ -1,1 +1,1 @@
-"""Carries a client in another language onto the network. Imports protocol; nothing imports it."""
+"""Connects clients in other languages to the network over TCP. Only the command line imports this package."""

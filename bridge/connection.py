@@ -1,10 +1,10 @@
-"""One client of the bridge: its connection, and the Transport that it alone uses.
+"""One client of the bridge: its TCP connection, and a Transport that only this client uses.
 
-    its own thread      reads packets and does what they ask
-    a thread a query    waits for the answers and hands them over
-    news thread         hands over what was published, and who came and went
+    client thread            reads packets and performs them
+    one thread per query     waits for the answers and sends them to the client
+    news thread              sends published values and presence changes to the client
 
-Whatever ends first, the connection or the transport, ends the other: presence lasts as long as the client does.
+If the connection or the transport ends, the other is closed too: the client's presence ends with its connection.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from daedalus.bridge.budget import Budget
+from daedalus.bridge.budget import QueryBudget
 from daedalus.bridge.packets import (
     GREETING,
     HEADER_BYTES,
@@ -24,35 +24,39 @@ from daedalus.bridge.packets import (
     PacketError,
     check_key,
     encode_packet,
+    fits_packet,
     read_header,
 )
 from daedalus.transport.interface import Inbox, Transport, TransportError
 
-STALL_SECONDS = 30.0  # a client that takes nothing for so long, or stops within a packet, is given up
-_MOST_DECLARED = 64  # keys that one client follows, watches or is present under
-_MOST_CHANGES = 1024  # of presence, that the client has not taken yet
-_CHUNK_BYTES = 64 << 10  # memory is taken for what came, not for what was declared
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))  # a host that vanished is missed by this
+STALL_SECONDS = 30.0  # a client that stalls for longer, or stops within a packet, is disconnected
+_MAX_DECLARATIONS = 64  # of FOLLOW, WATCH and ANNOUNCE by one client
+_MAX_CHANGES = 1024  # presence changes that wait for a slow client
+_CHUNK_BYTES = 64 << 10  # allocate memory for bytes received, not for bytes declared
+_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))  # detects a host that vanished
 
 
 class ClientConnection:
-    """Serves one connection from `run` to its end."""
+    """Serves one client from `run` until the connection ends."""
 
     def __init__(self, connection: socket.socket, open_transport: Callable[[], Transport]) -> None:
         self._connection = connection
         self._open_transport = open_transport
         self._transport: Transport | None = None
-        self._budget = Budget()
+        self._budget = QueryBudget()
         self._sending = threading.Lock()
-        self._changed = threading.Condition()  # guards the next five
+        self._changed = threading.Condition()  # guards the next five attributes
         self._closed = False
         self._declared = 0
-        self._inboxes: dict[int, tuple[str, Inbox]] = {}  # by number
-        self._fresh: set[int] = set()  # whose inbox may have something new
+        self._inboxes: dict[int, tuple[str, Inbox]] = {}  # by the number of the FOLLOW packet
+        self._fresh: set[int] = set()  # numbers whose inbox may hold a new value
         self._changes: deque[Packet] = deque()
 
     def run(self) -> str:
-        """Serves it until it goes, is told to by `close`, or is given up; says why, or nothing if the client went."""
+        """Serve the client until it disconnects, `close` is called, or it breaks the protocol.
+
+        Returns the reason for which the bridge ended the connection; empty if the client disconnected.
+        """
         try:
             self._connection.settimeout(STALL_SECONDS)
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -62,20 +66,20 @@ class ClientConnection:
                     self._connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
             self._connection.sendall(GREETING)
             if self._read(len(GREETING), begun=True) != GREETING:
-                return "it speaks another protocol"
+                return "the client uses another protocol"
             transport = self._open_transport()
             if not self._keep(transport):
                 return ""
-            threading.Thread(target=self._pass_on_news, name="bridge-news", daemon=True).start()
+            threading.Thread(target=self._send_news, name="bridge-news", daemon=True).start()
             while (packet := self._next()) is not None:
-                self._do(transport, packet)
+                self._perform(transport, packet)
             return ""
         except (PacketError, TransportError) as error:
             with contextlib.suppress(OSError):
                 self._send(Packet(Kind.ERROR, 0, payload=str(error).encode()))
             return str(error)
         except ConnectionError:
-            return ""  # it went with something unread
+            return ""  # the client disconnected with packets unread
         except OSError as error:
             return "" if self._closed else f"{error}"
         finally:
@@ -83,7 +87,7 @@ class ClientConnection:
             self._connection.close()
 
     def close(self) -> None:
-        """Ends all that the client has here. From any thread; idempotent."""
+        """Close the connection and the transport. Safe from any thread; idempotent."""
         with self._changed:
             self._closed = True
             transport, self._transport = self._transport, None
@@ -95,7 +99,7 @@ class ClientConnection:
             transport.close()
 
     def _keep(self, transport: Transport) -> bool:
-        """Whether the client is still there for it; closed if not."""
+        """Use a new transport; close it and return False if the connection was closed meanwhile."""
         with self._changed:
             if not self._closed:
                 self._transport = transport
@@ -103,10 +107,10 @@ class ClientConnection:
         transport.close()
         return False
 
-    # ----------------------------------------------------------------------------------------- its own thread
+    # ---------------------------------------------------------------------------------------- client thread
 
     def _next(self) -> Packet | None:
-        """The next packet; None if the client went between two."""
+        """Return the next packet, or None if the client disconnected between two packets."""
         head = self._read(HEADER_BYTES, begun=False)
         if not head:
             return None
@@ -116,31 +120,35 @@ class ClientConnection:
         return Packet(header.kind, header.number, key, header.timeout, payload)
 
     def _read(self, size: int, *, begun: bool) -> bytes:
-        """So many bytes; none at all if the client went before the first, and the packet was not `begun`."""
+        """Return exactly `size` bytes.
+
+        Returns b"" if the client disconnects before the first byte and the packet was not `begun`. Raises PacketError
+        if the client stalls or disconnects within a packet.
+        """
         data = bytearray()
         while len(data) < size:
             try:
                 chunk = self._connection.recv(min(size - len(data), _CHUNK_BYTES))
             except TimeoutError:
                 if data or begun:
-                    raise PacketError(f"no more came within {STALL_SECONDS:g} s") from None
-                continue  # it just has nothing to say
+                    raise PacketError(f"the client sent nothing for {STALL_SECONDS:g} s within a packet") from None
+                continue  # the client is idle between packets
             if not chunk and (data or begun):
-                raise PacketError("it went in the middle")
+                raise PacketError("the client disconnected within a packet")
             if not chunk:
                 return b""
             data += chunk
         return bytes(data)
 
-    def _do(self, transport: Transport, packet: Packet) -> None:
+    def _perform(self, transport: Transport, packet: Packet) -> None:
         if packet.kind == Kind.QUERY:
             if not self._budget.take(len(packet.payload), self._has_gone):
                 raise ConnectionAbortedError
-            threading.Thread(target=self._ask, args=(transport, packet), name="bridge-query", daemon=True).start()
+            threading.Thread(target=self._run_query, args=(transport, packet), name="bridge-query", daemon=True).start()
             return
         self._declared += 1
-        if self._declared > _MOST_DECLARED:
-            raise PacketError(f"more than {_MOST_DECLARED} keys followed, watched or announced")
+        if self._declared > _MAX_DECLARATIONS:
+            raise PacketError(f"the client followed, watched or announced more than {_MAX_DECLARATIONS} keys")
         number = packet.number
         if packet.kind == Kind.ANNOUNCE:
             transport.declare_presence(packet.key)
@@ -150,24 +158,24 @@ class ClientConnection:
             inbox = transport.subscribe(packet.key, lambda: self._on_news(number))
             with self._changed:
                 self._inboxes[number] = packet.key, inbox
-            self._on_news(number)  # what came before the inbox had its number
+            self._on_news(number)  # values that arrived before the inbox had its number
 
     def _has_gone(self) -> bool:
-        """Whether it closed its end, even if something that it sent before is still unread."""
+        """Return whether the client closed its end, even if bytes that it sent before are still unread."""
         poll = select.poll()
         poll.register(self._connection, getattr(select, "POLLRDHUP", 0))
         return bool(poll.poll(0))
 
-    # ------------------------------------------------------------------------------- the threads of its queries
+    # ---------------------------------------------------------------------------------------- query threads
 
-    def _ask(self, transport: Transport, packet: Packet) -> None:
+    def _run_query(self, transport: Transport, packet: Packet) -> None:
         try:
             for answer in transport.query(packet.key, packet.payload, timeout=packet.timeout):
                 if len(answer) <= MAX_ANSWER_BYTES:
                     self._send(Packet(Kind.ANSWER, packet.number, payload=answer))
             self._send(Packet(Kind.END, packet.number))
         except (OSError, TransportError):
-            self.close()  # neither of them can be used any more
+            self.close()  # the connection or the transport has failed
         finally:
             self._budget.give_back(len(packet.payload))
 
@@ -175,7 +183,7 @@ class ClientConnection:
         with self._sending:
             self._connection.sendall(encode_packet(packet))
 
-    # ---------------------------------------------------------------------- the transport's threads hand over only
+    # ------------------------------------------------------------------ callbacks on the transport's threads
 
     def _on_news(self, number: int) -> None:
         with self._changed:
@@ -183,17 +191,19 @@ class ClientConnection:
             self._changed.notify_all()
 
     def _on_presence(self, number: int, key: str, present: bool) -> None:
+        if not fits_packet(key):
+            return  # another process declared it: no actor or learner of ours has such a key
         with self._changed:
             self._changes.append(Packet(Kind.PRESENT if present else Kind.ABSENT, number, key))
-            too_slow = len(self._changes) > _MOST_CHANGES
+            too_slow = len(self._changes) > _MAX_CHANGES
             self._changed.notify_all()
         if too_slow:
             with contextlib.suppress(OSError):
-                self._connection.shutdown(socket.SHUT_RDWR)  # the thread that reads it ends all else
+                self._connection.shutdown(socket.SHUT_RDWR)  # wakes the client thread, which closes the rest
 
-    # -------------------------------------------------------------------------------------------- the news thread
+    # ------------------------------------------------------------------------------------------ news thread
 
-    def _pass_on_news(self) -> None:
+    def _send_news(self) -> None:
         try:
             while (packets := self._await_news()) is not None:
                 for packet in packets:
@@ -202,7 +212,7 @@ class ClientConnection:
             self.close()
 
     def _await_news(self) -> list[Packet] | None:
-        """What is new, once there is something; None when closed."""
+        """Wait for news and return it as packets; return None when the connection is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._fresh or self._changes)
             if self._closed:

@@ -1,4 +1,4 @@
-"""What travels between the bridge and its client, and how. Pure functions; this file knows no socket.
+"""The packets between the bridge and its clients, and their encoding. Pure functions, without I/O.
 
 Each end first sends the four bytes b"DBR1", then packets:
 
@@ -6,8 +6,8 @@ Each end first sends the four bytes b"DBR1", then packets:
          0      4  length of the payload, little-endian like all numbers here
          4      1  kind
          5      1  length of the key
-         6      2  timeout in milliseconds, of a query; else 0
-         8      4  number: the client's choice; what the bridge sends of a question, follow or watch bears its number
+         6      2  timeout of a query in milliseconds; otherwise 0
+         8      4  number that the client chooses; packets that belong to a query, FOLLOW or WATCH repeat its number
         12      -  key, ASCII
          -      -  payload
 """
@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 GREETING = b"DBR1"
 HEADER_BYTES = 12
-MAX_QUESTION_BYTES = 64 << 20  # of what a client sends
-MAX_ANSWER_BYTES = 1 << 30  # of what it is sent: weights may be large
+MAX_QUERY_BYTES = 64 << 20  # payload of a query
+MAX_ANSWER_BYTES = 1 << 30  # payload to a client: weights may be large
 
 _HEADER = struct.Struct("<IBBHI")
 _CHUNK = r"(?:[A-Za-z0-9][A-Za-z0-9._-]{0,63}|\*)"
@@ -28,29 +28,29 @@ _KEY = re.compile(rf"daedalus(?:/{_CHUNK}){{1,4}}")
 
 
 class Kind(enum.IntEnum):
-    """What a packet is for."""
+    """Kind of a packet."""
 
-    QUERY = 1  # client: asks whoever serves the key
-    FOLLOW = 2  # client: wants what is published under the key
-    ANNOUNCE = 3  # client: is present under the key until its connection ends
-    WATCH = 4  # client: wants to know who is present under the key
+    QUERY = 1  # client: sends a query to the servers of the key
+    FOLLOW = 2  # client: subscribes to the key
+    ANNOUNCE = 3  # client: declares presence under the key until its connection ends
+    WATCH = 4  # client: watches presence under the key
     ANSWER = 5  # bridge: one answer to a query
     END = 6  # bridge: the query has no more answers
-    NEWS = 7  # bridge: the newest value of a followed key
-    PRESENT = 8  # bridge: somebody is there, under the key that the packet bears
-    ABSENT = 9  # bridge: they have gone
-    ERROR = 10  # bridge: why it closes the connection, as text
+    NEWS = 7  # bridge: the newest value of a key that the client follows
+    PRESENT = 8  # bridge: the packet's key has become present
+    ABSENT = 9  # bridge: the packet's key is no longer present
+    ERROR = 10  # bridge: the reason, as text, why it closes the connection
 
 
-_PATTERNS = (Kind.QUERY, Kind.WATCH)  # may bear a key with `*` in it
+_PATTERNS = (Kind.QUERY, Kind.WATCH)  # whose key may contain `*`
 
 
 class PacketError(Exception):
-    """The client sent what is no packet; its fault."""
+    """The client sent an invalid packet: a fault of the client."""
 
 
 class Packet(NamedTuple):
-    """One of them."""
+    """One message between the bridge and a client."""
 
     kind: Kind
     number: int
@@ -60,7 +60,7 @@ class Packet(NamedTuple):
 
 
 class Header(NamedTuple):
-    """The first bytes of a packet, checked."""
+    """The validated first bytes of a client's packet."""
 
     kind: Kind
     number: int
@@ -70,28 +70,33 @@ class Header(NamedTuple):
 
 
 def encode_packet(packet: Packet) -> bytes:
-    """The bytes of a packet."""
+    """Return the bytes of a packet."""
     key, milliseconds = packet.key.encode("ascii"), round(packet.timeout * 1000)
     return _HEADER.pack(len(packet.payload), packet.kind, len(key), milliseconds, packet.number) + key + packet.payload
 
 
+def fits_packet(key: str) -> bool:
+    """Return whether a packet can hold a key that another process declared."""
+    return key.isascii() and len(key) <= 255
+
+
 def read_header(data: bytes) -> Header:
-    """The header of a packet from a client; raises PacketError."""
+    """Return the header of a client's packet. Raises PacketError if it is not valid."""
     payload_bytes, kind, key_bytes, milliseconds, number = _HEADER.unpack(data)
     if not Kind.QUERY <= kind <= Kind.WATCH:
-        raise PacketError(f"kind {kind} is not one that a client sends")
-    most = MAX_QUESTION_BYTES if kind == Kind.QUERY else 0
-    if payload_bytes > most:
-        raise PacketError(f"a payload of {payload_bytes} bytes, the limit is {most}")
+        raise PacketError(f"packet kind {kind} is not one that a client sends")
+    limit = MAX_QUERY_BYTES if kind == Kind.QUERY else 0
+    if payload_bytes > limit:
+        raise PacketError(f"the payload has {payload_bytes} bytes, the limit is {limit}")
     return Header(Kind(kind), number, milliseconds / 1000, key_bytes, payload_bytes)
 
 
 def check_key(data: bytes, kind: Kind) -> str:
-    """The key of a packet from a client; raises PacketError.
+    """Return the key of a client's packet. Raises PacketError if it is not valid.
 
-    Nothing outside `daedalus/` is reached through a bridge, least of all the routers' own settings.
+    A bridge gives access to keys under `daedalus/` only: Zenoh's routers expose their settings under other keys.
     """
     key = data.decode("ascii", "replace")
     if not _KEY.fullmatch(key) or ("*" in key and kind not in _PATTERNS):
-        raise PacketError(f"{kind.name} has no proper key: {key[:64]!r}")
+        raise PacketError(f"the key of {kind.name} is not valid: {key[:64]!r}")
     return key

@@ -1,4 +1,4 @@
-"""Lets clients in, each with a transport of its own, and ends them all when told to stop."""
+"""The bridge's listening socket: accepts clients, and closes them all when stopped."""
 
 import contextlib
 import logging
@@ -11,13 +11,13 @@ from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
-_MOST_CLIENTS = 64  # at once
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
-_END_SECONDS = 4.0  # for all clients together, when told to stop
+_MAX_CLIENTS = 64  # at once
+_HEARTBEAT_SECONDS = 0.2  # between checks of the stop event
+_END_SECONDS = 4.0  # for all clients to end after a stop
 
 
 class Bridge:
-    """All clients of one listening socket, each with a transport of its own."""
+    """Server of one listening socket; each client gets its own transport."""
 
     def __init__(self, listener: socket.socket, open_transport: Callable[[], Transport]) -> None:
         self._listener = listener
@@ -25,12 +25,12 @@ class Bridge:
         self._clients: dict[ClientConnection, threading.Thread] = {}
 
     def run(self, stop: threading.Event) -> None:
-        """Serves whoever comes until told to stop; then ends them all."""
+        """Serve clients until `stop` is set, then close all connections."""
         self._listener.settimeout(_HEARTBEAT_SECONDS)
         try:
             while not stop.is_set():
                 with contextlib.suppress(TimeoutError, ConnectionError):
-                    self._welcome(*self._listener.accept())
+                    self._accept(*self._listener.accept())
                 self._clients = {client: thread for client, thread in self._clients.items() if thread.is_alive()}
         finally:
             self._listener.close()
@@ -39,11 +39,11 @@ class Bridge:
             for thread in self._clients.values():
                 thread.join(_END_SECONDS / len(self._clients))
 
-    def _welcome(self, connection: socket.socket, address: tuple[str, int]) -> None:
+    def _accept(self, connection: socket.socket, address: tuple[str, int]) -> None:
         name = f"{address[0]}:{address[1]}"
-        if len(self._clients) >= _MOST_CLIENTS:
+        if len(self._clients) >= _MAX_CLIENTS:
             connection.close()
-            _logger.info(f"turned {name} away: {_MOST_CLIENTS} clients are here already")
+            _logger.warning("refused %s: %d clients are connected already", name, _MAX_CLIENTS)
             return
         client = ClientConnection(connection, self._open_transport)
         thread = threading.Thread(target=self._serve, args=(client, name), name="bridge-client", daemon=True)
@@ -51,6 +51,9 @@ class Bridge:
         thread.start()
 
     def _serve(self, client: ClientConnection, name: str) -> None:
-        _logger.info(f"{name} came")
+        _logger.info("%s connected", name)
         reason = client.run()
-        _logger.info(f"{name} was given up: {reason}" if reason else f"{name} went")
+        if reason:
+            _logger.warning("%s was disconnected: %s", name, reason)
+        else:
+            _logger.info("%s disconnected", name)

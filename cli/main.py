@@ -49,6 +49,9 @@ def main() -> int:
         hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
         print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
         return 2
+    from daedalus.cli.processes import exit_on_thread_exceptions
+
+    exit_on_thread_exceptions()
     return _COMMANDS[command](rest)
 
 

@@ -1,16 +1,20 @@
-"""Signals and lifetime of processes: stop on SIGTERM and SIGINT, and end with the parent process."""
+"""What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
+import logging
 import os
 import signal
 import sys
 import threading
 import time
+import traceback
+
+_logger = logging.getLogger(__name__)
 
 
 def stop_on_signals() -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
-    The handlers only set the event, so that the process can save its state before it ends.
+    The signal handlers only set the event, so that the process closes its resources before it ends.
     """
     stop = threading.Event()
 
@@ -23,7 +27,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_with_parent(stop: threading.Event) -> None:
-    """Set `stop` when standard input ends. The parent process holds standard input open while it runs."""
+    """Set `stop` when standard input ends: the parent holds it open while it runs."""
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -33,8 +37,30 @@ def exit_with_parent(stop: threading.Event) -> None:
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
 
 
+def exit_on_thread_exceptions() -> None:
+    """Make an exception in any thread end the process with status 1, with its traceback on standard error.
+
+    An exception that no thread handles is a fault of ours. Without this hook only its thread would end and the process
+    would idle; with it a supervisor restarts the process. Call this at the start of a command.
+    """
+
+    def end_process(arguments: threading.ExceptHookArgs) -> None:
+        name = arguments.thread.name if arguments.thread else "unknown"
+        try:
+            print(f"exception in thread {name}:", file=sys.stderr)
+            traceback.print_exception(arguments.exc_type, arguments.exc_value, arguments.exc_traceback)
+            sys.stderr.flush()
+            _logger.critical("exception in thread %s: %s: the process ends", name, arguments.exc_type.__name__)
+            sys.stdout.flush()
+        finally:
+            # sys.exit would end only this thread, and an orderly end could wait for the failed thread without end.
+            os._exit(1)
+
+    threading.excepthook = end_process
+
+
 def process_started() -> float:
-    """Return the start time of this process on the monotonic clock, or the time now where it is not known."""
+    """Return the start of this process on the monotonic clock, or the present time where it is not known."""
     now = time.monotonic()
     try:
         with (

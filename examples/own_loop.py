@@ -1,12 +1,13 @@
-"""A loop that owns its clock, trained from: `python examples/own_loop.py tcp/127.0.0.1:7447`.
+"""Train from a loop that the caller owns: `python examples/own_loop.py tcp/127.0.0.1:7447`.
 
-The learner, in another terminal, on any machine:
+Start the learner in another terminal, on any machine:
     daedalus learner cartpole --actors 1 --set collection.rollout_length=64 --set training.batch_rollouts=4
 
-CartPole stands for a robot here: what matters is that the loop calls the policy, and not the other way round.
+CartPole stands for a robot here: the loop calls the policy, instead of the actor stepping the environment.
 """
 
 import argparse
+import logging
 
 import gymnasium
 
@@ -16,8 +17,9 @@ from daedalus import Client
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("address", nargs="?", default="tcp/127.0.0.1:7447", help="default: %(default)s")
-    options.add_argument("--name", help="this actor's name (default: from the host's)")
+    options.add_argument("--name", help="name of this actor (default: made of the host name)")
     parsed = options.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")  # the client logs when it joins and leaves the run
     robot = gymnasium.make("CartPole-v1")
     with Client(
         parsed.address, observation_space=robot.observation_space, action_space=robot.action_space, name=parsed.name

@@ -1,1 +1,1 @@
-"""Learns: returns and losses, the optimiser and its state, and the service that feeds them. Never imports the actor."""
+"""The learner process: settings, training, serving of actors, reporting. Never imports the actor."""

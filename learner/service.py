@@ -1,7 +1,7 @@
-"""The life of a learner: let actors in, learn from what they send, publish, save, leave. The main thread.
+"""The learner process: serve actors, train on their rollouts, publish snapshots, save checkpoints.
 
-The other threads are the actor server's and the recorder's. Torch is imported only when actors can already join: it
-takes a second, in which they make their environments.
+This is the main thread; the other threads are those of the actor server and the recorder. Torch is imported after
+actors can join, because the import takes a second and the actors make their environments in the meantime.
 """
 
 import logging
@@ -37,15 +37,15 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """How a run ended."""
+    """Result of a run."""
 
     solved: bool
-    finished: bool  # solved, or the budget used up; False if it was stopped before
-    seconds_to_target: float | None
+    finished: bool  # solved or out of budget; False if the run was stopped before
+    seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
 
 
 class LearnerService:
-    """One run of one learner over one transport."""
+    """One run of one learner process over one transport."""
 
     def __init__(
         self,
@@ -62,14 +62,14 @@ class LearnerService:
         """Construct the service.
 
         Args:
-          spec: what is learned.
-          directory: of the run, which is named after it.
-          transport: to the actors; the caller closes it.
-          stop: ends the run when it is set.
+          spec: specification of the run.
+          directory: the run directory; its name is the name of the run.
+          transport: the network; the caller closes it.
+          stop: event that ends the run.
           progress: shows each metrics row.
-          open_writers: where metrics rows go.
-          started: on the monotonic clock, what the run's seconds count from.
-          restored: the checkpoint to continue from.
+          open_writers: functions that open the metrics writers.
+          started: start of the run on the monotonic clock, in seconds.
+          restored: checkpoint to continue from.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._restored = open_writers, restored
@@ -78,7 +78,7 @@ class LearnerService:
             self._counters.restore(restored.counters)
         epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
-        self._health = Health(started=started, updated=started, attended=started)
+        self._health = Health(started=started, updated=started, actor_seen=started)
         self._server = ActorServer(
             directory.name,
             spec,
@@ -102,10 +102,11 @@ class LearnerService:
         )
 
     def run(self) -> Outcome:
-        """Serve actors and learn until the target, the budget's end, or the order to stop.
+        """Serve actors and train until the target is reached, the budget is used or the stop event is set.
 
-        Once learning has begun, the run ends with a checkpoint and a summary, however it ends. Raises TransportError
-        if another learner serves the run, CheckpointMismatchError, NetworkError or SettingsError.
+        Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
+        learner serves the run, CheckpointMismatchError if the checkpoint does not fit the settings, NetworkError if
+        the policy does not support the spaces, SettingsError if the device is not available.
         """
         try:
             self._server.open()
@@ -120,10 +121,10 @@ class LearnerService:
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
             return self._learn(learner, self._checkpointer(learner))
         finally:
-            self._leave()
+            self._close_server()
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
-        """Offer the policy to the actors, and return what saves it."""
+        """Publish the policy and return its checkpointer."""
         from daedalus.learner.training.checkpointer import Checkpointer
 
         program, spaces = learner.program(), self._server.fleet.spaces
@@ -142,25 +143,25 @@ class LearnerService:
         )
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer") -> Outcome:
-        """Run the main loop, and what must follow it."""
+        """Run the main loop, then write the last metrics row, checkpoint and summary."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
         try:
             seconds_to_target = self._loop(learner, checkpointer, recorder)
         finally:
             ended = time.monotonic()
-            self._leave()
+            self._close_server()
             recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
             recorder.close()
             checkpointer.save()
         solved = seconds_to_target is not None
-        used_up = self._counters.env_steps >= self._spec.training.env_steps
-        finished = used_up or (solved and self._spec.training.stop_when_solved)
+        out_of_budget = self._counters.env_steps >= self._spec.training.env_steps
+        finished = out_of_budget or (solved and self._spec.training.stop_when_solved)
         self._write_summary(solved, finished, seconds_to_target, ended)
         return Outcome(solved=solved, finished=finished, seconds_to_target=seconds_to_target)
 
     def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
-        """Update until there is a reason to end; return when the target was reached, if it was."""
+        """Train until the run ends. Return the seconds until the target was reached, or None if it was not."""
         training, service = self._spec.training, self._spec.service
         seconds_to_target = None
         now = time.monotonic()
@@ -183,7 +184,7 @@ class LearnerService:
         return seconds_to_target
 
     def _update(self, learner: "Learner") -> None:
-        """Learn from one batch and publish; do nothing if no batch is complete soon."""
+        """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
         rollouts = self._server.rollouts.take_batch(learner.policy_version)
         if not rollouts:
@@ -191,10 +192,10 @@ class LearnerService:
         skipped = learner.updates_skipped
         learner.step(rollouts, progress)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
-        self._health.updated = self._health.attended = time.monotonic()
+        self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
-            _logger.warning("an update was skipped: its gradient was not finite; the weights stay as they were")
+            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
 
@@ -205,16 +206,19 @@ class LearnerService:
         learner: "Learner",
         checkpointer: "Checkpointer",
     ) -> None:
-        """Give an evaluator the newest policy, of which a checkpoint is kept; or take in how it played."""
+        """Record the report of an evaluator, or answer its request with the newest policy.
+
+        The evaluated policy is saved as a checkpoint first, because it may turn out to be the best.
+        """
         if isinstance(message, EvaluationReport):
-            answer, news = self._evaluations.report(message)
+            answer, text = self._evaluations.report(message)
             request.reply(encode(answer))
-            if news:
-                _logger.info(news)
+            if text:
+                _logger.info(text)
             return
         directory = checkpointer.save()
         if directory is None:
-            request.reply(encode(Refusal(code="not_ready", reason="no checkpoint could be saved")))
+            request.reply(encode(Refusal(code="not_ready", reason="the checkpoint of the policy could not be saved")))
             return
         publisher, version = self._server.publisher, learner.policy_version
         if version != publisher.version:
@@ -222,7 +226,7 @@ class LearnerService:
         self._evaluations.begin(message.evaluator, directory, version, self._counters.env_steps)
         request.reply(publisher.newest())
 
-    def _leave(self) -> None:
+    def _close_server(self) -> None:
         stopped = self._stop.is_set()
         self._server.close("the learner was stopped" if stopped else "the learner has finished")
 
@@ -234,4 +238,4 @@ class LearnerService:
         try:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
-            _logger.warning("no summary was written: %s", error.strerror)
+            _logger.warning("summary not written: %s", error.strerror)

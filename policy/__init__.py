@@ -1,6 +1,6 @@
-"""The network and its forward pass, both ways: torch for learning, a program with numpy around it for acting."""
+"""The policy network: in torch for learning, as an exported ONNX program for acting."""
 
 import os
 
-# onnxruntime would tell its makers of every process that imports it.
+# Otherwise onnxruntime sends telemetry from every process that imports it.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

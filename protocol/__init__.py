@@ -1,1 +1,1 @@
-"""What crosses the wire, and nothing else: messages, their bytes, the run's specification, keys, transports."""
+"""The wire protocol: messages, their encoding, the run's specification and key expressions. Pure, without I/O."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Algorithm:
-    """How an algorithm's updates are scheduled.
+class AlgorithmRecord:
+    """The schedule of one algorithm's updates.
 
     Attributes:
       name: as in `training.algorithm`.
@@ -30,10 +30,10 @@ class Algorithm:
 ALGORITHMS = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm(name="a2c", summary="synchronous", synchronous=True),
-        Algorithm(name="a3c", summary="asynchronous", batch_rollouts=1),
-        Algorithm(name="impala", summary="asynchronous, corrected for policy lag", corrected=True),
-        Algorithm(
+        AlgorithmRecord(name="a2c", summary="synchronous", synchronous=True),
+        AlgorithmRecord(name="a3c", summary="asynchronous", batch_rollouts=1),
+        AlgorithmRecord(name="impala", summary="asynchronous, corrected for policy lag", corrected=True),
+        AlgorithmRecord(
             name="appo", summary="as impala, several passes over each batch", corrected=True, passes_over_batch=True
         ),
     )

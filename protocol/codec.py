@@ -1,4 +1,4 @@
-"""Messages to bytes and back; bytes to messages, or an error that says what is wrong with them.
+"""Encoding messages as bytes, and decoding bytes that may be damaged or hostile.
 
     offset  bytes
          0      4  magic b"DAED"
@@ -10,11 +10,11 @@
          -      -  body: the raw little-endian buffers of the arrays, each padded with zeros to 8; of a
                    swapped one the buffer's second axis comes first
 
-A rollout's frames are swapped: environment by environment, zstd finds each frame's predecessor beside it.
+A rollout's frames are swapped: in the order of environments, each frame follows its predecessor, and zstd finds it.
 
-The first six bytes keep their meaning in every version, so that two ends of different versions can
-name both. Nothing that is read executes, and no size that a message declares is believed before it
-is held against `Limits`. This file knows no key, no transport and no state.
+The first six bytes keep their meaning in every version, so that an end can name the version of the other. Decoding
+executes nothing, and checks every declared size against `Limits` before it allocates memory. This file knows no keys
+and no transport.
 """
 
 import math
@@ -40,30 +40,33 @@ _PLAIN, _ZSTD = 0, 1
 _ALIGNMENT = 8
 _DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
-_COMPRESSED = (Rollout, Program, CompactSnapshot)  # weights are noise to zstd; the rest is small
-_LEVEL, _BYTES_LEVEL = -1, 1  # zstd's: what is cheap for numbers leaves pixels and byte planes twice as large
+_COMPRESSED = (Rollout, Program, CompactSnapshot)  # zstd cannot compress weights; other messages are small
+_LEVEL, _BYTES_LEVEL = (
+    -1,
+    1,
+)  # zstd levels: the faster one, for floats, would leave pixels and byte planes twice as large
 _MAX_DIMENSIONS = 8
 
 
 class ProtocolError(Exception):
-    """The bytes are not a message that this end can accept; the sender's fault."""
+    """The bytes are not an acceptable message: a fault of the sender."""
 
 
 class VersionMismatchError(ProtocolError):
-    """The other end speaks another version of the protocol."""
+    """The other end uses another version of the protocol."""
 
     def __init__(self, theirs: int) -> None:
         super().__init__(
-            f"the other end speaks protocol version {theirs}, this one {PROTOCOL_VERSION}: "
+            f"the other end uses protocol version {theirs}, this one {PROTOCOL_VERSION}: "
             "install the same release of daedalus-rl on both"
         )
         self.theirs = theirs
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message.
+    """Encode a message.
 
-    Raises ValueError for an array whose dtype does not travel: a fault of our own.
+    Raises ValueError for an array whose dtype the protocol does not support: a fault of the caller.
     """
     arrays: list[tuple[str, np.ndarray]] = []
     fields = schema.pack(message, "", arrays)
@@ -71,7 +74,7 @@ def encode(message: Message) -> bytes:
     content = {
         "kind": type(message).__name__,
         "fields": fields,
-        "arrays": [(name, _travelling(name, array).str, array.shape, _is_swapped(array)) for name, array in arrays],
+        "arrays": [(name, _wire_dtype(name, array).str, array.shape, _is_swapped(array)) for name, array in arrays],
         "size": len(body),
     }
     header = cast(bytes, msgpack.packb(content))
@@ -88,17 +91,17 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes, limits: Limits) -> Message:
-    """The message in `data`; its arrays are read-only.
+    """Decode a message; its arrays are read-only.
 
-    Raises VersionMismatchError if another version wrote it, ProtocolError if it is anything but one whole,
-    consistent message within `limits`; and nothing else, whatever the bytes.
+    Raises VersionMismatchError if another protocol version wrote it, and ProtocolError if the bytes are not exactly one
+    complete and consistent message within `limits`. No input raises any other exception.
     """
     flags, header, body = _split(data, limits)
     kind, fields, arrays, size = _read_header(header)
     if size > limits.max_bytes:
         raise ProtocolError(f"the body declares {size} bytes, the limit is {limits.max_bytes}")
     if flags == _ZSTD and _KINDS[kind] not in _COMPRESSED:
-        raise ProtocolError(f"a {kind} does not travel compressed")
+        raise ProtocolError(f"a {kind} must not be compressed")
     layout = _read_layout(arrays, size, limits)
     buffers = _read_arrays(layout, _plain_body(flags, body, size))
     try:
@@ -115,22 +118,22 @@ def decode(data: bytes, limits: Limits) -> Message:
 # ------------------------------------------------------------------------------------------- writing
 
 
-def _travelling(name: str, array: np.ndarray) -> np.dtype:
+def _wire_dtype(name: str, array: np.ndarray) -> np.dtype:
     dtype = array.dtype.newbyteorder("<")
     if dtype.str not in _DTYPES:
-        raise ValueError(f"array {name!r} has dtype {array.dtype}, which does not travel")
+        raise ValueError(f"array {name!r} has dtype {array.dtype}, which the protocol does not support")
     return dtype
 
 
 def _is_swapped(array: np.ndarray) -> bool:
-    """Whether the array lies in memory with its second axis first, and is sent so."""
+    """Return whether the array is in memory with its second axis first; it is then sent in that order."""
     return array.ndim >= 2 and not array.flags.c_contiguous and array.swapaxes(0, 1).flags.c_contiguous
 
 
 def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
     if _is_swapped(array):
         array = array.swapaxes(0, 1)
-    data = np.ascontiguousarray(array, dtype=_travelling(name, array)).tobytes()
+    data = np.ascontiguousarray(array, dtype=_wire_dtype(name, array)).tobytes()
     return data, bytes(-len(data) % _ALIGNMENT)
 
 
@@ -161,7 +164,7 @@ def _split(data: bytes, limits: Limits) -> tuple[int, bytes, memoryview]:
 def _read_header(header: bytes) -> tuple[str, dict[str, Any], list[Any], int]:
     try:
         content = msgpack.unpackb(header, raw=False, strict_map_key=True, max_ext_len=0, max_bin_len=0)
-    except Exception as error:  # msgpack raises ValueError, its own kinds and UnicodeDecodeError alike
+    except Exception as error:  # msgpack raises ValueError, UnicodeDecodeError and exceptions of its own
         raise ProtocolError(f"unreadable header: {type(error).__name__}") from None
     if not isinstance(content, dict) or content.keys() != {"kind", "fields", "arrays", "size"}:
         raise ProtocolError("the header must have exactly kind, fields, arrays and size")
@@ -174,7 +177,7 @@ def _read_header(header: bytes) -> tuple[str, dict[str, Any], list[Any], int]:
 
 
 class _Entry(NamedTuple):
-    """One array of the body."""
+    """Position of one array in the body."""
 
     name: str
     dtype: np.dtype
@@ -184,7 +187,7 @@ class _Entry(NamedTuple):
 
 
 def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[_Entry]:
-    """Where each array lies; together they fill the body exactly."""
+    """Return the position of each array. Raises ProtocolError if they do not fill the body exactly."""
     if len(arrays) > limits.max_arrays:
         raise ProtocolError(f"{len(arrays)} arrays, the limit is {limits.max_arrays}")
     layout, offset, names = [], 0, set()
@@ -195,13 +198,13 @@ def _read_layout(arrays: list[Any], size: int, limits: Limits) -> list[_Entry]:
         if not isinstance(name, str) or name in names:
             raise ProtocolError("array names must be distinct strings")
         if not isinstance(dtype, str) or dtype not in _DTYPES:
-            raise ProtocolError(f"array {name!r} has a dtype that does not travel")
+            raise ProtocolError(f"array {name!r} has an unsupported dtype")
         if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
-            raise ProtocolError(f"array {name!r} has no proper shape")
+            raise ProtocolError(f"array {name!r} has an invalid shape")
         if not all(type(side) is int and 0 <= side <= limits.max_bytes for side in shape):
-            raise ProtocolError(f"array {name!r} has no proper shape")
+            raise ProtocolError(f"array {name!r} has an invalid shape")
         if type(swapped) is not bool or (swapped and len(shape) < 2):
-            raise ProtocolError(f"array {name!r} cannot be swapped like that")
+            raise ProtocolError(f"array {name!r} has an invalid swapped flag")
         layout.append(_Entry(name, _DTYPES[dtype], tuple(shape), swapped, offset))
         names.add(name)
         length = math.prod(shape) * _DTYPES[dtype].itemsize
@@ -217,7 +220,7 @@ def _plain_body(flags: int, body: memoryview, size: int) -> bytes | memoryview:
             raise ProtocolError(f"the body has {len(body)} bytes, it declares {size}")
         return body
     try:
-        # python-zstandard ignores max_output_size where the frame declares its size: hold that against ours first.
+        # python-zstandard ignores max_output_size if the frame declares its size, so check the declared size first.
         if zstandard.frame_content_size(body) != size:
             raise ProtocolError("the compressed frame declares another size than the header")
         plain = _zstd.decompressor.decompress(body, max_output_size=size, allow_extra_data=False)
@@ -233,21 +236,21 @@ def _read_arrays(layout: list[_Entry], body: bytes | memoryview) -> dict[str, np
     for name, dtype, shape, swapped, offset in layout:
         flat = np.frombuffer(body, np.uint8, math.prod(shape) * dtype.itemsize, offset)
         if dtype == np.bool_ and flat.size and flat.max() > 1:
-            raise ProtocolError(f"array {name!r} has a truth value that is neither 0 nor 1")
+            raise ProtocolError(f"array {name!r} has a bool that is neither 0 nor 1")
         try:
             if swapped:
                 array = flat.view(dtype).reshape(shape[1], shape[0], *shape[2:]).swapaxes(0, 1)
             else:
                 array = flat.view(dtype).reshape(shape)
-        except ValueError:  # sides whose product is more than numpy counts to, beside one of 0
-            raise ProtocolError(f"array {name!r} has no proper shape") from None
+        except ValueError:  # the product of the sides overflows although one of them is 0
+            raise ProtocolError(f"array {name!r} has an invalid shape") from None
         array.flags.writeable = False
         arrays[name] = array
     return arrays
 
 
 class _Zstd(threading.local):
-    """zstd contexts are worth keeping and must not be shared between threads."""
+    """zstd contexts of one thread: they are expensive to create and must not be shared between threads."""
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)

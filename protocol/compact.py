@@ -1,20 +1,21 @@
-"""Weights for slow links: in bfloat16, and as differences to a version that the reader holds.
+"""Compact weights for slow links: bfloat16, optionally as differences to a version that the reader holds.
 
-A bfloat16 is the upper half of a float32, rounded to the nearest even. From one update to the next most of them stay
-as they are and the others move by little, so differences are small numbers of either sign; folded (0, -1, 1, -2, ...
-as 0, 1, 2, 3, ...) and with all high bytes before all low bytes they are mostly zeros, which is what zstd likes: 4 to
-7 % of the float32 that they stand for, where bfloat16 alone has 35 % (docs/results.md). Pure functions.
+A bfloat16 is the upper half of a float32, rounded to the nearest even. From one update to the next most values are
+unchanged and the others change little, so the differences are small integers. They are mapped to unsigned numbers
+(0, -1, 1, -2, ... to 0, 1, 2, 3, ...) and stored with all high bytes before all low bytes. Most bytes are then zero.
+zstd compresses them to 4 to 7 % of the float32 weights; whole bfloat16 weights compress to 35 % (docs/results.md).
+Pure functions.
 """
 
 import numpy as np
 
-Bits = dict[str, np.ndarray]  # by weight, uint16: bfloat16, or differences of them, of the weight's own shape
+Bits = dict[str, np.ndarray]  # by weight name, uint16 of the weight's shape: bfloat16 values or their differences
 
 
 def bfloat16(weights: dict[str, np.ndarray]) -> Bits:
-    """The bits of the nearest bfloat16 of each float32; NaN stays one.
+    """Return the bits of the nearest bfloat16 of each float32; NaN stays NaN.
 
-    Raises ValueError for weights of another dtype: a fault of our own.
+    Raises ValueError for weights of another dtype: a fault of the caller.
     """
     return {name: _rounded(name, array) for name, array in weights.items()}
 
@@ -28,32 +29,32 @@ def _rounded(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def float32(bits: Bits) -> dict[str, np.ndarray]:
-    """The float32 that each bfloat16 stands for."""
+    """Return the float32 value of each bfloat16."""
     return {name: (array.astype(np.uint32) << 16).view(np.float32) for name, array in bits.items()}
 
 
 def planes(bits: Bits, base: Bits | None) -> dict[str, np.ndarray]:
-    """What travels: uint8 [2, *shape], high bytes and low bytes, of the bits or of their difference to `base`'s."""
+    """Return what is sent, uint8 [2, *shape]: the high and low bytes of the bits, or of their difference to `base`."""
     if base is None:
         return {name: _split(array) for name, array in bits.items()}
     return {name: _split(_folded(array, base[name])) for name, array in bits.items()}
 
 
 def bits_of(planes: dict[str, np.ndarray], base: Bits | None) -> Bits:
-    """What `planes` was made of.
+    """Return the bits from which `planes` were computed, with the same `base`.
 
-    Raises ValueError if they are no planes, or do not fit `base`: the sender's fault.
+    Raises ValueError if the arrays are not planes or do not fit `base`: a fault of the sender.
     """
     joined = {name: _joined(name, array) for name, array in planes.items()}
     if base is None:
         return joined
     if {name: array.shape for name, array in joined.items()} != {name: array.shape for name, array in base.items()}:
-        raise ValueError("differences of other weights than those that they are to")
+        raise ValueError("the differences have other names or shapes than their base")
     return {name: _added(base[name], array) for name, array in joined.items()}
 
 
 def _folded(bits: np.ndarray, base: np.ndarray) -> np.ndarray:
-    signed = (bits.reshape(-1) - base.reshape(-1)).view(np.int16)  # flat: numpy warns of single numbers that wrap
+    signed = (bits.reshape(-1) - base.reshape(-1)).view(np.int16)  # flat, since numpy warns if a scalar wraps
     return (signed << 1 ^ signed >> 15).view(np.uint16).reshape(bits.shape)
 
 

@@ -1,8 +1,8 @@
-"""Frames and the stacks made of them. A frame travels once; both ends make the same stacks of it.
+"""Frames and frame stacks. A frame is sent once; the actor and the learner build the same stacks from the frames.
 
-A stack is the newest k frames, oldest first. At the start of an episode its first frame stands in for the frames
-before it, so no stack shows two episodes. The actor keeps running stacks; the learner makes those of every row of a
-rollout from the frames that came. Pure numpy; this file does not know how frames become bytes (codec.py).
+A stack is the newest k frames, oldest first. At the start of an episode its first frame replaces the frames before it,
+so no stack contains frames of two episodes. The actor keeps running stacks; the learner builds the stacks of every row
+of a rollout from the received frames. Pure numpy; codec.py encodes frames as bytes.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from daedalus.protocol.spaces import ArraySpace
 
 
 class FrameStack:
-    """The running stacks of E environments. With k = 1 a stack is the frame itself, without an axis of its own."""
+    """Running stacks of E environments. With k = 1 a stack is the frame itself, without a stack axis."""
 
     def __init__(self, space: ArraySpace, environments: int) -> None:
         self._depth = space.frames
@@ -19,20 +19,20 @@ class FrameStack:
 
     @property
     def frames(self) -> np.ndarray:
-        """[E, k, *frame_shape] what the stacks are made of, also where k is 1; a view."""
+        """Frames of the stacks [E, k, *frame_shape], also for k = 1; a view."""
         return self._frames
 
     @property
     def observations(self) -> np.ndarray:
-        """[E, *stacked_shape] what the policy sees; a view, good until the next `push`."""
+        """Observations of the policy [E, *stacked_shape]; a view, valid until the next `push`."""
         return self._frames[:, 0] if self._depth == 1 else self._frames
 
     def push(self, frames: np.ndarray, starts: np.ndarray) -> None:
-        """Takes in the next frame of each environment.
+        """Add the next frame of each environment.
 
         Args:
           frames: [E, *frame_shape].
-          starts: [E] bool, whether an episode starts with it.
+          starts: [E] bool, whether an episode starts with the frame.
         """
         if self._depth == 1:
             self._frames[:, 0] = frames
@@ -44,12 +44,12 @@ class FrameStack:
 
 
 def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:
-    """Makes the observations of all rows of a rollout.
+    """Compute the observations of all rows of a rollout.
 
     Args:
-      frames: [k-1 + T+1, E, *frame_shape]; the first k are the stack of row 0, complete as it was.
-      valid: [T, E] bool; after a row that is not, an episode starts.
-      out: [T+1, E, k, *frame_shape], to be filled; k is taken from it.
+      frames: [k-1 + T+1, E, *frame_shape]; the first k are the complete stack of row 0.
+      valid: [T, E] bool; an episode starts after each row that is not valid.
+      out: [T+1, E, k, *frame_shape], filled by this function; k is taken from its shape.
     """
     rows, depth = out.shape[0], out.shape[2]
     for age in range(depth):
@@ -58,5 +58,5 @@ def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:
         start = row + 1  # the first row of the new episode
         first = frames[start + depth - 1, environment]
         for later in range(start, min(start + depth - 1, rows)):
-            # Of this row's stack, frames from before the start are those at the first depth - 1 - (later - start).
+            # In this row's stack, the first depth - 1 - (later - start) frames are from before the start.
             out[later, environment, : depth - 1 - (later - start)] = first

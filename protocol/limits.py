@@ -1,18 +1,36 @@
-"""What a message may ask of its reader, by kind of message: held before memory is allocated for it."""
+"""Limits of each kind of message, checked before memory is allocated for it.
+
+A reader decodes a message with the limits of the kind that it expects. The limits of a rollout depend on the run's
+spec and are computed by the learner (learner/serving/intake.py).
+"""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What a message may ask of its reader before anything is known about it.
+    """Largest sizes that a reader accepts; the defaults suit messages without large arrays.
 
     Attributes:
-      max_bytes: largest body after decompression; also the largest message.
-      max_header_bytes: largest header.
-      max_arrays: most arrays in one message.
+      max_bytes: bytes of the body after decompression; also of the whole message.
+      max_header_bytes: bytes of the header.
+      max_arrays: number of arrays.
     """
 
     max_bytes: int = 64 << 20
     max_header_bytes: int = 256 << 10
     max_arrays: int = 4096
+
+
+# Read by the learner; a larger message is malformed.
+JOIN_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)  # names and spaces, no arrays
+SNAPSHOT_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)  # a name and three numbers
+EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)  # returns and lengths
+
+# Read by actors and evaluators.
+ACKNOWLEDGEMENT_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)  # a verdict and a reason
+SNAPSHOT_PART_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=1)  # one small piece
+LEARNER_LIMITS = Limits(max_bytes=1 << 30)  # any message of the learner: weights and programs may be large
+
+# Read by operators.
+STATUS_LIMITS = Limits()  # grows with the number of actors

@@ -1,8 +1,7 @@
-"""The vocabulary of the wire: every message that crosses it, as frozen data.
+"""All messages of the protocol, as frozen dataclasses.
 
-Shapes are checked at construction, so an inconsistent message can neither be sent nor leave the
-decoder. This file does not know how messages become bytes (codec.py), on which key they travel
-(keys.py), nor whether they are welcome (the learner's intake).
+Shapes are checked at construction, so an inconsistent message can neither be sent nor decoded. codec.py encodes
+messages, keys.py names the keys that they use, and the learner's intake decides which it accepts.
 
 Time first: row t holds observation t, the action chosen from it and the reward that action earned.
 """
@@ -19,31 +18,31 @@ from daedalus.protocol.status import RunStatus
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Join:
-    """An actor asks to take part. Actor -> learner, on `join`.
+    """Request of an actor to join. Actor -> learner, on `join`.
 
-    Sent twice: without spaces it asks what to play; with the spaces that it then found in the
-    environment it asks to be counted in.
+    Sent twice: first without spaces, to receive the specification of the run; then with the spaces of the environment
+    that the actor made from the specification.
     """
 
-    actor: str  # a name that survives restarts
-    incarnation: int  # this life of the process
+    actor: str  # a name that stays the same across restarts
+    incarnation: int  # identifies this process of the actor
     spaces: Spaces | None = None
-    environments: int = 0  # how many it plays at once
+    environments: int = 0  # E, number of vectorised environments
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Welcome:
-    """What an actor needs to play: learner -> actor, in answer to Join."""
+    """Specification that an actor needs. Learner -> actor, in answer to Join."""
 
     run: str
-    learner_epoch: int  # this life of the learner; rollouts of another are fenced
-    seed: int  # for this actor's environments and samples, and this life of it only
+    learner_epoch: int  # identifies this process of the learner; rollouts for another epoch are fenced
+    seed: int  # for the environments and samples of this incarnation of the actor
     spec: RunSpec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refusal:
-    """A typed no, in answer to any query."""
+    """Negative answer to any query, with a code."""
 
     code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full", "name_taken"]
     reason: str
@@ -59,7 +58,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutIdentity:
-    """Makes a rollout unique: the learner trains on each at most once."""
+    """Unique identity of a rollout: the learner trains on each rollout at most once."""
 
     actor: str
     incarnation: int
@@ -71,23 +70,23 @@ class RolloutIdentity:
 class Rollout:
     """T consecutive rows of E environments under one snapshot. Actor -> learner, on `rollouts/{actor}`.
 
-    Each frame travels once: where the policy sees k frames stacked, the observation of row t is made of frames t to
-    t+k-1, the first frame of an episode in place of those before it (protocol/frames.py); k is 1 elsewhere.
-    Environments reset by gymnasium's NEXT_STEP rule: the row after an episode's end only resets, its
-    action was ignored and it is not `valid`; its observation is the true last one of the episode.
+    Each frame is sent once. With a frame stack of k, the observation of row t consists of the frames t to t+k-1, where
+    the first frame of an episode replaces the frames before it (protocol/frames.py); without a frame stack k is 1.
+    Environments reset by gymnasium's NEXT_STEP rule: the row after the end of an episode only resets the environment.
+    Its action was ignored and it is not `valid`; its observation is the final observation of the episode.
     """
 
     identity: RolloutIdentity
     policy_version: int  # of the behaviour policy
     frames: np.ndarray  # [k-1 + T+1, E, *frame_shape]; the last row bootstraps
-    initial_state: np.ndarray  # [E, S] float32, the policy's memory at row 0; S is 0 where it has none
+    initial_state: np.ndarray  # [E, S] float32, the policy's memory at row 0; S is 0 without a memory
     actions: np.ndarray  # [T, E] integers
     behaviour_log_probs: np.ndarray  # [T, E] float32, log mu(a_t | s_t)
-    rewards: np.ndarray  # [T, E] float32, as learning shall see them (scaled)
+    rewards: np.ndarray  # [T, E] float32, scaled and clipped for learning
     terminated: np.ndarray  # [T, E] bool, the environment ended the episode
-    truncated: np.ndarray  # [T, E] bool, a limit did
+    truncated: np.ndarray  # [T, E] bool, a limit ended the episode
     valid: np.ndarray  # [T, E] bool, False where the environment only reset
-    episode_returns: np.ndarray  # [K] float32, true undiscounted returns of the episodes that ended here
+    episode_returns: np.ndarray  # [K] float32, unscaled undiscounted returns of the episodes that ended in this rollout
     episode_lengths: np.ndarray  # [K] int32, their env_steps
 
     def __post_init__(self) -> None:
@@ -95,7 +94,7 @@ class Rollout:
             raise ValueError(f"actions must be [T, E], not {self.actions.shape}")
         rows, environments = self.actions.shape
         if rows == 0 or environments == 0:
-            raise ValueError("a rollout needs at least one row and one environment")
+            raise ValueError("a rollout must have at least one row and one environment")
         if self.frames.ndim < 3 or len(self.frames) <= rows or self.frames.shape[1] != environments:
             raise ValueError(f"frames must be [{rows + 1} or more, {environments}, ...], not {self.frames.shape}")
         if self.initial_state.ndim != 2 or len(self.initial_state) != environments:
@@ -113,41 +112,43 @@ class Rollout:
         if self.actions.dtype.kind not in "iu" or self.episode_lengths.dtype.kind not in "iu":
             raise ValueError("actions and episode_lengths must be integers")
         if self.episode_returns.ndim != 1 or self.episode_returns.shape != self.episode_lengths.shape:
-            raise ValueError("episode_returns and episode_lengths must be [K] alike")
+            raise ValueError("episode_returns and episode_lengths must both be [K]")
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
 
     @property
     def rows(self) -> int:
-        """T."""
+        """T, the number of rows."""
         return self.actions.shape[0]
 
     @property
     def environments(self) -> int:
-        """E."""
+        """E, the number of environments."""
         return self.actions.shape[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """What became of a rollout or of an evaluation's report: learner -> who sent it.
+    """Verdict on a rollout or an evaluation report. Learner -> sender.
 
-    accepted: it will be trained on, unless the learner ends first or its policy lag outgrows the bound.
-    busy: the learner has no room now; send it again. rejected: never; `reason` says why.
-    fenced: the rollout belongs to another life of the learner; join again. finished: the run is over.
-    quarantined: nothing more is taken from this life of the actor, whose rollouts were unfit; `reason` says how.
+    accepted: it will be trained on, unless the learner ends first or its policy lag exceeds the bound.
+    busy: the learner's queue is full; send it again later.
+    rejected: it will never be accepted; `reason` says why.
+    fenced: the rollout belongs to another epoch of the learner or another incarnation of the actor; join again.
+    quarantined: no rollout of this incarnation is accepted any more, since several were invalid; `reason` says why.
+    finished: the run is over.
     """
 
     verdict: Literal["accepted", "busy", "rejected", "fenced", "quarantined", "finished"]
     reason: str = ""
-    policy_version: int = 0  # the newest that was published
+    policy_version: int = 0  # of the newest published snapshot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
-    """Weights at one policy version, immutable. Learner -> actors, on `snapshots`.
+    """Immutable weights of one policy version. Learner -> actors, on `snapshots`.
 
-    `program` names the program they bind to; every input of it but the observation is among them.
+    `program` is the hash of the program; `weights` has all of its inputs except the observations and the state.
     """
 
     learner_epoch: int
@@ -158,22 +159,23 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotRequest:
-    """An actor on a slow link asks for a part of a CompactSnapshot: actor -> learner, on `snapshots`.
+    """Request of an actor on a slow link for one part of a CompactSnapshot. Actor -> learner, on `snapshots`.
 
-    Asking for part 0 has the newest one made, for the version that the actor holds; the others follow by its version.
+    The request for part 0 makes the learner encode its newest snapshot as differences to `held_version`; the requests
+    for the other parts give the policy version of that snapshot.
     """
 
     actor: str
-    held_version: int | None  # what differences are to be to; None: it holds none
-    policy_version: int | None = None  # of the one whose part is asked for; None: the newest
+    held_version: int | None  # the version that the actor holds; None: no version
+    policy_version: int | None = None  # of the snapshot; None: the newest
     part: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SnapshotPart:
-    """A piece of an encoded CompactSnapshot, in answer to SnapshotRequest: small enough to hold up nobody's traffic.
+    """Part of an encoded CompactSnapshot, in answer to SnapshotRequest; small, so that it does not delay other traffic.
 
-    The pieces 0 to parts - 1, one after the other, are the message.
+    The concatenated parts 0 to parts - 1 are the encoded message.
     """
 
     learner_epoch: int
@@ -184,14 +186,14 @@ class SnapshotPart:
 
     def __post_init__(self) -> None:
         if not 0 <= self.part < self.parts:
-            raise ValueError(f"part {self.part} of {self.parts}")
+            raise ValueError(f"part is {self.part}, it must be from 0 to {self.parts - 1}")
         if self.data.ndim != 1 or self.data.dtype != np.uint8:
             raise ValueError(f"data must be uint8 [bytes], not {self.data.dtype} {self.data.shape}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CompactSnapshot:
-    """A Snapshot in bfloat16, whole or as differences to an earlier version (protocol/compact.py).
+    """Snapshot in bfloat16, whole or as differences to an earlier version (protocol/compact.py).
 
     Learner -> actors on slow links, in SnapshotParts.
     """
@@ -199,15 +201,15 @@ class CompactSnapshot:
     learner_epoch: int
     policy_version: int
     program: str
-    base_version: int | None  # what the differences are to; None: it is whole
+    base_version: int | None  # the version that the differences refer to; None: no differences
     weights: dict[str, np.ndarray]  # uint8 [2, *shape]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationRequest:
-    """An evaluator asks for a policy to play: evaluator -> learner, on `evaluations/{evaluator}`.
+    """Request for a policy to evaluate. Evaluator -> learner, on `evaluations/{evaluator}`.
 
-    The answer is the newest Snapshot, of which the learner keeps a checkpoint until it is reported on, or a Refusal.
+    The answer is a Refusal or the newest Snapshot; the learner keeps a checkpoint of that snapshot until its report.
     """
 
     evaluator: str
@@ -215,24 +217,24 @@ class EvaluationRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EvaluationReport:
-    """How the policy of an EvaluationRequest played: evaluator -> learner, on `evaluations/{evaluator}`."""
+    """Returns of an evaluated policy. Evaluator -> learner, on `evaluations/{evaluator}`."""
 
     evaluator: str
     learner_epoch: int
     policy_version: int
-    returns: np.ndarray  # [K] float32, true undiscounted returns
+    returns: np.ndarray  # [K] float32, unscaled undiscounted returns
     lengths: np.ndarray  # [K] int32, in env_steps
 
     def __post_init__(self) -> None:
         if self.returns.ndim != 1 or not len(self.returns) or self.returns.shape != self.lengths.shape:
-            raise ValueError("returns and lengths must be [K] alike, with K at least 1")
+            raise ValueError("returns and lengths must both be [K], with K at least 1")
         if self.returns.dtype != np.float32 or self.lengths.dtype != np.int32:
             raise ValueError("returns must be float32 and lengths int32")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnded:
-    """The run is over: learner -> actors, on `snapshots`. Actors leave."""
+    """The run is over and actors end. Learner -> actors, on `snapshots`."""
 
     learner_epoch: int
     reason: str
@@ -240,7 +242,7 @@ class RunEnded:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
-    """The fleet as the learner sees it, in answer to a `status` query."""
+    """State of the run and its actors, in answer to a `status` query."""
 
     status: RunStatus
 

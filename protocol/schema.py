@@ -1,7 +1,7 @@
-"""Messages to plain maps and named arrays, and back: what each field may hold is read off the message's class.
+"""Converting messages to plain maps and named arrays, and back, by the type annotations of the message classes.
 
 Scalars, strings, nested messages and pydantic models go into the map; arrays are named by their path. Building a
-message checks the type of every field, and says which is wrong. This file knows no bytes.
+message checks the type of every field. This file does not encode bytes.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 
 def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[str, Any]:
-    """The fields of a message as a plain map; its arrays are appended to `arrays`, named `path` + field."""
+    """Return the fields of a message as a plain map, and append its arrays to `arrays`, named `path` + field."""
     packed: dict[str, Any] = {}
     for name, annotation in _fields(type(value)).items():
         item = getattr(value, name)
@@ -33,9 +33,9 @@ def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[st
 
 
 def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Builds `cls` from what `pack` made, taking out of `arrays` what it uses.
+    """Build a message of class `cls` from a map made by `pack`, and remove its arrays from `arrays`.
 
-    Raises ValueError, naming the field, for anything missing, unknown or of the wrong type.
+    Raises ValueError, which names the field, for a field that is missing, unknown or of the wrong type.
     """
     values: dict[str, Any] = {}
     expected = _fields(cls)

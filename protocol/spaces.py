@@ -1,4 +1,4 @@
-"""The spaces of observations and actions, as they travel."""
+"""The spaces of observations and actions in messages."""
 
 from typing import Annotated, Literal
 
@@ -8,10 +8,10 @@ from daedalus.protocol.specification import PositiveInt, Specification
 
 
 class ArraySpace(Specification):
-    """Arrays of one shape and dtype (gymnasium's Box), as they travel: `float32` or `uint8`.
+    """Arrays of one shape and dtype (gymnasium's Box): `float32` or `uint8`.
 
-    An environment shows one frame at a step; the policy sees the newest `frames` of them, stacked on a first axis of
-    their own where there is more than one.
+    An environment returns one frame per step; the policy observes the newest `frames` frames, stacked on a new first
+    axis if there are several.
     """
 
     kind: Literal["array"] = "array"
@@ -21,7 +21,7 @@ class ArraySpace(Specification):
 
     @property
     def stacked_shape(self) -> tuple[int, ...]:
-        """The shape that the policy sees."""
+        """Shape of the policy's observations."""
         return self.shape if self.frames == 1 else (self.frames, *self.shape)
 
     def __str__(self) -> str:
@@ -30,7 +30,7 @@ class ArraySpace(Specification):
 
 
 class DiscreteSpace(Specification):
-    """One of `count` choices, numbered from 0 (gymnasium's Discrete, its `start` taken away)."""
+    """One of `count` choices, numbered from 0 (gymnasium's Discrete with `start` subtracted)."""
 
     kind: Literal["discrete"] = "discrete"
     count: Annotated[int, Field(ge=1, le=65_536)]
@@ -40,7 +40,7 @@ class DiscreteSpace(Specification):
 
 
 class Spaces(Specification):
-    """What an environment shows and what it can be told; the actor finds them, the learner holds all to them."""
+    """Observation and action space of an environment; actors report them, and the learner checks that all agree."""
 
     observation: ArraySpace
     action: DiscreteSpace

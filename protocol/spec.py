@@ -1,153 +1,222 @@
-"""The specification of a run: everything that decides what is played and how it is learned.
+"""Specification of a run: every setting of the environment, the policy, the training and the service.
 
 One frozen model per concern, checked at construction; unknown fields are errors. The learner owns the
-specification and sends it whole to every actor that joins. This file does not know where it came from
-(a preset, a file, the command line) nor what will be done with it.
+specification and sends all of it to every actor that joins. The docstring below a field is its description in the
+reference of all settings. This file does not know where a specification comes from (a preset, a file, the command
+line) or how it is used.
 """
 
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
-from daedalus.protocol.algorithms import ALGORITHMS, Algorithm, check_algorithm
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
-Backend = Literal["gymnasium", "envpool", "ale", "fast"]  # fast: CarRacing-v3 with a cheaper renderer
+Backend = Literal["gymnasium", "envpool", "ale", "fast"]
 
 
 class EnvironmentSpec(Specification):
-    """Which environment the actors play, and what they do to its pixels, actions and rewards.
+    """Environment that the actors play, and the transforms of its pixels, actions and rewards.
 
-    The transforms apply in the order in which they stand here. A step of the result is one env_step, however many of
-    the environment's own steps (frames) it repeats its action for.
+    The transforms apply in the order of the fields. One step of the result is one env_step, however many of the
+    environment's own steps (frames) its action is repeated for.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
-    backend: Backend = "gymnasium"  # whose implementation of it
+    """Environment to play: a gymnasium id, `module:Id` for your own, or the backend's own name."""
+    backend: Backend = "gymnasium"
+    """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer."""
     kwargs: dict[str, JsonValue] = Field(default_factory=dict)
-    processes: bool = False  # on gymnasium's backend: each in a process of its own, where the environment is slow
-    max_episode_steps: PositiveInt | None = None  # in the environment's own steps
+    """Further arguments of the environment's constructor."""
+    processes: bool = False
+    """Run each environment in its own process, for slow environments. The gymnasium backend only."""
+    max_episode_steps: PositiveInt | None = None
+    """Truncate episodes after this many of the environment's own steps. Unset: the environment's own limit."""
 
     action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
+    """Discrete actions over a continuous action space: one row for each choice, the values of one action."""
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
-    no_reward_limit: PositiveInt | None = None  # an episode is cut after so many env_steps without a positive reward
+    """Take each action this many times and sum the rewards; together they are one env_step."""
+    no_reward_limit: PositiveInt | None = None
+    """Truncate an episode after this many env_steps in a row without a positive reward. Not in evaluations."""
 
-    crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None  # pixels off top, bottom, left, right
+    crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None
+    """Pixels to remove at the top, bottom, left and right."""
     grey: bool = False
-    resize: tuple[PositiveInt, PositiveInt] | None = None  # to height, width: the mean of what each pixel covers
+    """Convert RGB frames to greyscale; the colour axis is removed."""
+    resize: tuple[PositiveInt, PositiveInt] | None = None
+    """Resize frames to (height, width); each pixel is the mean of the area that it covers."""
     frame_stack: Annotated[int, Field(ge=1, le=16)] = 1
+    """Number of newest frames that the policy sees, stacked on a new first axis if more than one."""
 
-    # Learning sees these rewards and ends; logs and evaluations show the true ones.
-    reward_clip: Annotated[float, Field(gt=0.0)] | None = None  # to +- this
+    # Learning uses these rewards and terminations; logs and evaluations show the true ones.
+    reward_clip: Annotated[float, Field(gt=0.0)] | None = None
+    """Clip the rewards that learning uses to +- this value, before `reward_scale`."""
     reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
-    bootstrap_terminations: bool = False  # at terminations, as if they were truncations
+    """Multiply the rewards that learning uses by this value."""
+    bootstrap_terminations: bool = False
+    """Bootstrap at terminations as if they were truncations."""
 
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
-        """The same environment for a score: episodes are played to their true end, on another backend if named."""
+        """Return the environment for evaluations: without `no_reward_limit`, on another backend if one is named."""
         return self.model_copy(update={"no_reward_limit": None, "backend": backend or self.backend})
 
 
 class PolicySpec(Specification):
-    """The network: an encoder, a memory if it has one, then a head for the policy and one for the value."""
+    """Network: an encoder, an optional memory, then a policy head and a value head."""
 
     encoder: Annotated[str, Field(pattern=r"^(mlp|small|nature|impala|article|[\w.]+:\w+)$", max_length=200)] = "mlp"
-    hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)  # of the mlp
-    activation: Literal["tanh", "relu"] = "tanh"  # of the mlp
+    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own."""
+    hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)
+    """Units of each hidden layer; the `mlp` encoder only."""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Activation function; the `mlp` encoder only."""
     memory: Literal["none", "gru"] = "none"
+    """Recurrent layer between the encoder and the heads."""
     memory_units: Annotated[int, Field(ge=1, le=4096)] = 256
+    """Size of the recurrent state."""
 
 
 class CollectionSpec(Specification):
     """How actors gather experience."""
 
-    actors: PositiveInt = 2  # started by `daedalus train`; a2c waits for as many before its first update
+    actors: PositiveInt = 2
+    """Actor processes that `daedalus train` starts. `a2c` waits for this many before its first update."""
     envs_per_actor: Annotated[int, Field(ge=1, le=4096)] = 16
+    """Environments of one actor (E), stepped together with one batched forward pass."""
     rollout_length: Annotated[int, Field(ge=1, le=4096)] = 16
-    window: Annotated[int, Field(ge=1, le=64)] = 2  # an actor's rollouts that are being played or not yet taken in
+    """Rows of a rollout (T): env_steps of each environment under one snapshot."""
+    window: Annotated[int, Field(ge=1, le=64)] = 2
+    """Maximum number of rollouts of one actor that are being played or not yet acknowledged."""
 
 
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
     algorithm: Annotated[str, AfterValidator(check_algorithm)] = "impala"
+    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    env_steps: PositiveInt = 1_000_000  # the budget
-    target_return: float | None = None  # solved when the mean of the last `target_episodes` reaches it
+    """Seed of the network, the environments and the actions."""
+    env_steps: PositiveInt = 1_000_000
+    """Budget: env_steps over all actors."""
+    target_return: float | None = None
+    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value."""
     target_episodes: PositiveInt = 100
+    """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True
+    """Stop when `target_return` is reached. Otherwise use the whole budget."""
 
-    batch_rollouts: PositiveInt | None = None  # rollouts in a batch; unset: a3c 1, impala and appo one per actor
-    max_policy_lag: NaturalInt | None = None  # updates; older rollouts are dropped and counted; unset: 32 batches
+    batch_rollouts: PositiveInt | None = None
+    """Rollouts in a batch. Unset: 1 for `a3c`, `collection.actors` for `impala` and `appo`. Not for `a2c`."""
+    max_policy_lag: NaturalInt | None = None
+    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches."""
 
     discount_factor: UnitInterval = 0.99
-    trace_lambda: UnitInterval = 1.0  # 1: n-step returns; below: lambda-returns
-    rho_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace: impala and appo
-    trace_clip: Annotated[float, Field(gt=0.0)] = 1.0  # V-trace's c: impala and appo
-    passes: Annotated[int, Field(ge=1, le=64)] = 3  # over each batch, appo only
-    minibatches: Annotated[int, Field(ge=1, le=4096)] = 4  # that a batch is shuffled into, one update each; appo only
-    clip_range: Annotated[float, Field(gt=0.0)] = 0.2  # of the probability ratio, appo only
+    """Discount of the reward of the next step."""
+    trace_lambda: UnitInterval = 1.0
+    """Decay of the multi-step targets. 1: n-step returns; below 1: lambda-returns."""
+    rho_clip: Annotated[float, Field(gt=0.0)] = 1.0
+    """Upper bound of V-trace's importance weights rho; `impala` and `appo` only."""
+    trace_clip: Annotated[float, Field(gt=0.0)] = 1.0
+    """Upper bound of V-trace's trace coefficients c; `impala` and `appo` only."""
+    passes: Annotated[int, Field(ge=1, le=64)] = 3
+    """Passes over each batch; `appo` only."""
+    minibatches: Annotated[int, Field(ge=1, le=4096)] = 4
+    """Minibatches that each pass shuffles the batch into, one update for each; `appo` only."""
+    clip_range: Annotated[float, Field(gt=0.0)] = 0.2
+    """Clip range of the probability ratio; `appo` only."""
 
     value_loss: Literal["mse", "huber"] = "mse"
+    """Loss of the value."""
     value_coefficient: Annotated[float, Field(ge=0.0)] = 0.5
+    """Weight of the value loss."""
     entropy_bonus: Annotated[float, Field(ge=0.0)] = 0.01
-    entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None  # annealed to this over the budget
+    """Weight of the policy's entropy."""
+    entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
+    """Anneal the entropy bonus to this value over the budget. Unset: constant."""
     normalize_advantages: bool = False
+    """Scale the advantages of each update to mean 0 and standard deviation 1."""
 
     optimizer: Literal["adam", "rmsprop"] = "adam"
+    """Optimiser of the network's parameters."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
-    learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None  # annealed to this over the budget
+    """Learning rate at the start."""
+    learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Anneal the learning rate to this value over the budget. Unset: constant."""
     optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
+    """Epsilon of the optimiser."""
     rmsprop_decay: UnitInterval = 0.99
+    """Decay of the mean squared gradient; `rmsprop` only."""
     max_gradient_norm: Annotated[float, Field(gt=0.0)] = 0.5
+    """Clip the gradient of an update to this norm."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"  # of convolutions; auto: bfloat16 where it is faster
-    threads: PositiveInt = 1  # of the learner; two that spin for a core the actors use are far slower than one
+    """Device of the learner."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Precision of the forward passes. `auto`: bfloat16 for convolutions where the hardware multiplies it."""
+    threads: PositiveInt = 1
+    """Threads of the learner. More than one is slower if actors use the same cores."""
 
     @property
     def updates_per_batch(self) -> int:
-        """How many policy versions one batch makes."""
+        """Number of policy versions that one batch produces."""
         return self.passes * self.minibatches if ALGORITHMS[self.algorithm].passes_over_batch else 1
 
     @property
     def policy_lag_bound(self) -> int:
-        """The largest policy lag that is learned from, in updates."""
+        """Largest policy lag that is learned from, in updates."""
         return 32 * self.updates_per_batch if self.max_policy_lag is None else self.max_policy_lag
 
 
 class EvaluationSpec(Specification):
-    """The evaluator that `daedalus train` keeps beside the actors: episodes that training never sees."""
+    """Evaluator that `daedalus train` runs beside the actors, on episodes that training never uses."""
 
-    seconds: Annotated[float, Field(gt=0.0)] | None = None  # from one evaluation's start to the next's; unset: none
+    seconds: Annotated[float, Field(gt=0.0)] | None = None
+    """Seconds from the start of one evaluation to the start of the next. Unset: no evaluator."""
     episodes: Annotated[int, Field(ge=1, le=10_000)] = 10
-    actions: Literal["greedy", "sampled"] = "greedy"  # the most probable, or as in training
-    final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100  # with the best policy, once training has ended
-    final_backend: Backend | None = None  # unset: the one that was trained on
+    """Episodes of each evaluation during training."""
+    actions: Literal["greedy", "sampled"] = "greedy"
+    """Actions of evaluations: the most probable, or sampled as in training."""
+    final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100
+    """Episodes of the evaluation of the best policy after training."""
+    final_backend: Backend | None = None
+    """Backend of the final evaluation. Unset: `environment.backend`."""
 
 
 class ServiceSpec(Specification):
     """How the learner runs as a service."""
 
     checkpoint_seconds: Annotated[float, Field(gt=0.0)] = 60.0
+    """Seconds between checkpoints: the most training time that a killed learner loses."""
     keep_checkpoints: PositiveInt = 3
+    """Number of newest checkpoints to keep."""
     log_seconds: Annotated[float, Field(gt=0.0)] = 0.5
-    queue_megabytes: Annotated[float, Field(gt=0.0)] = 64.0  # rollouts waiting to be decoded; beyond: `busy`
+    """Seconds between rows of metrics."""
+    queue_megabytes: Annotated[float, Field(gt=0.0)] = 64.0
+    """MiB of rollouts that may wait to be decoded. Rollouts beyond this limit are answered `busy`."""
 
     @property
     def queue_bytes(self) -> int:
-        """What the rollouts that wait to be decoded may hold together."""
+        """Bytes that the rollouts waiting to be decoded may occupy together."""
         return int(self.queue_megabytes * 2**20)
 
 
 class RunSpec(Specification):
-    """All of a run. Written complete as `config.toml`, which reproduces it."""
+    """Complete specification of a run, written as `config.toml`, which reproduces the run."""
 
     environment: EnvironmentSpec
+    """Environment that the actors play."""
     policy: PolicySpec = PolicySpec()
+    """Network."""
     collection: CollectionSpec = CollectionSpec()
+    """How actors gather experience."""
     training: TrainingSpec = TrainingSpec()
+    """How the learner learns, and when it stops."""
     evaluation: EvaluationSpec = EvaluationSpec()
+    """Evaluator beside the actors."""
     service: ServiceSpec = ServiceSpec()
+    """How the learner runs as a service."""
 
     @model_validator(mode="after")
     def _one_batch_fits_the_barrier(self) -> "RunSpec":
@@ -169,7 +238,7 @@ class RunSpec(Specification):
         return self
 
     @property
-    def algorithm(self) -> Algorithm:
+    def algorithm(self) -> AlgorithmRecord:
         """How the run's updates are scheduled."""
         return ALGORITHMS[self.training.algorithm]
 

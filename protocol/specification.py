@@ -1,4 +1,4 @@
-"""The base of everything that is specified: immutable, and strict about unknown names."""
+"""Base class and number types of the pydantic models."""
 
 from typing import Annotated
 
@@ -10,6 +10,6 @@ UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class Specification(BaseModel):
-    """Base of every specification: immutable, and strict about names it does not know."""
+    """Base of all models: immutable, rejects unknown fields and numbers that are not finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)

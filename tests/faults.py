@@ -158,15 +158,16 @@ class Sender:
     def __init__(self, address: str, name: str, environments: int = 2) -> None:
         self.transport = connect([address])
         self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
-        self._link = LearnerQueries(self.transport)
+        self._queries = LearnerQueries(self.transport)
         join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
-        self.welcome: Welcome = self._link.find(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
+        self.welcome: Welcome = self._queries.join_learner(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
         self.transport.declare_presence(keys.presence(self.welcome.run, name, self.incarnation))
         self.key = keys.rollouts(self.welcome.run, name)
 
     def version(self) -> int:
         """Return the newest policy version, or 0 before the first."""
-        newest = [message for message in self._link.newest(self.welcome.run) if isinstance(message, Snapshot)]
+        messages = self._queries.newest_snapshot(self.welcome.run)
+        newest = [message for message in messages if isinstance(message, Snapshot)]
         return newest[0].policy_version if newest else 0
 
     def rollout(self, sequence: int, version: int, **changed: Any) -> bytes:

@@ -14,14 +14,14 @@ class _Collector(logging.Handler):
 
 @contextmanager
 def collected() -> Iterator[None]:
-    """Collects into LINES, from empty, what is logged at INFO and above."""
+    """Collect into LINES, from empty, what is logged at INFO and above; undo what the test configures."""
     LINES.clear()
     logger, collector = logging.getLogger("daedalus"), _Collector()
-    level = logger.level
+    level, handlers = logger.level, list(logger.handlers)
     logger.addHandler(collector)
     logger.setLevel(logging.INFO)
     try:
         yield
     finally:
-        logger.removeHandler(collector)
+        logger.handlers[:] = handlers
         logger.setLevel(level)

@@ -1,1 +1,1 @@
-"""What both sides need of a network: the interface, the in-memory one, Zenoh, addresses and TLS."""
+"""The network: the transport interface, its in-memory and Zenoh implementations, addresses and TLS."""

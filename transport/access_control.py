@@ -1,6 +1,6 @@
-"""Who may do what on a network that is not trusted: Zenoh's access control, by the names in certificates.
+"""Rules of Zenoh's access control: what each role may do on an untrusted network, by the names in certificates.
 
-Denied is what is not allowed here. What comes over plain TCP is the machine's own: a router listens for that on
+Everything that these rules do not allow is denied. Plain TCP connections have full access: a router accepts them on
 loopback only (transport/addresses.py). Pure functions.
 """
 
@@ -24,30 +24,34 @@ _EVERYTHING = (
 
 
 def common_name(role: str, name: str = "") -> str:
-    """What a certificate of that role bears as its common name: `learner`, `router`, `actor:NAME`, `operator:NAME`."""
+    """Return the common name of a certificate: `learner`, `router`, `actor:NAME` or `operator:NAME`."""
     return f"{role}:{name}" if name else role
 
 
 def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str, Any]:
-    """Zenoh's `access_control` for a router, embedded in a learner or not."""
+    """Return Zenoh's `access_control` setting for a router (or a learner, which embeds one).
+
+    Args:
+      actors, operators: authorised names.
+    """
     rules = [
         _rule("all", ("ingress", "egress"), _EVERYTHING, ["daedalus/**"]),
         *_actors_rules(),
         *_operators_rules(),
     ]
     subjects: list[dict[str, Any]] = [
-        {"id": "ours", "cert_common_names": [common_name("learner"), common_name("router")]},
+        {"id": "learner and routers", "cert_common_names": [common_name("learner"), common_name("router")]},
         {"id": "this machine", "link_protocols": ["tcp"]},
     ]
-    policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["ours", "this machine"]}]
+    policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
     shared = [rule["id"] for rule in _actors_rules()]
     for operator in sorted(operators):
         subjects.append({"id": f"operator {operator}", "cert_common_names": [common_name("operator", operator)]})
-        policies.append({"rules": ["operators ask", "operators are told"], "subjects": [f"operator {operator}"]})
+        policies.append({"rules": ["operators query", "operators receive"], "subjects": [f"operator {operator}"]})
     for actor in sorted(actors):
         rules += _own_rules(actor)
         subjects.append({"id": f"actor {actor}", "cert_common_names": [common_name("actor", actor)]})
-        own = [f"{actor} sends", f"{actor} is there", f"{actor} is answered"]
+        own = [f"{actor} uploads", f"{actor} is present", f"{actor} receives replies"]
         policies.append({"rules": [*shared, *own], "subjects": [f"actor {actor}"]})
     return {
         "enabled": True,
@@ -69,45 +73,50 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 
 
 def _actors_rules() -> list[dict[str, Any]]:
-    """What every actor may do: ask to join, for programs and snapshots; follow snapshots; watch for the learner."""
-    asked = [keys.join(_RUN), keys.program(_RUN, "*"), keys.snapshots(_RUN)]
-    served = [*asked, keys.rollouts(_RUN, "*"), keys.evaluations(_RUN, "*")]
+    """Return the rules of every actor: query `join`, programs, snapshots; subscribe to snapshots; watch the learner."""
+    queried = [keys.join(_RUN), keys.program(_RUN, "*"), keys.snapshots(_RUN)]
+    served = [*queried, keys.rollouts(_RUN, "*"), keys.evaluations(_RUN, "*")]
     return [
-        _rule("actors ask", ["ingress"], ["query"], asked),
-        _rule("actors are answered", ["egress"], ["reply"], asked),
-        _rule("actors are told", ["egress"], ["declare_queryable"], served),
-        _rule("actors follow", ["ingress"], ["declare_subscriber"], [keys.snapshots(_RUN)]),
-        _rule("actors are pushed", ["egress"], ["put"], [keys.snapshots(_RUN)]),
-        _rule("actors watch", ["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], [keys.learner(_RUN)]),
-        _rule("actors see", ["egress"], ["liveliness_token"], [keys.learner(_RUN)]),
+        _rule("actors query", ["ingress"], ["query"], queried),
+        _rule("actors receive replies", ["egress"], ["reply"], queried),
+        _rule("actors discover queryables", ["egress"], ["declare_queryable"], served),
+        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], [keys.snapshots(_RUN)]),
+        _rule("actors receive snapshots", ["egress"], ["put"], [keys.snapshots(_RUN)]),
+        _rule(
+            "actors watch the learner",
+            ["ingress"],
+            ["declare_liveliness_subscriber", "liveliness_query"],
+            [keys.learner(_RUN)],
+        ),
+        _rule("actors see the learner", ["egress"], ["liveliness_token"], [keys.learner(_RUN)]),
     ]
 
 
 def _own_rules(actor: str) -> list[dict[str, Any]]:
-    """What one may do under its own name, and under `NAME.anything`: one certificate serves a host of actors."""
+    """Return the rules of one actor for its own name and for `NAME.anything`: one certificate serves a whole host."""
     names = [actor, f"{actor}.$*"]
     sent = [key for name in names for key in (keys.rollouts(_RUN, name), keys.evaluations(_RUN, name))]
     return [
-        _rule(f"{actor} sends", ["ingress"], ["query"], sent),
-        _rule(f"{actor} is answered", ["egress"], ["reply"], sent),
+        _rule(f"{actor} uploads", ["ingress"], ["query"], sent),
+        _rule(f"{actor} receives replies", ["egress"], ["reply"], sent),
         _rule(
-            f"{actor} is there", ["ingress"], ["liveliness_token"], [keys.presence(_RUN, name, "*") for name in names]
+            f"{actor} is present", ["ingress"], ["liveliness_token"], [keys.presence(_RUN, name, "*") for name in names]
         ),
     ]
 
 
 def _operators_rules() -> list[dict[str, Any]]:
-    """Who looks after a run reads its status and sees who is there."""
+    """Return the rules of operators: query the status, and watch the presence of actors and learner."""
     present = [keys.presence(_RUN, "*", "*"), keys.learner(_RUN)]
     return [
         _rule(
-            "operators ask",
+            "operators query",
             ["ingress"],
             ["query", "declare_liveliness_subscriber", "liveliness_query"],
             [keys.status(_RUN), *present],
         ),
         _rule(
-            "operators are told",
+            "operators receive",
             ["egress"],
             ["reply", "declare_queryable", "liveliness_token"],
             [keys.status(_RUN), *present],

@@ -1,4 +1,4 @@
-"""Waits for a router or learner that is not there yet: who starts first does not matter."""
+"""Connecting with retries, so that processes may start in any order."""
 
 import logging
 import threading
@@ -19,12 +19,12 @@ def connect_with_retry(
     timeout: float | None = None,
     credentials: Credentials | None = None,
 ) -> Transport | None:
-    """Tries to `connect` until something answers, and says once that it waits; None if told to stop first.
+    """Retry `connect` until it succeeds, and log once that it waits; return None if `stop` is set first.
 
-    Raises TransportError after `timeout` seconds, RefusedError at once.
+    Raises TransportError after `timeout` seconds, and RefusedError at once.
     """
     deadline = None if timeout is None else time.monotonic() + timeout
-    pause, told = _FIRST_PAUSE_SECONDS, False
+    pause, logged = _FIRST_PAUSE_SECONDS, False
     while True:
         try:
             return connect(endpoints, credentials)
@@ -33,11 +33,11 @@ def connect_with_retry(
         except TransportError as error:
             if deadline is not None and time.monotonic() > deadline:
                 raise TransportError(
-                    f"{error} (for {timeout:g} s): is the learner running, and is the address its own?"
+                    f"{error} (for {timeout:g} s): is the learner running, and is this its address?"
                 ) from None
-            if not told and pause >= _MAX_PAUSE_SECONDS / 2:
+            if not logged and pause >= _MAX_PAUSE_SECONDS / 2:
                 _logger.info("%s; waiting for it", error)
-                told = True
+                logged = True
         if stop.wait(pause):
             return None
         pause = min(2 * pause, _MAX_PAUSE_SECONDS)

@@ -1,105 +1,111 @@
-"""What the two sides need of a transport, and MemoryTransport, the one for a single process.
+"""The interface that both sides use to reach each other. MemoryTransport and ZenohTransport implement it.
 
-    serve / query / query_async           a payload goes to whoever serves the key, answers come back
-    publish / subscribe                   the newest value of a key, pushed; only the newest is kept
-    declare_presence / watch_presence     who is there, and who has gone
+    serve / query / query_async           send a payload to all servers of a key, and receive their answers
+    publish / subscribe                   push the values of a key; a subscriber keeps only the newest
+    declare_presence / watch_presence     learn which processes appear and disappear
 
-A transport moves bytes. It knows no message, and its callbacks must only hand over: they run on
-threads that carry everybody else's traffic too.
+A transport moves bytes and does not know the messages. Callbacks must return quickly, for example put the value on a
+queue: they run on threads that carry all other traffic too.
 """
 
 from collections.abc import Callable
 from typing import Protocol
 
-OnAnswer = Callable[[bytes | None], None]  # takes the answer to a query, or None without one
+OnAnswer = Callable[[bytes | None], None]  # called with the answer to a query, or with None if there is no answer
 
 
 class TransportError(Exception):
-    """The transport cannot do what was asked; the message says what to do about it."""
+    """The transport cannot perform an operation; the message says why and what to do."""
 
 
 class AddressInUseError(TransportError):
-    """Somebody else listens on that address already."""
+    """Another process already listens on the address."""
 
 
 class RefusedError(TransportError):
-    """Who listens there does not let us in, or cannot be trusted: no waiting mends it."""
+    """The other end refuses this certificate, or its own certificate is not trusted: retrying will not help."""
 
 
 class Request(Protocol):
-    """One query, held by the side that serves it. Answered at most once, from any thread, or dropped."""
+    """One query as its server receives it: answered at most once, from any thread, or dropped."""
 
     @property
     def key(self) -> str:
-        """The key that was asked."""
+        """Key of the query."""
         ...
 
     @property
     def size(self) -> int:
-        """How many bytes came with it; asking copies nothing."""
+        """Number of bytes of the payload; reading this property copies nothing."""
         ...
 
     @property
     def payload(self) -> bytes:
-        """What came with it."""
+        """Payload of the query; each access copies it."""
         ...
 
     def reply(self, payload: bytes) -> None:
-        """Answers; later answers are ignored."""
+        """Send the answer; later calls have no effect."""
         ...
 
 
 class Inbox(Protocol):
-    """The newest unread value of a followed key."""
+    """Newest unread value of a subscription."""
 
     def close(self) -> None:
-        """Follows no more. Idempotent."""
+        """End the subscription. Idempotent."""
         ...
 
     def take(self) -> bytes | None:
-        """The newest value that was not taken yet, or None. Never waits."""
+        """Return the newest value that was not taken yet, or None. Never waits."""
         ...
 
 
 class Transport(Protocol):
-    """One end of the network. Safe to use from several threads."""
+    """Connection of one process to the network. Safe to use from several threads.
+
+    Methods raise TransportError if the connection was closed or refuses the operation.
+    """
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
-        """Hands every query for `key` (`*` matches one chunk) to `handler`."""
+        """Call `handler` with every query for `key`, in which `*` matches one chunk."""
         ...
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
-        """Every answer to a query within `timeout` seconds; empty if nobody serves the key."""
+        """Return all answers that arrive within `timeout` seconds; an empty list if no process serves the key."""
         ...
 
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """Queries without waiting; `on_answer` gets the first answer, or None, exactly once."""
+        """Send a query without waiting.
+
+        `on_answer` is called exactly once: with the first answer, or with None after `timeout` seconds.
+        """
         ...
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Pushes a value to all that follow the key; those too slow for it get a later one."""
+        """Push a value to all subscribers of the key; a subscriber on a congested link may miss values."""
         ...
 
     def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
-        """Follows a key; `on_news` is called when the inbox may have something new."""
+        """Subscribe to a key; `on_news` is called when the inbox may hold a new value."""
         ...
 
     def declare_presence(self, key: str) -> None:
-        """Declares presence under `key` until this end closes or dies."""
+        """Declare presence under `key` until this transport is closed or its process dies."""
         ...
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
-        """Calls `on_change(key, present)` for all present now and for every change."""
+        """Call `on_change(key, present)` for every key that is present now, and for every change."""
         ...
 
     def reopen(self, unless_served: str | None = None) -> bool:
-        """Starts afresh, with all that was declared, in place of a session that may be dead; whether it did.
+        """Replace a session that may be dead by a new one that repeats all declarations; return whether it did.
 
-        With `unless_served` only if that, seen from outside, nobody serves that key. Raises TransportError if there
-        is nothing to connect to; all stays as it was then.
+        Does nothing if a query over the new session finds a server of the key `unless_served`. Raises TransportError
+        if no session can be opened; the present session then stays in use.
         """
         ...
 
     def close(self) -> None:
-        """Ends everything that this end declared. Idempotent."""
+        """End the session and all its declarations. Idempotent."""
         ...

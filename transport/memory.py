@@ -1,4 +1,4 @@
-"""The transport within one process: for tests, and for an actor and a learner in one program."""
+"""A Transport within one process: for tests, and for an actor and a learner in one program."""
 
 import threading
 import time
@@ -8,6 +8,8 @@ from daedalus.transport.interface import Inbox, OnAnswer, Request
 
 
 class _MemoryRequest:
+    """A query within the process; passes None to `on_answer` if it is garbage-collected without an answer."""
+
     def __init__(self, key: str, payload: bytes, on_answer: Callable[[bytes | None], None]) -> None:
         self.key, self.payload, self.size = key, payload, len(payload)
         self._on_answer: Callable[[bytes | None], None] | None = on_answer
@@ -16,7 +18,7 @@ class _MemoryRequest:
         self._answer(payload)
 
     def __del__(self) -> None:
-        self._answer(None)  # forgotten by who served it
+        self._answer(None)  # the server dropped it without an answer
 
     def _answer(self, payload: bytes | None) -> None:
         on_answer, self._on_answer = self._on_answer, None
@@ -25,6 +27,8 @@ class _MemoryRequest:
 
 
 class _MemoryInbox:
+    """The newest unread value of one subscription."""
+
     def __init__(self, key: str, on_news: Callable[[], None]) -> None:
         self.key, self.on_news, self.newest = key, on_news, None
 
@@ -41,7 +45,7 @@ class _MemoryInbox:
 
 
 class MemoryNetwork:
-    """Joins the MemoryTransports made with it."""
+    """The MemoryTransports that reach each other."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -49,19 +53,19 @@ class MemoryNetwork:
 
 
 def _matches(pattern: str, key: str) -> bool:
-    """Whether two keys meet; `*` on either side stands for one chunk."""
+    """Return whether two keys match; `*` on either side stands for one chunk."""
     left, right = pattern.split("/"), key.split("/")
     return len(left) == len(right) and all(a == b or "*" in (a, b) for a, b in zip(left, right, strict=True))
 
 
 class MemoryTransport:
-    """A Transport within one process: the same promises, no sockets, handlers run on the caller's thread."""
+    """A Transport within one process, without sockets; handlers run on the caller's thread."""
 
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self._served: dict[str, Callable[[Request], None]] = {}
         self._inboxes: list[_MemoryInbox] = []
-        self._announced: set[str] = set()
+        self._present_keys: set[str] = set()
         self._watches: list[tuple[str, Callable[[str, bool], None]]] = []
         with network.lock:
             network.ends.append(self)
@@ -93,7 +97,7 @@ class MemoryTransport:
         return list(answers)
 
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """See Transport. Within a process no answer is lost, so no timer is kept for one."""
+        """See Transport. `timeout` has no effect: within a process no answer is lost."""
         handlers = self._handlers(key)
         if not handlers:
             on_answer(None)
@@ -123,25 +127,25 @@ class MemoryTransport:
 
     def declare_presence(self, key: str) -> None:
         """See Transport."""
-        self._announced.add(key)
-        self._tell(key, True)
+        self._present_keys.add(key)
+        self._report(key, True)
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
         self._watches.append((key, on_change))
         for end in self._ends():
-            for announced in list(end._announced):
-                if _matches(key, announced):
-                    on_change(announced, True)
+            for declared in list(end._present_keys):
+                if _matches(key, declared):
+                    on_change(declared, True)
 
-    def _tell(self, key: str, present: bool) -> None:
+    def _report(self, key: str, present: bool) -> None:
         for end in self._ends():
             for pattern, on_change in end._watches:
                 if _matches(pattern, key):
                     on_change(key, present)
 
     def reopen(self, unless_served: str | None = None) -> bool:
-        """See Transport. There is no session here that could die."""
+        """See Transport. Always False: there is no session that could die."""
         return False
 
     def close(self) -> None:
@@ -150,6 +154,6 @@ class MemoryTransport:
             if self not in self._network.ends:
                 return
             self._network.ends.remove(self)
-        for key in self._announced:
-            if not any(key in end._announced for end in self._ends()):
-                self._tell(key, False)
+        for key in self._present_keys:
+            if not any(key in end._present_keys for end in self._ends()):
+                self._report(key, False)

@@ -25,6 +25,6 @@ def authorization_hint(credentials: Credentials | None) -> str:
     if credentials is None:
         return ""
     return (
-        f"; is there one, does it (or its router) know the actor {credentials.name!r}? "
-        "It reads whom it lets in when it starts (daedalus certs issue)"
+        f"; is it running, and is the actor {credentials.name!r} authorised by it (or by its router)? "
+        "The list of authorised actors is read at start (daedalus certs issue)"
     )

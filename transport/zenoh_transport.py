@@ -1,114 +1,65 @@
-"""The Transport over Zenoh: the only file that imports it.
+"""The Transport over Zenoh.
 
-A session either embeds a full router that listens (the learner, by default) or is a client of one.
-
-What Zenoh needs to be held to (measured, see docs/results.md):
-  - BLOCK is not flow control: a peer that stalls is disconnected with all it had. So rollouts are
-    queries that are answered, and snapshots are put with DROP.
-  - A process that ends with a callback declared and its session open hangs for ever: `close` belongs
-    in a `finally`.
-  - One that ends while Zenoh's threads still hold callbacks aborts now and then: `close` waits until they do not.
+Only the files named `zenoh_*.py` import Zenoh. What Zenoh needs of its user (measured, see docs/results.md):
+  - Congestion control BLOCK is not flow control: Zenoh disconnects a peer that stalls, and drops all that the peer
+    had queued. So rollouts are queries that are answered, and snapshots are put with DROP.
+  - A process that ends with a callback declared and its session open hangs for ever: call `close` in a `finally`.
 """
 
 import contextlib
-import json
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
 
 import zenoh
 
-from daedalus.transport.credentials import Credentials, diagnose_connection
-from daedalus.transport.interface import (
-    AddressInUseError,
-    Inbox,
-    OnAnswer,
-    RefusedError,
-    Request,
-    Transport,
-    TransportError,
-)
-from daedalus.transport.zenoh_settings import session_settings
+from daedalus.transport.credentials import Credentials
+from daedalus.transport.interface import Inbox, OnAnswer, Request, Transport, TransportError
+from daedalus.transport.zenoh_callbacks import Callbacks
+from daedalus.transport.zenoh_session import OpenSession, session_opener
 
-_PROBE_SECONDS = 2.0  # for a look from outside
-_LEAVING_SECONDS = 2.0  # for Zenoh to let go of callbacks when a session is closed
+_PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
 
 
 def listen(endpoints: list[str], connect: list[str] | None = None, credentials: Credentials | None = None) -> Transport:
-    """Opens a router that listens on `endpoints` (`tcp/HOST:PORT`, `tls/HOST:PORT`) and may join other routers.
+    """Open a router that listens on `endpoints` and connects to the routers at `connect`.
 
-    With `credentials` it lets in whom they name, and those that come over plain TCP.
-    Raises AddressInUseError, TransportError, or CredentialsError.
+    Endpoints are `tcp/HOST:PORT` or `tls/HOST:PORT`. With `credentials` the router admits the names that their folder
+    lists, and connections over plain TCP.
+    Raises AddressInUseError, TransportError or CredentialsError.
     """
-    return _open("router", endpoints, connect or [], credentials)
+    return ZenohTransport(session_opener("router", endpoints, connect or [], credentials), is_client=False)
 
 
 def connect(endpoints: list[str], credentials: Credentials | None = None) -> Transport:
-    """Opens a client of the router at one of `endpoints`.
+    """Open a client of the router at one of `endpoints`.
 
-    Raises TransportError at once if none of them can be reached, RefusedError if that is for good.
+    Raises TransportError at once if none of them can be reached, RefusedError if retrying will not help.
     """
-    return _open("client", [], endpoints, credentials)
-
-
-def _open(
-    mode: Literal["router", "client"],
-    listen_on: list[str],
-    connect_to: list[str],
-    credentials: Credentials | None,
-) -> "ZenohTransport":
-    config = zenoh.Config()
-    security = credentials.settings(listens=bool(listen_on)) if credentials else {}
-    settings = session_settings(mode, listen_on, connect_to, security)
-
-    def open_session() -> zenoh.Session:
-        try:
-            for name, value in settings.items():
-                config.insert_json5(name, json.dumps(value))
-            return zenoh.open(config)
-        except zenoh.ZError as error:
-            raise _opening_error(str(error), listen_on, connect_to, credentials) from None
-
-    return ZenohTransport(open_session, is_client=mode == "client")
-
-
-def _opening_error(
-    text: str, listen_on: list[str], connect_to: list[str], credentials: Credentials | None
-) -> TransportError:
-    if "in use" in text:
-        return AddressInUseError(
-            f"address {', '.join(listen_on)} is already in use: "
-            "stop what listens there, or choose another with --listen"
-        )
-    if connect_to:
-        reasons = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]
-        for_good = all(final for _, final in reasons)
-        return (RefusedError if for_good else TransportError)("; ".join(reason for reason, _ in reasons))
-    return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
+    return ZenohTransport(session_opener("client", [], endpoints, credentials), is_client=True)
 
 
 @contextlib.contextmanager
-def _as_transport_error(what: str) -> Iterator[None]:
+def _as_transport_error(action: str) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as error:
-        raise TransportError(f"cannot {what}: {error}") from None
+        raise TransportError(f"cannot {action}: {error}") from None
 
 
 def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
-    """Every answer to a query."""
+    """Return every answer to a query within `timeout` seconds."""
     replies = session.get(
         key,
         payload=payload,
         timeout=timeout,
         target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,  # else one answer for each key, of all that serve it
+        consolidation=zenoh.ConsolidationMode.NONE,  # otherwise one answer for each key, not for each server
     )
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
 
 class _ZenohRequest:
-    """One query of Zenoh's; finalised as soon as it is answered or forgotten."""
+    """A query that Zenoh delivered; finalised as soon as it is answered or garbage-collected."""
 
     __slots__ = ("_buffers", "_query", "key", "size")
 
@@ -130,10 +81,12 @@ class _ZenohRequest:
             query.reply(self.key, payload)
             query.drop()
         except zenoh.ZError:
-            pass  # the asker is gone, or our own session is closing: nobody waits for this answer
+            pass  # the sender of the query is gone, or our session is closing: nobody waits for this answer
 
 
 class _ZenohInbox:
+    """The newest unread value of one subscription, still in Zenoh's buffers."""
+
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._newest: zenoh.ZBytes | None = None
@@ -152,49 +105,22 @@ class _ZenohInbox:
         self.undeclare()
 
 
-class _Callbacks:
-    """Our functions that Zenoh holds, each on a thread of its own, which must be done with Python before that ends."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._held = 0
-
-    def hold(self, function: Callable[[Any], None], at_end: Callable[[], None] = lambda: None) -> Any:
-        """A callback as Zenoh takes them; `at_end` is called once, after the last call of `function`."""
-
-        def drop() -> None:
-            try:
-                at_end()
-            finally:
-                with self._changed:
-                    self._held -= 1
-                    self._changed.notify_all()
-
-        with self._changed:
-            self._held += 1
-        return zenoh.handlers.Callback(function, drop)
-
-    def await_none(self) -> None:
-        """Waits, within bounds, until Zenoh has let go of all of them."""
-        with self._changed:
-            self._changed.wait_for(lambda: not self._held, _LEAVING_SECONDS)
-
-
 class ZenohTransport:
-    """A Transport over one Zenoh session, and over another in its place where it was reopened."""
+    """A Transport over one Zenoh session; `reopen` replaces the session and repeats the declarations."""
 
-    def __init__(self, open_session: Callable[[], zenoh.Session], *, is_client: bool) -> None:
-        """Opens its session; `open_session` raises TransportError if it cannot."""
+    def __init__(self, open_session: OpenSession, *, is_client: bool) -> None:
+        """Open the session; `open_session` raises TransportError if that fails."""
         self._open_session = open_session
         self._is_client = is_client
         self._session = open_session()
         self._closed = False
-        # What is to be made again in another session, and what it made in this one: that ends when it is garbage.
+        # Each declaration, to be repeated in a new session, and the object that it returned in the present session:
+        # Zenoh undeclares that object when it is garbage-collected.
         self._declared: dict[Callable[[zenoh.Session], object], object] = {}
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
-        self._callbacks = _Callbacks()
+        self._callbacks = Callbacks()
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
@@ -210,7 +136,7 @@ class ZenohTransport:
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
-        with _as_transport_error(f"ask {key}"):
+        with _as_transport_error(f"query {key}"):
             return _answers(self._session, key, payload, timeout)
 
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
@@ -224,7 +150,7 @@ class ZenohTransport:
         def on_end() -> None:
             on_answer(first[0] if first else None)
 
-        with _as_transport_error(f"send to {key}"):
+        with _as_transport_error(f"query {key}"):
             self._querier(key, timeout).get(self._callbacks.hold(on_reply, on_end), payload=payload)
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
@@ -264,7 +190,7 @@ class ZenohTransport:
         def declaration(session: zenoh.Session) -> object:
             return session.declare_subscriber(key, self._callbacks.hold(on_sample))
 
-        with _as_transport_error(f"follow {key}"):
+        with _as_transport_error(f"subscribe to {key}"):
             self._declare(declaration)
         inbox.undeclare = lambda: self._undeclare(declaration)
         return inbox
@@ -272,12 +198,12 @@ class ZenohTransport:
     def _undeclare(self, declaration: Callable[[zenoh.Session], object]) -> None:
         subscriber = self._declared.pop(declaration, None)
         if isinstance(subscriber, zenoh.Subscriber):
-            with contextlib.suppress(zenoh.ZError):  # its session was closed: nothing comes any more anyway
+            with contextlib.suppress(zenoh.ZError):  # its session was closed, and the subscription with it
                 subscriber.undeclare()
 
     def declare_presence(self, key: str) -> None:
         """See Transport."""
-        with _as_transport_error(f"announce {key}"):
+        with _as_transport_error(f"declare presence under {key}"):
             self._declare(lambda session: session.liveliness().declare_token(key))
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
@@ -290,34 +216,34 @@ class ZenohTransport:
             on_change(name, is_there)
 
         def declaration(session: zenoh.Session) -> object:
-            while present:  # as seen by a session that was given up: who is still there is told of again
+            while present:  # as the previous session saw it: the new subscriber reports again what is still present
                 on_change(present.pop(), False)
-            # Without history a token declared just after the subscriber is missed now and then.
+            # Without history the subscriber sometimes misses a token that is declared just after it.
             return session.liveliness().declare_subscriber(key, self._callbacks.hold(on_sample), history=True)
 
-        with _as_transport_error(f"watch {key}"):
+        with _as_transport_error(f"watch presence under {key}"):
             self._declare(declaration)
 
     def reopen(self, unless_served: str | None = None) -> bool:
-        """See Transport. A router that listens here is never reopened: it would refuse itself the address."""
+        """See Transport. A router is never reopened: its address would still be in use by itself."""
         if not self._is_client:
             return False
         session = self._open_session()
         try:
-            with _as_transport_error(f"ask {unless_served}"):
-                unneeded = unless_served is not None and bool(_answers(session, unless_served, b"", _PROBE_SECONDS))
+            with _as_transport_error(f"query {unless_served}"):
+                is_served = unless_served is not None and bool(_answers(session, unless_served, b"", _PROBE_SECONDS))
         except TransportError:
             session.close()
             raise
         with self._lock:
-            if unneeded or self._closed:
+            if is_served or self._closed:
                 session.close()
                 return False
-            given_up, self._session = self._session, session
+            previous, self._session = self._session, session
             self._queriers.clear()
             self._publishers.clear()
-        given_up.close()
-        with _as_transport_error("declare again"):
+        previous.close()
+        with _as_transport_error("repeat the declarations"):
             self._declared = {declaration: declaration(session) for declaration in list(self._declared)}
         return True
 
@@ -328,4 +254,4 @@ class ZenohTransport:
             session = self._session
         if not session.is_closed():
             session.close()
-            self._callbacks.await_none()
+            self._callbacks.await_release()

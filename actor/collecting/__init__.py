@@ -1,1 +1,1 @@
-"""Rollouts from environments and a policy runtime."""
+"""Rollouts from environments and a policy, for an actor's service to upload."""

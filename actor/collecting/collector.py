@@ -1,47 +1,42 @@
-"""Plays a policy in environments and gathers rollouts. No network, no threads."""
+"""The interface between an actor's service and whatever produces its rollouts."""
 
-import numpy as np
+from typing import Protocol
 
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 
-class Collector:
-    """Steps E environments.
+class Collector(Protocol):
+    """A source of rollouts for one learner after the other. Its methods are for the service's thread."""
 
-    A rollout's arrays are views of the collector's: encode it before the next `collect`.
-    """
+    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+        """Prepare for a run, and return its spaces and E, the number of environments.
 
-    def __init__(
-        self,
-        environments: VectorEnvironment,
-        runtime: PolicyRuntime,
-        spec: EnvironmentSpec,
-        *,
-        rollout_length: int,
-        seed: int,
-    ) -> None:
-        environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
-        self._environments = environments
-        self._writer = RolloutWriter(
-            environments.spaces,
-            environments.count,
-            runtime,
-            spec,
-            rollout_length=rollout_length,
-            random=np.random.default_rng(action_seed),
-        )
-        self._writer.start(environments.reset(int(environment_seed)))
+        Raises EnvironmentSetupError or ActorError if this actor cannot take part in the run.
+        """
+        ...
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        """Plays on with these weights from the next rollout."""
-        self._writer.load(weights)
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+        """Collect with a policy from now on; `load` provides its weights before the first rollout."""
+        ...
 
-    def collect(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
-        """T rows more under the weights loaded last, whose version the caller names."""
-        while not self._writer.record(*self._environments.step(self._writer.act())):
-            pass
-        return self._writer.finish(identity, policy_version)
+    def load(self, snapshot: Snapshot) -> None:
+        """Use these weights from the next rollout on."""
+        ...
+
+    def has_rollout(self) -> bool:
+        """Return whether `collect` would return a rollout now. Safe from any thread."""
+        ...
+
+    def collect(self, identity: RolloutIdentity) -> Rollout | None:
+        """Return the next rollout, or None if it depends on somebody else and is not complete yet.
+
+        The rollout's arrays are valid until the next call.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release everything that `prepare` created. Idempotent."""
+        ...

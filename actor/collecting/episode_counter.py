@@ -1,4 +1,4 @@
-"""The running episodes of E environments."""
+"""Returns and lengths of the running episodes of E environments. Pure state."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinishedEpisodes:
-    """The episodes that ended in some rows, in the order of their ends."""
+    """K episodes, in the order in which they ended."""
 
     returns: np.ndarray  # [K] float32, undiscounted and unscaled
     lengths: np.ndarray  # [K] int32, env_steps
 
 
 class EpisodeCounter:
-    """Follows E environments' running episodes; says which rows are valid and which episodes ended."""
+    """The running returns and lengths of E environments' episodes, and those of the episodes that ended."""
 
     def __init__(self, count: int) -> None:
         self._returns = np.zeros(count, np.float64)
@@ -24,11 +24,11 @@ class EpisodeCounter:
 
     @property
     def valid(self) -> np.ndarray:
-        """[E] whether the next step is a real one, and not the reset after an episode's end."""
+        """[E] bool: whether the next step is a real one and not the reset after an episode's end."""
         return ~self._ended
 
     def step(self, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> None:
-        """Takes in one row: unscaled rewards [E], terminated [E], truncated [E]."""
+        """Count one row: unscaled rewards [E], terminated [E], truncated [E]."""
         self._returns += rewards
         self._lengths += ~self._ended
         self._ended = terminated | truncated
@@ -38,7 +38,7 @@ class EpisodeCounter:
             self._lengths[self._ended] = 0
 
     def take_finished(self) -> FinishedEpisodes:
-        """The episodes that ended since the last call."""
+        """Return the episodes that ended since the last call."""
         finished, self._finished = self._finished, []
         returns, lengths = zip(*finished, strict=True) if finished else ((), ())
         return FinishedEpisodes(

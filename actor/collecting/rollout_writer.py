@@ -1,4 +1,4 @@
-"""Acts for E environments and writes down what comes of it, row by row. No network, no threads, no environments."""
+"""Rollouts, written row by row: actions from a policy, outcomes from the caller. No network, no threads."""
 
 import numpy as np
 
@@ -11,9 +11,10 @@ from daedalus.protocol.spec import EnvironmentSpec
 
 
 class RolloutWriter:
-    """Holds what rows are made of between rollouts, and the arrays that every rollout is written into.
+    """The state that E environments carry from row to row, and the arrays that every rollout is written into.
 
-    `start`, and then for each row `act`, what the environments make of it, and `record`.
+    Call `start` once; then for each row `act`, step the environments, and `record`. After a `record` that returns True
+    call `finish`.
     """
 
     def __init__(
@@ -26,6 +27,16 @@ class RolloutWriter:
         rollout_length: int,
         random: np.random.Generator,
     ) -> None:
+        """Allocate the arrays of a rollout.
+
+        Args:
+          spaces: of one environment, after the run's transforms.
+          count: E, the number of environments.
+          runtime: chooses the actions.
+          spec: how rewards are clipped and scaled, and whether terminations are bootstrapped.
+          rollout_length: T, the number of rows.
+          random: source of the sampled actions.
+        """
         rows = rollout_length
         observation, action = spaces.observation, spaces.action
         self._runtime = runtime
@@ -49,19 +60,15 @@ class RolloutWriter:
 
     @property
     def is_between_rollouts(self) -> bool:
-        """Whether the next row is a rollout's first: the moment for other weights."""
+        """Whether the next row is the first of a rollout: only then may the runtime load other weights."""
         return self._row == 0
 
     def start(self, frames: np.ndarray) -> None:
-        """Takes the first frames [E, *frame_shape] of all environments."""
+        """Begin with the first frames [E, *frame_shape] of all environments."""
         self._stack.push(frames, np.ones(len(frames), np.bool_))
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        """Plays on with these weights; between rollouts only."""
-        self._runtime.load(weights)
-
     def act(self) -> np.ndarray:
-        """Chooses the actions [E] of the next row."""
+        """Return the actions [E] that the policy chooses for the next row."""
         if self._row == 0:
             depth = self._stack.frames.shape[1]
             self._frames[:depth] = self._stack.frames.swapaxes(0, 1)
@@ -73,7 +80,7 @@ class RolloutWriter:
         return actions
 
     def record(self, frames: np.ndarray, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
-        """Writes down what came of those actions, as VectorEnvironment.step returns it; whether the rollout is full."""
+        """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
         row, depth = self._row, self._stack.frames.shape[1]
         valid = self._episodes.valid
         self._frames[depth + row] = frames
@@ -81,7 +88,7 @@ class RolloutWriter:
         self._terminated[row] = terminated
         self._truncated[row] = truncated
         self._valid[row] = valid
-        # The row after one that only reset is the first of its episode: nothing before it is remembered.
+        # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
         self._stack.push(frames, ~valid)
         self._state = self._next_state * valid[:, None]
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
@@ -89,7 +96,7 @@ class RolloutWriter:
         return self._row == len(self._actions)
 
     def finish(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
-        """The full rollout; its arrays are views of ours: encode or copy it before the next `act`."""
+        """Return the full rollout. Its arrays are views: encode or copy it before the next `act`."""
         self._row = 0
         if self._reward_clip is not None:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
@@ -115,9 +122,9 @@ class RolloutWriter:
 
 
 def _frames(space: ArraySpace, rows: int, environments: int) -> np.ndarray:
-    """Room for a rollout's frames [k-1 + T+1, E, *frame_shape].
+    """Return an array for a rollout's frames [k-1 + T+1, E, *frame_shape].
 
-    Images lie environment by environment, as they are sent: each beside the one that it differs little from.
+    Images are stored environment by environment, as they are sent: consecutive images are alike and compress well.
     """
     length = space.frames + rows
     if len(space.shape) >= 2:

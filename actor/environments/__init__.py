@@ -1,1 +1,1 @@
-"""Environments: backends, transforms, action mapping."""
+"""Environments: backends, transforms and the mapping of actions."""

@@ -1,4 +1,4 @@
-"""Choices numbered from 0 -> the environment's own actions."""
+"""Action indices, counted from 0, mapped to the environment's own actions."""
 
 import gymnasium
 import numpy as np
@@ -7,19 +7,18 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 
 
 def env_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> np.ndarray:
-    """[count, *action_shape] the environment's own action for each choice.
+    """Return the environment's own action for each action index, [count, *action_shape].
 
     Args:
-      table: a row for each choice, over a Box; None where the environment has choices of its own.
-      space: of one environment's actions.
+      table: over a Box, a row of numbers for each action; None for a Discrete space.
+      space: the action space of one environment.
 
-    Raises EnvironmentSetupError if the two do not fit.
+    Raises EnvironmentSetupError if the table does not fit the space.
     """
     if isinstance(space, gymnasium.spaces.Discrete):
         if table is not None:
             raise EnvironmentSetupError(
-                f"environment.action_table has {len(table)} rows, but action space {space} has choices of its own: "
-                "leave the table out"
+                f"environment.action_table has {len(table)} rows, but action space {space} needs no table: leave it out"
             )
         return np.arange(space.start, space.start + space.n)
     if not isinstance(space, gymnasium.spaces.Box):
@@ -28,8 +27,8 @@ def env_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Sp
         )
     if table is None:
         raise EnvironmentSetupError(
-            f"action space {space} is not supported by itself: it must be Discrete; "
-            f"name the actions to choose from in environment.action_table, {_size(space)} numbers each"
+            f"action space {space} is not supported without a table: it must be Discrete; "
+            f"list the actions to choose from in environment.action_table, {_size(space)} numbers each"
         )
     return _checked(table, space)
 

@@ -1,4 +1,4 @@
-"""Atari games by the Arcade Learning Environment's own vectorised form: the games themselves, pixels included."""
+"""Backend `ale`: Atari games by the Arcade Learning Environment's own vector environment."""
 
 import re
 from typing import Any
@@ -19,7 +19,7 @@ _PURPOSE = "environment.backend=ale"
 
 
 class AleEnvironments:
-    """An AtariVectorEnv with stacks of one frame, as a BackendEnvironments."""
+    """A BackendEnvironments over an AtariVectorEnv with stacks of one frame."""
 
     def __init__(self, environment: Any) -> None:
         self._environment = environment
@@ -44,15 +44,15 @@ class AleEnvironments:
 
 
 def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, EnvironmentSpec]:
-    """The games, and the specification with what is left to do: ALE repeats, greys and resizes by itself.
+    """Return the environments, and the specification without what ALE does itself: repeat, grey and resize.
 
-    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
+    Raises EnvironmentSetupError; its message is one line.
     """
     for field in ("action_table", "no_reward_limit", "crop"):
         if getattr(spec, field) is not None:
             raise EnvironmentSetupError(
-                f"environment.backend=ale does not do environment.{field}: "
-                "leave it out, or play gymnasium's (--set environment.backend=gymnasium)"
+                f"environment.backend=ale does not support environment.{field}: "
+                "leave it out, or use --set environment.backend=gymnasium"
             )
     roms = import_extra("ale_py.roms", "atari", _PURPOSE)
     vector = import_extra("ale_py.vector_env", "atari", _PURPOSE)
@@ -75,17 +75,17 @@ def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, Enviro
             **limit,
             **spec.kwargs,
         )
-    except Exception as error:  # whatever ALE says of its options
-        raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be made: {first_line(error)}") from None
+    except Exception as error:  # broad: ALE's options raise many kinds of exception without a common base
+        raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be created: {first_line(error)}") from error
     return AleEnvironments(environment), spec.model_copy(update={"action_repeat": 1, "grey": False, "resize": None})
 
 
 def _game(environment_id: str, games: list[str]) -> str:
-    """`ALE/MsPacman-v5`, `MsPacman-v5` or `MsPacman` -> ALE's own name of the game, `ms_pacman`."""
+    """Return ALE's own name of a game, `ms_pacman` for `ALE/MsPacman-v5`, `MsPacman-v5` or `MsPacman`."""
     name = re.fullmatch(r"(?:ALE/)?(.*?)(?:-v\d+)?", environment_id, re.DOTALL)
     assert name is not None
     by_name = {"".join(word.capitalize() for word in game.split("_")): game for game in games}
     for known, game in by_name.items():
         if name[1].replace("_", "").lower() == known.lower():
             return game
-    raise unknown_environment(environment_id, by_name, "ALE has no game like it")
+    raise unknown_environment(environment_id, by_name, "ALE has no similar game")

@@ -1,7 +1,7 @@
-"""gymnasium's CarRacing, drawn only when a frame is looked at; and a sketch of it, drawn in a tenth of the time.
+"""gymnasium's CarRacing, rendered only when a frame is needed; and a fast renderer that takes a tenth of the time.
 
-A step of the original takes 0.1 ms of physics and 6 ms of drawing on a canvas of 1000 x 800, of which a repeated action
-throws all but the last frame away. The physics here are gymnasium's own, so rewards and episodes are the same.
+A step of the original takes 0.1 ms of physics and 6 ms of drawing on a canvas of 1000 x 800, and a repeated action
+discards all but the last frame. The physics here are gymnasium's own, so rewards and episodes are the same.
 """
 
 import math
@@ -9,10 +9,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.box2d import car_racing  # first: it says which packages it misses
+from gymnasium.envs.box2d import car_racing  # first: its error names the packages that are missing
 from pygame import Surface, draw, surfarray, transform
 
-_WIDTH, _HEIGHT = 250, 200  # of the sketch's canvas: a quarter of the original's
+_WIDTH, _HEIGHT = 250, 200  # of the fast renderer's canvas: a quarter of the original's
 _GRASS = np.array([(x, y) for x in range(-20, 20, 2) for y in range(-20, 20, 2)]) * car_racing.GRASS_DIM
 _CORNERS = np.array([[(1, 0)], [(0, 0)], [(0, 1)], [(1, 1)]])
 _PATCHES = _GRASS + car_racing.GRASS_DIM * _CORNERS  # [4, 400, xy]
@@ -20,9 +20,9 @@ _FIELD = car_racing.PLAYFIELD * (2 * _CORNERS - 1)  # [4, 1, xy]
 
 
 class LateRenderedCarRacing(car_racing.CarRacing):
-    """Steps show nothing (None) until `draw` is called, which shows what gymnasium's own would have."""
+    """A CarRacing whose steps observe None; `draw` returns the frame that gymnasium's own would have."""
 
-    _score = 0.0  # that the frame tells, which is the one before this step's reward
+    _score = 0.0  # shown in the frame: the score before this step's reward
 
     def _render(self, mode: str) -> Any:
         if mode != "state_pixels":
@@ -31,7 +31,7 @@ class LateRenderedCarRacing(car_racing.CarRacing):
         return None
 
     def draw(self) -> np.ndarray:
-        """The frame [96, 96, 3] uint8 of this moment."""
+        """Return the current frame [96, 96, 3] uint8."""
         score, self.reward = self.reward, self._score
         try:
             frame = super()._render("state_pixels")
@@ -42,7 +42,7 @@ class LateRenderedCarRacing(car_racing.CarRacing):
 
 
 class FastCarRacing(LateRenderedCarRacing):
-    """Draws on a smaller canvas, leaves out what is out of sight and the number that tells the score."""
+    """A CarRacing drawn on a smaller canvas, without the parts out of sight and without the score."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -50,14 +50,16 @@ class FastCarRacing(LateRenderedCarRacing):
         self._frame = Surface((car_racing.STATE_W, car_racing.STATE_H))
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode on a new track."""
+        """See gymnasium.Env."""
         started = super().reset(**kwargs)
         self._road = np.stack([corners for corners, _ in self.road_poly], axis=1)  # [4, N, xy]
-        self._road_colours = [colour for _, colour in self.road_poly]  # which change when a tile is driven over
+        self._road_colours = [
+            colour for _, colour in self.road_poly
+        ]  # lists that change when the car drives over a tile
         return started
 
     def draw(self) -> np.ndarray:
-        """The frame [96, 96, 3] uint8 of this moment; within a few grey values of gymnasium's own along edges."""
+        """Return the current frame [96, 96, 3] uint8; edges differ from gymnasium's own by a few grey values."""
         assert self.car is not None
         hull = self.car.hull
         zoom = 0.1 * car_racing.SCALE * max(1 - self.t, 0) + car_racing.ZOOM * car_racing.SCALE * min(self.t, 1)
@@ -77,7 +79,7 @@ class FastCarRacing(LateRenderedCarRacing):
         return surfarray.array3d(self._frame).swapaxes(0, 1)
 
     def _draw_polygons(self, polygons: np.ndarray, colours: list[Any]) -> None:
-        """Those of `polygons` [4, N, xy] that reach into the canvas, in their order."""
+        """Draw those of `polygons` [4, N, xy] that reach into the canvas, in their order."""
         in_sight = (polygons.max(axis=0) >= 0.0) & (polygons.min(axis=0) <= (_WIDTH, _HEIGHT))
         for index in np.flatnonzero(in_sight.all(axis=1)).tolist():
             colour = [int(part) for part in colours[index]]
@@ -85,8 +87,8 @@ class FastCarRacing(LateRenderedCarRacing):
 
 
 class RenderObservation(gymnasium.ObservationWrapper):
-    """Shows the frame of an environment that is not drawn by itself; the outermost wrapper, after all repeats."""
+    """Observations drawn on demand. It must be the outermost wrapper, so that repeated steps draw once."""
 
     def observation(self, observation: Any) -> np.ndarray:
-        """The frame of this moment."""
-        return self.unwrapped.draw()  # type: ignore[attr-defined]  # only such environments are wrapped
+        """Return the current frame."""
+        return self.unwrapped.draw()  # type: ignore[attr-defined]  # wraps a LateRenderedCarRacing

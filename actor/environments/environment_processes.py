@@ -1,4 +1,4 @@
-"""Environments in processes of their own: gymnasium's AsyncVectorEnv, made to start and end without accidents."""
+"""Environments in separate processes: gymnasium's AsyncVectorEnv with a safe start and end."""
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -12,55 +12,57 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
-    """One process for each environment; an interrupt of the process group leaves them to their parent."""
+    """One process for each environment. SIGINT to the process group does not reach them: their parent ends them."""
 
-    _answered = False  # whether nothing is under way, so that they can be asked to end themselves
+    _idle = False  # no call is in progress, so the processes can be asked to end
 
     def __init__(self, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
-        with _interrupts_held():
+        with _interrupts_blocked():
             super().__init__(
                 makers,
-                context="spawn",  # Zenoh does not survive a fork
+                context="spawn",  # Zenoh does not work after a fork
                 autoreset_mode=AutoresetMode.NEXT_STEP,
             )
-        self._answered = True
+        self._idle = True
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """See gymnasium's. Raises EnvironmentSetupError if a process has ended by itself."""
-        return self._ask(lambda: super(EnvironmentProcesses, self).reset(seed=seed, options=options))
+        """See AsyncVectorEnv. Raises EnvironmentSetupError if a process has died."""
+        return self._call(lambda: super(EnvironmentProcesses, self).reset(seed=seed, options=options))
 
     def step(self, actions: Any) -> Any:
-        """See gymnasium's. Raises EnvironmentSetupError if a process has ended by itself."""
-        return self._ask(lambda: super(EnvironmentProcesses, self).step(actions))
+        """See AsyncVectorEnv. Raises EnvironmentSetupError if a process has died."""
+        return self._call(lambda: super(EnvironmentProcesses, self).step(actions))
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """Ends them: by themselves if they listen, else by a signal. An interrupted step leaves nobody listening."""
+        """End the processes: by request if they are idle, otherwise by a signal."""
         try:
-            if self._answered and not terminate:
+            if self._idle and not terminate:
                 super().close_extras(timeout)
         except (EOFError, OSError):
-            pass  # one has ended before; the others are ended below
+            pass  # one process has died; the others are ended below
         finally:
             for process in self.processes:
                 process.terminate()
             for process in self.processes:
                 process.join()
 
-    def _ask(self, question: Callable[[], Any]) -> Any:
-        self._answered = False
+    def _call(self, call: Callable[[], Any]) -> Any:
+        self._idle = False
         try:
-            answer = question()
+            result = call()
         except (EOFError, ConnectionError):
-            if None in self.parent_pipes:  # the environment's own error, which its process has sent
+            if None in self.parent_pipes:  # the environment's own error, sent by its process
                 raise
-            raise EnvironmentSetupError("the process of an environment has ended by itself: was it killed?") from None
-        self._answered = True
-        return answer
+            raise EnvironmentSetupError(
+                "the process of an environment has died: check whether it was killed, such as for lack of memory"
+            ) from None
+        self._idle = True
+        return result
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Holds SIGINT back; processes started meanwhile never see it, since they inherit that."""
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT; processes that start meanwhile inherit the block for good."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

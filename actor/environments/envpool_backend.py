@@ -1,4 +1,4 @@
-"""envpool's environments: many in one C++ pool, on one thread."""
+"""Backend `envpool`: many environments in one C++ pool, on one thread."""
 
 import math
 import warnings
@@ -20,13 +20,16 @@ from daedalus.protocol.spec import EnvironmentSpec
 
 _ATARI_OPTIONS = {"stack_num", "frame_skip", "gray_scale", "img_height", "img_width", "reward_clip"}
 _ATARI_SIZE = (210, 160)
-_ATARI_FRAMES = 108_000  # half an hour of play, as in ALE; envpool's own default counts steps, whatever they repeat
+_ATARI_FRAMES = 108_000  # half an hour, as in ALE; envpool's own limit counts steps, however many frames they repeat
 
 Arrange = Callable[[np.ndarray], np.ndarray]
 
 
 class EnvpoolEnvironments:
-    """An envpool pool. Ended episodes are reset by index, which is what the pool's own autoreset does."""
+    """A BackendEnvironments over an envpool pool.
+
+    Ended episodes are reset by index, as the pool's own autoreset does.
+    """
 
     def __init__(
         self,
@@ -38,11 +41,20 @@ class EnvpoolEnvironments:
         no_reward_limit: int | None = None,
         arrange: Arrange = np.asarray,
     ) -> None:
-        """`arrange` makes frames [E, *frame_shape] of the pool's observations."""
+        """Prepare a pool, which the first `reset` creates.
+
+        Args:
+          envpool: the module.
+          name: of the environment.
+          options: of the pool.
+          repeat: how often each action is repeated here.
+          no_reward_limit: truncate an episode after so many steps in a row without a positive reward.
+          arrange: turns the pool's observations into frames [E, *frame_shape].
+        """
         self.count: int = options["num_envs"]
         self._make_pool = partial(envpool.make_gymnasium, name, **options)
-        self._pool: Any = None  # it wants its seed when it is made
-        with _quiet():
+        self._pool: Any = None  # created by `reset`, because it takes its seed at construction
+        with _no_warnings():
             spec = envpool.make_spec(name, **options)
             self.observation_space: gymnasium.Space = _arranged(spec.gymnasium_observation_space, arrange)
             self.action_space: gymnasium.Space = spec.gymnasium_action_space
@@ -56,7 +68,7 @@ class EnvpoolEnvironments:
     def reset(self, seed: int) -> np.ndarray:
         """See BackendEnvironments."""
         self.close()
-        with _quiet():
+        with _no_warnings():
             self._pool = self._make_pool(seed=seed % (2**31 - self.count))  # environment e gets the int32 seed + e
             observations, _ = self._pool.reset()
         self._ended[:] = False
@@ -94,17 +106,19 @@ class EnvpoolEnvironments:
 
 
 def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
-    """The pool, and the specification with what is left to do: Atari games are repeated, greyed and resized in it.
+    """Return the environments, and the specification without what the pool does itself.
 
-    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
+    For Atari games the pool repeats, greys and resizes.
+
+    Raises EnvironmentSetupError; its message is one line.
     """
-    with _quiet():
+    with _no_warnings():
         envpool = import_extra("envpool", "envpool", "environment.backend=envpool")
     names = envpool.list_all_envs()
     if spec.id not in names:
-        raise unknown_environment(spec.id, names, "envpool has none like it (--set environment.backend=gymnasium?)")
+        raise unknown_environment(spec.id, names, "envpool has none like it; use --set environment.backend=gymnasium")
     try:
-        with _quiet():
+        with _no_warnings():
             config = envpool.make_spec(spec.id).config
         if set(config._fields) >= _ATARI_OPTIONS:
             return _make_atari(envpool, spec, count)
@@ -116,12 +130,14 @@ def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments
         return bare, spec
     except EnvironmentSetupError:
         raise
-    except Exception as error:  # whatever envpool says of its options
-        raise EnvironmentSetupError(f"environment {spec.id} of envpool cannot be made: {first_line(error)}") from None
+    except Exception as error:  # broad: envpool's options raise many kinds of exception without a common base
+        raise EnvironmentSetupError(
+            f"environment {spec.id} of envpool cannot be created: {first_line(error)}"
+        ) from error
 
 
 def _make_atari(envpool: Any, spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments, EnvironmentSpec]:
-    cropped = spec.crop is not None  # which envpool does not do, and which comes before the resizing
+    cropped = spec.crop is not None  # envpool does not crop, and cropping comes before resizing
     height, width = _ATARI_SIZE if cropped or spec.resize is None else spec.resize
     options = _options(
         spec,
@@ -159,19 +175,19 @@ def _colour(observations: np.ndarray) -> np.ndarray:
 
 
 def _options(spec: EnvironmentSpec, count: int, ours: dict[str, Any]) -> dict[str, Any]:
-    """A pool's options: the user's, and those that are decided elsewhere."""
+    """Return a pool's options: the user's and ours. Raises EnvironmentSetupError if both name the same one."""
     ours = {**ours, "num_envs": count, "batch_size": count, "num_threads": 1}
-    if twice := sorted(ours.keys() & spec.kwargs.keys()):
+    if conflicting := sorted(ours.keys() & spec.kwargs.keys()):
         raise EnvironmentSetupError(
-            f"environment.kwargs of envpool's {spec.id} names {' and '.join(twice)}, "
-            "which the rest of the specification decides: leave it out of kwargs"
+            f"environment.kwargs of envpool's {spec.id} names {' and '.join(conflicting)}, "
+            "but other settings decide that: leave it out of kwargs"
         )
     return {**spec.kwargs, **ours}
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Without envpool's warnings about the precision of its own spaces."""
+def _no_warnings() -> Iterator[None]:
+    """Suppress envpool's warnings about the precision of its own spaces."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield

@@ -1,4 +1,4 @@
-"""gymnasium's environments, and every environment that a user registers with it."""
+"""Backend `gymnasium`: its environments and those that users register with it. Also backend `fast`, for CarRacing."""
 
 import importlib
 from collections.abc import Callable
@@ -27,7 +27,7 @@ _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
 class GymnasiumEnvironments:
-    """A gymnasium vector environment as a BackendEnvironments."""
+    """A BackendEnvironments over a gymnasium vector environment."""
 
     def __init__(self, environment: Any) -> None:
         self._environment = environment
@@ -49,7 +49,7 @@ class GymnasiumEnvironments:
 
 
 class RepeatedSteps(gymnasium.Wrapper):
-    """Repeats each action, shows every step to a camera, and cuts an episode that no_reward_limit has run out for."""
+    """A wrapper that repeats each action, passes every frame to a camera, and applies no_reward_limit."""
 
     def __init__(
         self, environment: gymnasium.Env, *, repeat: int, no_reward_limit: int | None, camera: Camera | None = None
@@ -61,14 +61,14 @@ class RepeatedSteps(gymnasium.Wrapper):
         self._unrewarded = 0  # steps in a row
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode."""
+        """See gymnasium.Env."""
         started = self.env.reset(seed=seed, options=options)
         self._unrewarded = 0
-        self._show()
+        self._film()
         return started
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Steps until the action has been repeated often enough or the episode ends; rewards are summed."""
+        """Repeat the action until the episode ends or `repeat` is reached, and sum the rewards."""
         observation, total, terminated, truncated, info = self._step_once(action)
         for _ in range(self._repeat - 1):
             if terminated or truncated:
@@ -82,23 +82,23 @@ class RepeatedSteps(gymnasium.Wrapper):
 
     def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._show()
+        self._film()
         return observation, float(reward), terminated, truncated, info
 
-    def _show(self) -> None:
+    def _film(self) -> None:
         if self._camera is None:
             return
         picture = self.env.render()
         if not isinstance(picture, np.ndarray):
             raise EnvironmentSetupError(
-                f"{self.env} renders no picture, but {type(picture).__name__}: it cannot be filmed"
+                f"{self.env} renders {type(picture).__name__} instead of an image: a video of it cannot be recorded"
             )
         self._camera(picture)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvironmentFactory:
-    """Makes one environment, here or in a process of its own."""
+    """A picklable function that creates one environment, here or in a process of its own."""
 
     spec: EnvironmentSpec
     wrap: str | None = None
@@ -106,15 +106,15 @@ class EnvironmentFactory:
     camera: Camera | None = None
 
     def __call__(self) -> gymnasium.Env:
-        """One environment; whatever it raises when it is made."""
+        """Return a new environment. Raises whatever the environment raises."""
         spec, registered = self.spec, registration(self.spec.id)
         kwargs = _kwargs(spec)
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
-        drawn_late = registered.entry_point == _CAR_RACING and self.wrap is None
+        late_rendered = registered.entry_point == _CAR_RACING and self.wrap is None
         environment = gymnasium.make(
-            _late_rendered(registered, spec.backend) if drawn_late else registered,
-            disable_env_checker=True,  # it costs a tenth of the speed, and warns on behalf of others
+            _late_rendered(registered, spec.backend) if late_rendered else registered,
+            disable_env_checker=True,  # it costs a tenth of the speed, and warns only authors
             **kwargs,
         )
         if self.wrap is not None:
@@ -123,18 +123,18 @@ class EnvironmentFactory:
             environment = RepeatedSteps(
                 environment, repeat=spec.action_repeat, no_reward_limit=spec.no_reward_limit, camera=self.camera
             )
-        if drawn_late:
-            from daedalus.actor.environments.car_racing import RenderObservation  # needs packages that are optional
+        if late_rendered:
+            from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
 
             environment = RenderObservation(environment)
         return environment
 
     @property
     def is_plain(self) -> bool:
-        """Whether nothing is asked of each environment by itself, so that its own vectorised form will do."""
+        """Whether no wrapper is needed, so that the environment's own vector entry point can be used."""
         spec = self.spec
-        of_each = (spec.no_reward_limit, self.wrap, self.render_mode, self.camera)
-        return spec.action_repeat == 1 and not spec.processes and all(asked is None for asked in of_each)
+        wrappers = (spec.no_reward_limit, self.wrap, self.render_mode, self.camera)
+        return spec.action_repeat == 1 and not spec.processes and all(wrapper is None for wrapper in wrappers)
 
 
 def make_gymnasium(
@@ -145,13 +145,17 @@ def make_gymnasium(
     render_mode: str | None = None,
     camera: Camera | None = None,
 ) -> GymnasiumEnvironments:
-    """By the environment's own vector entry point if it has one that will do, else in turn, else in processes."""
+    """Return `count` environments: by their own vector entry point if possible, else stepped in turn or in processes.
+
+    See make_environments for the arguments. Raises EnvironmentSetupError.
+    """
     if spec.backend == "fast" and registration(spec.id).entry_point != _CAR_RACING:
         raise EnvironmentSetupError(
-            f"environment.backend=fast draws CarRacing-v3 only, not {spec.id}: --set environment.backend=gymnasium"
+            f"environment.backend=fast supports CarRacing-v3 only, not {spec.id}: "
+            "use --set environment.backend=gymnasium"
         )
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
-        raise ValueError("a camera films one environment in render_mode 'rgb_array'")
+        raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     try:
         environment = _make_vector(
             EnvironmentFactory(spec=spec, wrap=wrap, render_mode=render_mode, camera=camera), count
@@ -162,19 +166,19 @@ def make_gymnasium(
         box2d = "box2d" in str(error).lower()
         remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
         raise EnvironmentSetupError(f"environment {spec.id} needs a package that is not installed: {remedy}") from None
-    except Exception as error:  # whatever a user's own environment raises
-        raise EnvironmentSetupError(f"environment {spec.id} cannot be made: {first_line(error)}") from None
+    except Exception as error:  # broad: the constructor of a user's environment may raise anything
+        raise EnvironmentSetupError(f"environment {spec.id} cannot be created: {first_line(error)}") from error
     if environment.metadata.get("autoreset_mode") is not AutoresetMode.NEXT_STEP:
         environment.close()
         raise EnvironmentSetupError(
-            f"environment {spec.id} resets by {environment.metadata.get('autoreset_mode')}: "
-            "its vector entry point must follow gymnasium's AutoresetMode.NEXT_STEP"
+            f"environment {spec.id} has autoreset mode {environment.metadata.get('autoreset_mode')}: "
+            "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     return GymnasiumEnvironments(environment)
 
 
 def registration(environment_id: str) -> EnvSpec:
-    """gymnasium's registration of `[module:]id`; the module may lie in the working directory."""
+    """Return gymnasium's registration of `[module:]id`; the module may be in the working directory."""
     module, _, name = environment_id.rpartition(":")
     if module:
         import_user_module(module, f"environment {environment_id}")
@@ -184,7 +188,7 @@ def registration(environment_id: str) -> EnvSpec:
         return gymnasium.spec(name)
     except gymnasium.error.Error:
         raise unknown_environment(
-            name, gymnasium.registry.keys(), "is its package installed and its module named (module:Id)?"
+            name, gymnasium.registry.keys(), "install its package, and name its module as module:Id"
         ) from None
 
 
@@ -206,7 +210,7 @@ def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
 
 
 def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:
-    """CarRacing's registration, for one that draws late: most of its time goes into frames that nobody sees."""
+    """Return CarRacing's registration with a class that renders on demand: most of its time goes into unused frames."""
     from daedalus.actor.environments.car_racing import FastCarRacing, LateRenderedCarRacing
 
     return replace(registered, entry_point=FastCarRacing if backend == "fast" else LateRenderedCarRacing)
@@ -214,7 +218,7 @@ def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:
 
 def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
     spec, registered = factory.spec, registration(factory.spec.id)
-    # ALE's vectorised form is another environment: it stacks, shrinks and clips by itself (that is backend=ale).
+    # ALE's vector entry point is another environment: it stacks, resizes and clips by itself (see backend=ale).
     if registered.vector_entry_point is not None and registered.namespace != "ALE" and factory.is_plain:
         return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
@@ -228,13 +232,14 @@ def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:
 
 
 def _wrapped(environment: gymnasium.Env, wrap: str) -> gymnasium.Env:
+    """Return the environment in the user's wrapper `module:function`."""
     module, _, name = wrap.rpartition(":")
     function = getattr(import_user_module(module, f"wrap {wrap}"), name, None) if module else None
     if not callable(function):
-        raise EnvironmentSetupError(f"wrap {wrap}: there is no such function; name it as module:function")
+        raise EnvironmentSetupError(f"wrap {wrap}: no such function; name it as module:function")
     wrapped = function(environment)
     if not isinstance(wrapped, gymnasium.Env):
         raise EnvironmentSetupError(
-            f"wrap {wrap} made {type(wrapped).__name__} of {environment}: it must be a gymnasium.Env"
+            f"wrap {wrap} returned {type(wrapped).__name__} for {environment}: it must return a gymnasium.Env"
         )
     return wrapped

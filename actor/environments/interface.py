@@ -1,7 +1,7 @@
-"""What an environment is to those that play it: E environments stepped together under gymnasium's NEXT_STEP rule.
+"""The interfaces of environments: E environments stepped together under gymnasium's NEXT_STEP rule.
 
-The step after an episode's end ignores its action and resets. Observations are single frames; stacks are made of them
-elsewhere (protocol/frames.py). Rewards are the environment's own.
+The step after an episode's end ignores its action and resets. Observations are single frames; protocol/frames.py
+stacks them. Rewards are the environment's own.
 """
 
 from typing import Protocol
@@ -19,47 +19,47 @@ class VectorEnvironment(Protocol):
 
     @property
     def count(self) -> int:
-        """E."""
+        """E, the number of environments."""
         ...
 
     @property
     def spaces(self) -> Spaces:
-        """What one of them shows and takes."""
+        """The observation and action space of one environment, as the run has them."""
         ...
 
     def reset(self, seed: int) -> np.ndarray:
-        """Starts an episode in each; returns frames [E, *frame_shape]."""
+        """Start an episode in each environment; return frames [E, *frame_shape]."""
         ...
 
     def step(self, actions: np.ndarray) -> Step:
-        """Takes one action [E] in each, repeated as the specification says.
+        """Take one action [E] in each environment, repeated as the specification says.
 
         Returns: frames [E, *frame_shape], true rewards [E] (summed over the repeats), terminated [E], truncated [E].
-        Where the last step ended an episode this one only resets: reward 0 and the first frame.
+        In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame.
         """
         ...
 
     def close(self) -> None:
-        """Ends them."""
+        """Close the environments. Idempotent."""
         ...
 
 
 class BackendEnvironments(Protocol):
-    """What a backend makes: steps, repeats and cuts episodes as the specification says, with its own spaces."""
+    """A backend's environments, with their own spaces: they repeat actions and truncate episodes as specified."""
 
     @property
     def count(self) -> int:
-        """E."""
+        """E, the number of environments."""
         ...
 
     @property
     def observation_space(self) -> gymnasium.Space:
-        """What one of them shows."""
+        """The observation space of one environment."""
         ...
 
     @property
     def action_space(self) -> gymnasium.Space:
-        """What one of them takes."""
+        """The action space of one environment."""
         ...
 
     def reset(self, seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Environments from their specification: `make_environments`."""
+"""Creates environments from their specification."""
 
 from collections.abc import Callable
 
@@ -18,22 +18,22 @@ def make_environments(
     render_mode: str | None = None,
     camera: Callable[[np.ndarray], None] | None = None,
 ) -> VectorEnvironment:
-    """`count` environments of one kind, by the backend that the specification names.
+    """Return `count` environments of one kind, created by the backend that the specification names.
 
     Args:
-      spec: what to play and what to do to it.
-      count: E.
+      spec: the environment and its transforms.
+      count: E, the number of environments.
       wrap: `module:function` (gymnasium.Env -> gymnasium.Env), applied to each before the specification's transforms.
-      render_mode: gymnasium's; "human" opens a window, "rgb_array" is what a camera needs.
-      camera: called with the picture [H, W, 3] uint8 after the reset and after every step of the environment's own,
-        the repeated ones too. One environment only.
+      render_mode: gymnasium's; "human" opens a window, and a camera needs "rgb_array".
+      camera: called with the rendered image [H, W, 3] uint8 after each reset and after every step, repeated ones
+        included. Requires count 1.
 
-    The last three are for the gymnasium backend only.
+    Only the gymnasium backend supports the last three.
 
-    Raises EnvironmentSetupError with one line that says what is wrong and what to do.
+    Raises EnvironmentSetupError; its message is one line.
     """
     if spec.backend != "gymnasium":
-        _refuse_what_only_gymnasium_does(spec, {"wrap": wrap, "render_mode": render_mode, "camera": camera})
+        _refuse_gymnasium_options(spec, {"wrap": wrap, "render_mode": render_mode, "camera": camera})
     bare, rest = _make_bare(spec, count, wrap, render_mode, camera)
     try:
         return TransformedEnvironment(bare, rest)
@@ -49,12 +49,11 @@ def _make_bare(
     render_mode: str | None,
     camera: Callable[[np.ndarray], None] | None,
 ) -> tuple[BackendEnvironments, EnvironmentSpec]:
-    """The backend's environments, and the specification with the transforms that are left to do."""
+    """Return the backend's environments, and the specification without the transforms that the backend does itself."""
     match spec.backend:
         case "envpool":
-            from daedalus.actor.environments.envpool_backend import (
-                make_envpool,  # a backend is imported when it is played
-            )
+            # A backend is imported when it is used.
+            from daedalus.actor.environments.envpool_backend import make_envpool
 
             return make_envpool(spec, count)
         case "ale":
@@ -67,10 +66,10 @@ def _make_bare(
             return make_gymnasium(spec, count, wrap=wrap, render_mode=render_mode, camera=camera), spec
 
 
-def _refuse_what_only_gymnasium_does(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
+def _refuse_gymnasium_options(spec: EnvironmentSpec, asked: dict[str, object]) -> None:
     names = [name for name, value in asked.items() if value is not None]
     if names:
         raise EnvironmentSetupError(
-            f"environment.backend={spec.backend} does not do {' and '.join(names)}: "
-            "leave it out, or play gymnasium's (--set environment.backend=gymnasium)"
+            f"environment.backend={spec.backend} does not support {' and '.join(names)}: "
+            "leave it out, or use --set environment.backend=gymnasium"
         )

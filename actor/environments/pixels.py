@@ -1,4 +1,4 @@
-"""What is done to the pixels of a frame before it is stored or sent: crop, grey, resize. Pure numpy, all E at once."""
+"""Transforms of frames before they are stored and sent: crop, grey, resize. Pure functions, all E frames at once."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -13,7 +13,7 @@ _GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0
 
 
 class Pixels:
-    """A specification's transforms of frames, in its order; none of them leaves frames as they are."""
+    """The pixel transforms of a specification, in order; the identity if it has none."""
 
     def __init__(self, spec: EnvironmentSpec, space: gymnasium.spaces.Box) -> None:
         """Raises EnvironmentSetupError if a transform does not fit the space."""
@@ -35,29 +35,32 @@ class Pixels:
                 raise EnvironmentSetupError(
                     f"environment.{name} does not fit observation space {space}: {error}"
                 ) from None
-        self.shape: tuple[int, ...] = frames.shape[1:]  # of one frame that comes out
+        self.shape: tuple[int, ...] = frames.shape[1:]  # of one transformed frame
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
-        """[E, *the space's shape] -> [E, *shape]."""
+        """Return frames [E, *space.shape] transformed to [E, *shape]."""
         for transform in self._transforms:
             frames = transform(frames)
         return frames
 
 
 def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
-    """[E, H, W, ...] without `margins` pixels at the top, bottom, left and right; a view."""
+    """Return a view of frames [E, H, W, ...] without `margins` pixels at the top, bottom, left and right."""
     top, bottom, left, right = margins
     height, width = frames.shape[1:3]
     if top + bottom >= height or left + right >= width:
-        raise ValueError(f"nothing would be left of {height} x {width} pixels")
+        raise ValueError(f"the margins leave nothing of {height} x {width} pixels")
     return frames[:, top : height - bottom, left : width - right]
 
 
 def grey(frames: np.ndarray) -> np.ndarray:
-    """[E, H, W, 3] red, green, blue -> [E, H, W] the nearest integer to their luma by ITU-R BT.601."""
+    """Return the luma by ITU-R BT.601 of RGB frames [E, H, W, 3], rounded to integers [E, H, W]."""
     if frames.ndim != 4 or frames.shape[3] != 3:
-        raise ValueError(f"a frame of shape {frames.shape[1:]} has no red, green and blue")
-    luma, part = np.full(frames.shape[:3], 128, np.uint16), np.empty(frames.shape[:3], np.uint16)  # 128: a half
+        raise ValueError(f"a frame of shape {frames.shape[1:]} is not RGB: its last dimension must be 3")
+    luma, part = (
+        np.full(frames.shape[:3], 128, np.uint16),
+        np.empty(frames.shape[:3], np.uint16),
+    )  # 128: rounds to the nearest
     for channel, weight in enumerate(_GREY_WEIGHTS):
         np.multiply(frames[..., channel], weight, out=part, dtype=np.uint16)
         luma += part  # at most 255 * 256 + 128, which fits
@@ -66,10 +69,10 @@ def grey(frames: np.ndarray) -> np.ndarray:
 
 
 def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """[E, H, W, ...] -> [E, h, w, ...] for `size` (h, w): each pixel the mean of the area that it covers.
+    """Return frames [E, H, W, ...] resized to `size` (h, w): each pixel is the mean of the area that it covers.
 
-    Lengths are counted in units of 1/h and 1/w of a source pixel, in which all overlaps are integers, so the sums are
-    exact in float32 up to 65,793 source pixels, and good to a rounding of the last bit beyond.
+    Lengths are in units of 1/h and 1/w of a source pixel, in which all overlaps are integers: the sums are exact in
+    float32 up to 65,793 source pixels, and rounded in the last bit beyond.
     """
     height, width = frames.shape[1:3]
     sums = _area_sums(_area_sums(frames, 1, size[0]), 2, size[1])
@@ -78,7 +81,10 @@ def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _area_sums(frames: np.ndarray, axis: int, target: int) -> np.ndarray:
-    """The sums over what each target pixel covers of an axis. By hand: BLAS would start threads over it."""
+    """Return the weighted sums of the source pixels that each target pixel covers on one axis.
+
+    A matrix product would do the same, but BLAS would start threads for it.
+    """
     sums = np.zeros((*frames.shape[:axis], target, *frames.shape[axis + 1 :]), np.float32)
     part = np.empty_like(sums)
     for sources, weights in zip(*_overlaps(frames.shape[axis], target), strict=True):
@@ -89,7 +95,7 @@ def _area_sums(frames: np.ndarray, axis: int, target: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _overlaps(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of each target pixel the source pixels that it covers, [K, target], and how much of each, float32 likewise.
+    """Return the source pixels that each target pixel covers, [K, target], and how much of each, float32 [K, target].
 
     Target pixel i spans [i * source, (i + 1) * source), source pixel j spans [j * target, (j + 1) * target).
     """

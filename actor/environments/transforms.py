@@ -1,4 +1,4 @@
-"""A specification's action table and pixel transforms, around a backend's environments."""
+"""The action table and pixel transforms of a specification, applied to a backend's environments."""
 
 from typing import Any
 
@@ -14,15 +14,15 @@ from daedalus.protocol.spec import EnvironmentSpec
 
 
 class Transforms:
-    """A specification's action table and pixel transforms, between an environment's spaces and the run's."""
+    """The mapping between an environment's spaces and the run's: action table and pixel transforms."""
 
     def __init__(
         self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
     ) -> None:
-        """Raises EnvironmentSetupError if they do not fit."""
+        """Raises EnvironmentSetupError if the specification does not fit the spaces."""
         if not isinstance(observation_space, gymnasium.spaces.Box) or not 1 <= len(observation_space.shape) <= 4:
             raise EnvironmentSetupError(
-                f"observation space {observation_space} is not supported: it must be a Box of one to four dimensions"
+                f"observation space {observation_space} is not supported: it must be a Box with one to four dimensions"
             )
         self._observation_space = observation_space
         self._actions = env_actions(spec.action_table, action_space)
@@ -47,26 +47,26 @@ class Transforms:
         return self.frames(frame[None])
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
-        """[E, *the environment's shape] as the run has them: [E, *frame_shape]."""
+        """Return the environment's frames [E, ...] as the run has them: [E, *frame_shape]."""
         return self._pixels(frames)
 
-    def env_actions(self, choices: np.ndarray) -> np.ndarray:
-        """[E] choices as the environment takes them: [E, *action_shape]."""
-        return self._actions[choices]
+    def env_actions(self, indices: np.ndarray) -> np.ndarray:
+        """Return the environment's actions [E, *action_shape] for action indices [E]."""
+        return self._actions[indices]
 
 
 class TransformedEnvironment:
-    """A bare environment seen through a specification's transforms."""
+    """A VectorEnvironment: a backend's environments with the specification's transforms."""
 
-    def __init__(self, bare: BackendEnvironments, spec: EnvironmentSpec) -> None:
-        """Raises EnvironmentSetupError if the two do not fit."""
-        self._bare = bare
-        self._transforms = Transforms(spec, bare.observation_space, bare.action_space)
+    def __init__(self, environments: BackendEnvironments, spec: EnvironmentSpec) -> None:
+        """Raises EnvironmentSetupError if the specification does not fit the environments."""
+        self._environments = environments
+        self._transforms = Transforms(spec, environments.observation_space, environments.action_space)
 
     @property
     def count(self) -> int:
         """See VectorEnvironment."""
-        return self._bare.count
+        return self._environments.count
 
     @property
     def spaces(self) -> Spaces:
@@ -75,13 +75,13 @@ class TransformedEnvironment:
 
     def reset(self, seed: int) -> np.ndarray:
         """See VectorEnvironment."""
-        return self._transforms.frames(self._bare.reset(seed))
+        return self._transforms.frames(self._environments.reset(seed))
 
     def step(self, actions: np.ndarray) -> Step:
         """See VectorEnvironment."""
-        frames, rewards, terminated, truncated = self._bare.step(self._transforms.env_actions(actions))
+        frames, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         return self._transforms.frames(frames), rewards, terminated, truncated
 
     def close(self) -> None:
         """See VectorEnvironment."""
-        self._bare.close()
+        self._environments.close()

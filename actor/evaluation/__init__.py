@@ -1,1 +1,1 @@
-"""Whole episodes played for a score, and videos of them."""
+"""Evaluation: whole episodes, the evaluator, and videos."""

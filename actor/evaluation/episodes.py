@@ -1,4 +1,4 @@
-"""Plays whole episodes with a policy and reports their returns. Contributes nothing to training."""
+"""Whole episodes played with a policy, and their returns. No network, no threads."""
 
 import os
 from collections.abc import Callable
@@ -6,33 +6,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_counter import EpisodeCounter
+from daedalus.actor.collecting.episode_counter import EpisodeCounter, FinishedEpisodes
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import FrameStack
 from daedalus.protocol.spec import EnvironmentSpec
 
-_MOST_ENVIRONMENTS = 100
-_ENVIRONMENTS_PER_PROCESSOR = 4  # where each is a process: enough to keep a processor busy, few enough to start
+_MAX_ENVIRONMENTS = 100
+_ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """The episodes played, in no particular order."""
+    """The results of an evaluation's episodes, in no particular order."""
 
     returns: np.ndarray  # [episodes] float32, undiscounted and unscaled
     lengths: np.ndarray  # [episodes] int32, env_steps
 
 
 def environments_for(episodes: int, spec: EnvironmentSpec | None = None) -> int:
-    """How many environments to play so many episodes in."""
-    most = _MOST_ENVIRONMENTS
+    """Return how many environments to create for so many episodes."""
+    most = _MAX_ENVIRONMENTS
     if spec is not None and spec.processes and spec.backend == "gymnasium":
         most = _ENVIRONMENTS_PER_PROCESSOR * (os.cpu_count() or 1)
     return min(episodes, most)
 
 
-def _silent(finished: int, mean: float) -> None:
+def _no_progress(finished: int, mean: float) -> None:
     pass
 
 
@@ -43,40 +43,62 @@ def play_episodes(
     seed: int,
     *,
     sampled: bool,
-    progress: Callable[[int, float], None] = _silent,
+    progress: Callable[[int, float], None] = _no_progress,
 ) -> Evaluation:
-    """Plays `episodes` episodes, greedily unless `sampled`.
+    """Play `episodes` episodes and return their results.
 
-    Each environment has its share and what it plays beyond that is not counted: taking whichever episodes end
-    first would favour the short ones. After every step `progress` is told how many have been counted, and their mean
-    return (NaN before the first).
+    Each environment plays its share of the episodes, and any further ones are not counted: counting whichever episodes
+    end first would favour short ones.
+
+    Args:
+      runtime: the policy, with its weights loaded.
+      environments: E environments; they are reset first, and not closed.
+      episodes: how many to count.
+      seed: of the environments and of sampled actions.
+      sampled: sample the actions instead of choosing the most probable ones.
+      progress: called after every step with the number of episodes counted and their mean return (NaN at first).
     """
     count = environments.count
-    share = np.full(count, episodes // count)
-    share[: episodes % count] += 1
     environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
     random = np.random.default_rng(action_seed) if sampled else None
-    counter = EpisodeCounter(count)
-    returns, lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
-    mean = float("nan")
+    counter, counted = EpisodeCounter(count), _CountedEpisodes(episodes, count)
     stack = FrameStack(environments.spaces.observation, count)
     state = np.zeros((count, runtime.state_size), np.float32)
     stack.push(environments.reset(int(environment_seed)), np.ones(count, np.bool_))
-    while share.any():
+    while not counted.complete:
         valid = counter.valid
         actions, _, next_state = runtime.act(stack.observations, state, random)
         frames, rewards, terminated, truncated = environments.step(actions)
-        # As the collector does: nothing from before an episode's first row is seen or remembered in it.
+        # As in RolloutWriter: the frame stack and the memory begin anew with each episode.
         stack.push(frames, ~valid)
         state = next_state * valid[:, None]
         counter.step(rewards, terminated, truncated)
         ended = terminated | truncated
         if ended.any():
-            finished = counter.take_finished()
-            counted = share[ended] > 0
-            returns = np.concatenate([returns, finished.returns[counted]])
-            lengths = np.concatenate([lengths, finished.lengths[counted]])
-            share[ended] = np.maximum(share[ended] - 1, 0)
-            mean = float(returns.mean(dtype=np.float64)) if len(returns) else mean
-        progress(len(returns), mean)
-    return Evaluation(returns=returns, lengths=lengths)
+            counted.add(ended, counter.take_finished())
+        progress(len(counted.returns), counted.mean_return)
+    return Evaluation(returns=counted.returns, lengths=counted.lengths)
+
+
+class _CountedEpisodes:
+    """The results of the episodes that count: of each environment, its share from its first episode on."""
+
+    def __init__(self, episodes: int, count: int) -> None:
+        self._missing = np.full(count, episodes // count)  # [E] episodes of each environment's share
+        self._missing[: episodes % count] += 1
+        self.returns, self.lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
+        self.mean_return = float("nan")
+
+    @property
+    def complete(self) -> bool:
+        """Whether every environment has played its share."""
+        return not self._missing.any()
+
+    def add(self, ended: np.ndarray, finished: FinishedEpisodes) -> None:
+        """Add the episodes that finished in the environments `ended` [E] bool, those beyond a share excepted."""
+        counted = self._missing[ended] > 0
+        self.returns = np.concatenate([self.returns, finished.returns[counted]])
+        self.lengths = np.concatenate([self.lengths, finished.lengths[counted]])
+        self._missing[ended] = np.maximum(self._missing[ended] - 1, 0)
+        if len(self.returns):
+            self.mean_return = float(self.returns.mean(dtype=np.float64))

@@ -1,5 +1,6 @@
-"""The evaluator: an actor that plays the learner's newest policy for a score, on a schedule, and reports. Contributes
-nothing to the training data. No threads but the transport's.
+"""The evaluator: an actor that evaluates the learner's newest policy on a schedule and reports the returns.
+
+It contributes nothing to the training data. The only threads are the caller's and the transport's.
 """
 
 import itertools
@@ -20,38 +21,40 @@ from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
-_DEFAULT_SECONDS = 60.0  # between evaluations where the run does not say
+_DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
 
 
 class Evaluator:
     """One evaluator over one transport."""
 
     def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
-        self._config = config
-        self._stop = stop
-        self._link = LearnerQueries(transport, config.hint)
+        """`stop` ends `run`, also in the middle of an episode."""
+        self._config, self._stop = config, stop
+        self._queries = LearnerQueries(transport, config.authorization_hint)
 
     def run(self) -> None:
-        """Evaluates until stopped or until the run is over.
+        """Evaluate until `stop` or until the run is over.
 
-        Raises ActorError if it is refused, EnvironmentSetupError if the environment cannot be made here, PolicyError if
-        the policy cannot be played.
+        Raises ActorError if the evaluator is refused, EnvironmentSetupError if the environment cannot be created here,
+        PolicyError if the policy does not run.
         """
         join = Join(actor=self._config.name, incarnation=self._config.incarnation)
         try:
             while True:
-                self._attend(self._link.find(self._config.run, join, self._config.timeout, self._stop))
+                self._evaluate_learner(
+                    self._queries.join_learner(self._config.run, join, self._config.timeout, self._stop)
+                )
         except RunOverError as error:
-            _logger.info(str(error))
+            _logger.info("%s", error)
 
-    def _attend(self, welcome: Welcome) -> None:
-        """Evaluates for one life of a learner, until it ends."""
+    def _evaluate_learner(self, welcome: Welcome) -> None:
+        """Evaluate the policies of one learner epoch until it ends."""
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes
         actions = spec.evaluation.actions
         _logger.info(
-            f"run {welcome.run!r}: {episodes} {actions} episodes of {spec.environment.id} every {interval:g} s"
+            "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
         )
         environment = spec.environment.as_evaluated()
         environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
@@ -61,7 +64,7 @@ class Evaluator:
                 if self._stop.wait(max(due - time.monotonic(), 0.0)):
                     raise RunOverError("stopped")
                 due = time.monotonic() + interval
-                # Actors' seeds are one number, these three: no episode of training is played here.
+                # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])
                 if not self._evaluate(welcome, environments, seed):
                     return
@@ -69,21 +72,26 @@ class Evaluator:
             environments.close()
 
     def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
-        """One evaluation, from the request to the report; False if the learner is not there any more."""
-        snapshot = self._link.evaluation_snapshot(welcome.run, self._config.name, self._stop)
+        """Request a policy, evaluate it and report; return False if the learner is gone."""
+        snapshot = self._queries.evaluation_snapshot(welcome.run, self._config.name, self._stop)
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
-        program = self._link.program(welcome.run, snapshot.program)
+        program = self._queries.program(welcome.run, snapshot.program)
         if program is None:
             return False
         runtime = OnnxRuntime(program[1])
         runtime.load(snapshot.weights)
-        how = welcome.spec.evaluation
+        wanted = welcome.spec.evaluation
         evaluation = play_episodes(
-            runtime, environments, how.episodes, seed, sampled=how.actions == "sampled", progress=self._continue
+            runtime,
+            environments,
+            wanted.episodes,
+            seed,
+            sampled=wanted.actions == "sampled",
+            progress=self._raise_if_stopped,
         )
-        _logger.info(f"policy version {snapshot.policy_version}: return {evaluation.returns.mean():.1f}")
-        self._link.report(
+        _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
+        self._queries.report_evaluation(
             welcome.run,
             EvaluationReport(
                 evaluator=self._config.name,
@@ -96,7 +104,7 @@ class Evaluator:
         )
         return True
 
-    def _continue(self, _finished: int, _mean: float) -> None:
-        """Called after every step: a request to stop ends it in the middle of an episode."""
+    def _raise_if_stopped(self, _finished: int, _mean: float) -> None:
+        """End an evaluation on `stop`, in the middle of an episode: called after every step."""
         if self._stop.is_set():
             raise RunOverError("stopped")

@@ -1,1 +1,1 @@
-"""The conversation of an actor with its learner: join, upload, snapshots, reconnect."""
+"""An actor's session with a learner: joining, uploading rollouts, receiving snapshots, reconnecting."""

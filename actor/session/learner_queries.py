@@ -1,4 +1,4 @@
-"""What an actor asks of learners: to be found, to be let in, for programs and snapshots. No state, no threads."""
+"""The queries of an actor to learners: join, program, snapshot, evaluation. No state but a transport, no threads."""
 
 import contextlib
 import logging
@@ -9,7 +9,7 @@ import time
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.messages import (
     Acknowledgement,
     EvaluationReport,
@@ -26,13 +26,12 @@ from daedalus.transport.interface import Transport, TransportError
 
 _logger = logging.getLogger(__name__)
 
-_LIMITS = Limits(max_bytes=1 << 30)  # of what the learner sends: weights may be large
-_ANSWER_SECONDS = 5.0  # a query without an answer by then has none
-_UPDATE_SECONDS = 60.0  # of one that is answered between two updates, which may be slow
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
+_ANSWER_SECONDS = 5.0  # for a query that is answered at once
+_UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
+_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
-_TAKEN_SECONDS = 10.0  # for an earlier life of this actor to be found dead
-_REOPEN_SECONDS = 5.0  # nobody answers for so long: perhaps the session is dead, so another is tried
+_NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
+_REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 
 
 class ActorError(Exception):
@@ -40,62 +39,64 @@ class ActorError(Exception):
 
 
 class LearnerLostError(Exception):
-    """The learner went away, or lives another life; join again."""
+    """The learner left, or another learner epoch began; join again."""
 
 
-class NameTakenError(ActorError):
-    """Another actor of that name takes part, or did a moment ago."""
+class NameInUseError(ActorError):
+    """Another actor of the same name takes part, or did a moment ago."""
 
 
 class RunOverError(Exception):
-    """Told to stop, or the run is over; the message says which."""
+    """The run ended, or the actor was asked to stop; the message says which."""
 
 
 class LearnerQueries:
-    """Questions over a transport, their answers decoded."""
+    """Queries over a transport, with decoded answers."""
 
-    def __init__(self, transport: Transport, hint: str = "") -> None:
-        """`hint`: what else may be the matter, said where no learner answers."""
+    def __init__(self, transport: Transport, authorization_hint: str = "") -> None:
+        """`authorization_hint` is added to messages that no learner responds: see transport/security.py."""
         self._transport = transport
-        self._hint = hint
+        self._authorization_hint = authorization_hint
 
-    def find(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
-        """Asks to join until a learner of `run` (`*`: of any) answers.
+    def join_learner(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
+        """Send requests to join until a learner of `run` (`*`: of any run) answers.
 
-        Raises RunOverError if told to stop; ActorError if refused, or after `timeout` seconds without an answer.
+        Raises RunOverError on `stop` or if the run is over; ActorError if refused, or after `timeout` seconds without
+        an answer.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        pause, told = _FIRST_RETRY_SECONDS, False
+        pause, logged = _FIRST_RETRY_SECONDS, False
         reopen_at = time.monotonic() + _REOPEN_SECONDS
-        taken_until = time.monotonic() + _TAKEN_SECONDS
+        name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
         while True:
-            wanted = f"a learner{self._hint}"
+            awaited = f"a learner{self._authorization_hint}"
             try:
-                welcome = self.join(run, join)
-            except NameTakenError:
-                if time.monotonic() > (taken_until if deadline is None else min(taken_until, deadline)):
+                welcome = self.request_join(run, join)
+            except NameInUseError:
+                if time.monotonic() > (name_free_by if deadline is None else min(name_free_by, deadline)):
                     raise
                 welcome = None
-                wanted = "the other actor of this name to leave"
+                awaited = "the other actor of this name to leave"
             if welcome is not None:
                 return welcome
             if deadline is not None and time.monotonic() > deadline:
                 raise ActorError(
-                    f"no learner answered within {timeout:g} s: is it running, and is the address its own?{self._hint}"
+                    f"no learner answered within {timeout:g} s: check that the learner runs and that the address is "
+                    f"correct{self._authorization_hint}"
                 )
-            if not told and pause >= _MAX_RETRY_SECONDS:
-                _logger.info(f"waiting for {wanted}")
-                told = True
+            if not logged and pause >= _MAX_RETRY_SECONDS:
+                _logger.info("waiting for %s", awaited)
+                logged = True
             if stop.wait(pause):
                 raise RunOverError("stopped")
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
-                with contextlib.suppress(TransportError):  # no router there now: the session that is goes on looking
+                with contextlib.suppress(TransportError):  # no router now: the present session keeps trying
                     self._transport.reopen()
                 reopen_at = time.monotonic() + _REOPEN_SECONDS
 
-    def join(self, run: str, join: Join) -> Welcome | None:
-        """One request to join; None if nobody answers now. Raises ActorError or RunOverError if refused."""
+    def request_join(self, run: str, join: Join) -> Welcome | None:
+        """Send one request to join; return None if nobody answers. Raises ActorError or RunOverError if refused."""
         answers = self._ask(keys.join(run), encode(join))
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         if len(welcomes) > 1:
@@ -107,32 +108,33 @@ class LearnerQueries:
             if isinstance(refusal, Refusal):
                 if refusal.code == "finished":
                     raise RunOverError("the run is over")
-                kind = NameTakenError if refusal.code == "name_taken" else ActorError
+                kind = NameInUseError if refusal.code == "name_taken" else ActorError
                 raise kind(f"the learner refused this actor: {refusal.reason}")
         return None
 
-    def is_there(self, run: str, join: Join) -> bool:
-        """Whether any learner of `run` answers at all."""
+    def learner_responds(self, run: str, join: Join) -> bool:
+        """Return whether any learner of `run` answers a request to join, with whatever answer."""
         return bool(self._ask(keys.join(run), encode(join)))
 
     def program(self, run: str, name: str = "*") -> tuple[str, bytes] | None:
-        """The program with that hash (`*`: the one that is played now) and its hash; None if nobody has it."""
+        """Return hash and bytes of the program with that hash (`*`: the current one), or None if nobody has it."""
         for answer in self._ask(keys.program(run, name)):
             if isinstance(answer, Program):
                 model = answer.model.tobytes()
-                found = program_hash(model)
-                if found == answer.hash and name in ("*", found):
-                    return found, model
+                computed = program_hash(model)
+                if computed == answer.hash and name in ("*", computed):
+                    return computed, model
         return None
 
-    def newest(self, run: str) -> list[Message]:
-        """The newest snapshot, or the run_ended, of a run."""
+    def newest_snapshot(self, run: str) -> list[Message]:
+        """Return the answers of the run's learners: the newest Snapshot, or RunEnded."""
         return self._ask(keys.snapshots(run))
 
     def evaluation_snapshot(self, run: str, evaluator: str, stop: threading.Event) -> Snapshot | None:
-        """The newest snapshot, of which the learner keeps a checkpoint until `report`; None if it has none to give.
+        """Return the newest snapshot, or None if the learner has none to evaluate.
 
-        Raises RunOverError if the run is over, or if told to stop.
+        The learner keeps a checkpoint of the same version until `report_evaluation`. Raises RunOverError if the run is
+        over, or on `stop`.
         """
         request = encode(EvaluationRequest(evaluator=evaluator))
         answer = self._ask_between_updates(keys.evaluations(run, evaluator), request, stop)
@@ -140,27 +142,30 @@ class LearnerQueries:
             raise RunOverError("the run is over")
         return answer if isinstance(answer, Snapshot) else None
 
-    def report(self, run: str, report: EvaluationReport, stop: threading.Event) -> None:
-        """Tells the learner how a policy played; what it does not take is lost. Raises RunOverError if told to stop."""
+    def report_evaluation(self, run: str, report: EvaluationReport, stop: threading.Event) -> None:
+        """Report a policy's returns to the learner; a rejected report is lost. Raises RunOverError on `stop`."""
         answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), stop)
         if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
-            _logger.info(f"the learner did not take the evaluation: {answer.reason}")
+            _logger.warning("the learner rejected the evaluation: %s", answer.reason)
 
     def decode(self, data: bytes) -> Message | None:
-        """The message in `data`; None, and a word about it, if it is damaged.
+        """Return the message in `data`; log damaged data and return None.
 
-        Raises ActorError if the learner is of another version.
+        Raises ActorError if the learner speaks another version of the protocol.
         """
         try:
-            return decode(data, _LIMITS)
+            return decode(data, LEARNER_LIMITS)
         except VersionMismatchError as error:
             raise ActorError(str(error)) from None
         except ProtocolError as error:
-            _logger.info(f"ignored a message: {error}")
+            _logger.warning("ignored a damaged message: %s", error)
             return None
 
     def _ask_between_updates(self, key: str, payload: bytes, stop: threading.Event) -> Message | None:
-        """One question to the learner's main thread; None without an answer. Raises RunOverError if told to stop."""
+        """Send a query that the learner answers between two updates; return None without an answer.
+
+        Raises RunOverError on `stop`.
+        """
         answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         try:
             self._transport.query_async(key, payload, timeout=_UPDATE_SECONDS, on_answer=answers.put)

@@ -1,4 +1,4 @@
-"""The newest snapshot of a learner, however it comes: pushed to all, or fetched where the link is slow. No threads."""
+"""The newest snapshot of a learner: pushed to all actors, or fetched in compact form over a slow link. No threads."""
 
 import time
 from collections.abc import Callable
@@ -9,74 +9,80 @@ from daedalus.protocol import keys
 from daedalus.protocol.messages import Message, RunEnded, Snapshot, Welcome
 from daedalus.transport.interface import Inbox, Transport
 
-_DOUBT_SECONDS = 1.0  # this long without a snapshot that answers told of, it is asked for
+_MISSED_PUSH_SECONDS = 1.0  # so long after the last snapshot, one that acknowledgements mention is requested
 
 
 class SnapshotFeed:
-    """What comes from one learner after the other. Its methods but `on_news` are for one thread."""
+    """The snapshots of one learner after the other. For one thread.
 
-    def __init__(self, transport: Transport, link: LearnerQueries, actor: str, on_news: Callable[[], None]) -> None:
-        self._transport, self._link, self._actor, self._on_news = transport, link, actor, on_news
+    `on_news` is called on the transport's threads when `read` may have something new.
+    """
+
+    def __init__(self, transport: Transport, queries: LearnerQueries, actor: str, on_news: Callable[[], None]) -> None:
+        self._transport, self._queries, self._actor, self._on_news = transport, queries, actor, on_news
         self._inboxes: dict[str, Inbox] = {}  # by run
-        self._slow: CompactSnapshotFetcher | None = None
+        self._fetcher: CompactSnapshotFetcher | None = None  # set on a slow link
         self._run, self._learner_epoch = "", -1
-        self._came_at = 0.0
+        self._updated_at = 0.0  # when the newest snapshot came or was requested
         self.newest: Snapshot | None = None  # of this learner epoch
 
-    def attend(self, welcome: Welcome) -> None:
-        """Begins anew with a learner."""
+    def begin(self, welcome: Welcome) -> None:
+        """Begin with a learner: no snapshot of it is known, and nothing about its link."""
         self._run, self._learner_epoch, self.newest = welcome.run, welcome.learner_epoch, None
-        self._slow = None
+        self._fetcher = None
 
-    def follow(self) -> None:
-        """Has every snapshot pushed from now on, unless the link is spared."""
-        if self._slow is None and self._run not in self._inboxes:
+    def subscribe(self) -> None:
+        """Receive every published snapshot from now on, unless compact snapshots are fetched. Idempotent."""
+        if self._fetcher is None and self._run not in self._inboxes:
             self._inboxes[self._run] = self._transport.subscribe(keys.snapshots(self._run), self._on_news)
 
     def use_compact_snapshots(self) -> None:
-        """From now on nothing is pushed: compact snapshots are fetched."""
+        """End the subscription; from now on compact snapshots are fetched on request."""
         for inbox in self._inboxes.values():
             inbox.close()
         self._inboxes.clear()
-        self._slow = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
+        self._fetcher = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
 
     @property
     def uses_compact_snapshots(self) -> bool:
-        """Whether snapshots are fetched."""
-        return self._slow is not None
+        """Whether compact snapshots are fetched."""
+        return self._fetcher is not None
 
     def read(self) -> None:
-        """Takes in what has come. Raises RunOverError after a run_ended, LearnerLostError if another learner speaks."""
-        if self._slow is not None:
-            news = self._slow.take()
+        """Decode what has come, and update `newest`. May take long: hold no lock meanwhile.
+
+        Raises RunOverError if the run ended, LearnerLostError if the message is from another learner epoch.
+        """
+        if self._fetcher is not None:
+            message = self._fetcher.take()
         else:
             inbox = self._inboxes.get(self._run)
             data = None if inbox is None else inbox.take()
-            news = None if data is None else self._link.decode(data)
-        if news is not None:
-            self._take(news)
+            message = None if data is None else self._queries.decode(data)
+        if message is not None:
+            self._apply(message)
 
-    def ask(self) -> None:
-        """Has the newest snapshot come, in doubt whether it was pushed. Raises as `read` does."""
-        if self._slow is not None:
-            self._slow.want()
+    def request_newest(self) -> None:
+        """Request the newest snapshot in case a push was lost. Raises as `read` does."""
+        if self._fetcher is not None:
+            self._fetcher.request_newest()
             return
-        for message in self._link.newest(self._run):
-            self._take(message)
+        for message in self._queries.newest_snapshot(self._run):
+            self._apply(message)
 
-    def keep_up(self, newest_version: int) -> None:
-        """Asks for a version that the learner's answers tell of, if it does not come by itself. Raises as `read`."""
-        missed = self.newest is None or newest_version > self.newest.policy_version
-        if missed and (self._slow is not None or time.monotonic() > self._came_at + _DOUBT_SECONDS):
-            self._came_at = time.monotonic()
-            self.ask()
+    def request_if_behind(self, newest_version: int) -> None:
+        """Request the snapshot of a version that acknowledgements mention, if its push is late. Raises as `read`."""
+        behind = self.newest is None or newest_version > self.newest.policy_version
+        if behind and (self._fetcher is not None or time.monotonic() > self._updated_at + _MISSED_PUSH_SECONDS):
+            self._updated_at = time.monotonic()
+            self.request_newest()
 
-    def _take(self, news: Message) -> None:
-        if isinstance(news, RunEnded) and news.learner_epoch == self._learner_epoch:
-            raise RunOverError(f"the run is over: {news.reason}")
-        if not isinstance(news, Snapshot):
+    def _apply(self, message: Message) -> None:
+        if isinstance(message, RunEnded) and message.learner_epoch == self._learner_epoch:
+            raise RunOverError(f"the run is over: {message.reason}")
+        if not isinstance(message, Snapshot):
             return
-        if news.learner_epoch != self._learner_epoch:
+        if message.learner_epoch != self._learner_epoch:
             raise LearnerLostError
-        if self.newest is None or news.policy_version > self.newest.policy_version:
-            self.newest, self._came_at = news, time.monotonic()
+        if self.newest is None or message.policy_version > self.newest.policy_version:
+            self.newest, self._updated_at = message, time.monotonic()

@@ -1,182 +1,87 @@
-"""What an actor and a learner say to each other while it plays: rollouts out, answers in, and every wait for either.
+"""Sends rollouts to a learner and receives their acknowledgements, on the transport's threads. Never waits."""
 
-The transport's threads bring answers and news; the rest is for the actor's own thread.
-"""
-
-import threading
 import time
-from collections.abc import Callable
 
-from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
-from daedalus.actor.session.uploader import Uploader
+from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
+from daedalus.actor.session.learner_presence import LearnerPresence
+from daedalus.actor.session.state_lock import StateLock
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join
+from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
+from daedalus.protocol.messages import Acknowledgement
 from daedalus.transport.interface import Transport, TransportError
 
-_ANSWER_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
-_ACKNOWLEDGE_SECONDS = 30.0  # a saturated learner answers late
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
-_SILENCE_SECONDS = 10.0  # nothing heard for so long, the learner is asked whether it is there
+_ACKNOWLEDGEMENT_SECONDS = 30.0  # a saturated learner answers late
 
 
 class UploadSession:
-    """With one learner after the other."""
+    """The upload of rollouts to one learner after the other.
 
-    def __init__(self, transport: Transport, link: LearnerQueries, stop: threading.Event) -> None:
-        self._transport, self._link, self._stop = transport, link, stop
-        self._changed = threading.Condition()  # guards what the transport's threads touch: the next three
-        self._uploader = Uploader(window=1)
-        self._learner_left = False
-        self._heard_at = 0.0  # when the learner last said anything
-        self._run, self._join = "", Join(actor="", incarnation=0)
+    The lock guards `in_flight`. Its methods are for the actor's thread.
+    """
 
-    def found(self) -> None:
-        """A learner has let the actor in; what is heard from now on counts."""
-        with self._changed:
-            self._learner_left, self._heard_at = False, time.monotonic()
+    def __init__(self, transport: Transport, actor: str, presence: LearnerPresence, lock: StateLock) -> None:
+        self._transport, self._actor, self._presence, self._lock = transport, actor, presence, lock
+        self.run = ""  # the name of the learner's run
+        self.in_flight = InFlightRollouts(window=1)
 
-    def begin(self, run: str, join: Join, window: int) -> None:
-        """Begins with a learner that knows of nothing yet; up to `window` rollouts are under way to it."""
-        with self._changed:
-            self._run, self._join, self._uploader = run, join, Uploader(window)
+    def begin(self, run: str, window: int) -> None:
+        """Begin with a learner that has no rollouts of this actor yet; keep up to `window` in flight."""
+        with self._lock:
+            self.run, self.in_flight = run, InFlightRollouts(window)
 
     def resume(self) -> None:
-        """Goes on with the same learner, after the network failed."""
-        with self._changed:
-            self._uploader.send_again()
+        """Continue with the same learner after the network failed."""
+        with self._lock:
+            self.in_flight.resend_all()
 
-    # ---------------------------------------------------------------------------------------- what is said
+    def size_window(self, collect_seconds: float, least: int, most: int) -> None:
+        """See InFlightRollouts."""
+        with self._lock:
+            self.in_flight.size_window(collect_seconds, least, most)
 
     def send(self, sequence: int, payload: bytes) -> None:
-        """Sends a rollout, again and again until it is answered for good."""
-        with self._changed:
-            self._uploader.add(sequence, payload)
-        self._send_due()
+        """Send an encoded rollout; `send_due` repeats it until its final acknowledgement."""
+        with self._lock:
+            self.in_flight.add(sequence, payload)
+        self.send_due()
 
-    def fit_window(self, play_seconds: float, least: int, most: int) -> None:
-        """See Uploader."""
-        with self._changed:
-            self._uploader.fit_window(play_seconds, least, most)
-
-    def await_room(self) -> None:
-        """Waits until one more rollout may be played, and then sent. Raises as `wait` does."""
-        self.wait(lambda: self._uploader.has_room)
-
-    def await_word(self, timeout: float) -> None:
-        """Waits for anything that the learner says, so many seconds at most. Raises as `wait` does."""
-        since = self._heard_at
-        self.wait(lambda: self._heard_at > since, timeout)
-
-    @property
-    def newest_version(self) -> int:
-        """The newest policy version that any answer told of."""
-        return self._uploader.newest_version
-
-    @property
-    def must_replace(self) -> bool:
-        """Whether the last answer was a rejection: another rollout is to take the place of that one."""
-        return self._uploader.must_replace
-
-    def replace(self) -> None:
-        """Another is about to."""
-        with self._changed:
-            self._uploader.must_replace = False
-
-    @property
-    def refusals(self) -> tuple[int, str]:
-        """How many of the last answers in a row were rejections, and what the last of them gave for a reason."""
-        with self._changed:
-            return self._uploader.refused_in_a_row, self._uploader.reason
-
-    # --------------------------------------------------------------------------------------------- waiting
-
-    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
-        """Waits until `ready`, sending what falls due meanwhile; False if `timeout` seconds passed first.
-
-        Raises as `check` does.
-        """
-        deadline = None if timeout is None else time.monotonic() + timeout
-        while True:
-            self._send_due()
-            self._break_silence()
-            with self._changed:
-                self.check()
-                if ready():
-                    return True
-                now = time.monotonic()
-                if deadline is not None and now >= deadline:
-                    return False
-                due = self._uploader.next_due()
-                until = min(t for t in (deadline, due, now + _HEARTBEAT_SECONDS) if t is not None)
-                self._changed.wait(max(until - now, 0.0))
-
-    def check(self) -> None:
-        """Raises if there is a reason to stop playing: RunOverError, ActorError in quarantine, LearnerLostError."""
-        if self._stop.is_set():
-            raise RunOverError("stopped")
-        if self._uploader.over == "quarantined":
-            raise ActorError(
-                f"the learner takes nothing more of this actor: {self._uploader.reason}; mend that and start it again"
-            )
-        if self._uploader.over == "finished":
-            raise RunOverError("the run is over")
-        if self._learner_left or self._uploader.over == "fenced":
-            raise LearnerLostError
-
-    def _break_silence(self) -> None:
-        """Raises if nothing was heard for long, and nothing is to be heard: then a session is dead that seems alive."""
-        if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
-            if not self._link.is_there(self._run, self._join):
-                raise LearnerLostError
-            with self._changed:
-                self._heard_at = time.monotonic()
-
-    def _send_due(self) -> None:
-        uploader = self._uploader
-        with self._changed:
-            due = uploader.due(time.monotonic())
+    def send_due(self) -> None:
+        """Send every rollout that is due, for the first time or again."""
+        in_flight = self.in_flight
+        with self._lock:
+            due = in_flight.take_due(time.monotonic())
         for sequence, payload in due:
             try:
                 self._transport.query_async(
-                    keys.rollouts(self._run, self._join.actor),
+                    keys.rollouts(self.run, self._actor),
                     payload,
-                    timeout=_ACKNOWLEDGE_SECONDS,
-                    on_answer=lambda answer, sequence=sequence: self._on_answer(uploader, sequence, answer),
+                    timeout=_ACKNOWLEDGEMENT_SECONDS,
+                    on_answer=lambda answer, sequence=sequence: self._on_answer(in_flight, sequence, answer),
                 )
             except TransportError:
-                self._on_answer(uploader, sequence, None)
+                self._on_answer(in_flight, sequence, None)
 
-    # ------------------------------------------------------------------------------------- from any thread
+    def clear_rejection(self) -> None:
+        """Forget that the last rollout was rejected: the actor is about to collect its replacement."""
+        with self._lock:
+            self.in_flight.last_was_rejected = False
 
-    def wake(self) -> None:
-        """Has a wait look again at what it waits for."""
-        with self._changed:
-            self._changed.notify_all()
+    @property
+    def rejections(self) -> tuple[int, str]:
+        """How many of the last final acknowledgements in a row were rejections, and the reason in the last one."""
+        with self._lock:
+            return self.in_flight.rejections_in_a_row, self.in_flight.reason
 
-    def hear(self) -> None:
-        """The learner said something."""
-        with self._changed:
-            self._heard_at = time.monotonic()
-            self._changed.notify_all()
-
-    def on_learner(self, _key: str, present: bool) -> None:
-        """A learner of the run came or went."""
-        with self._changed:
-            # Whoever is there next may be another: to be asked.
-            self._learner_left = self._learner_left or not present
-            self._changed.notify_all()
-
-    def _on_answer(self, uploader: Uploader, sequence: int, data: bytes | None) -> None:
-        answer = None
-        if data is not None:
-            try:
-                answer = decode(data, _ANSWER_LIMITS)
-            except ProtocolError:
-                answer = None
-        with self._changed:
+    def _on_answer(self, in_flight: InFlightRollouts, sequence: int, data: bytes | None) -> None:
+        """Receive an answer, or None without one. Called on the transport's threads."""
+        try:
+            answer = None if data is None else decode(data, ACKNOWLEDGEMENT_LIMITS)
+        except ProtocolError:
+            answer = None
+        with self._lock:
             if data is not None:
-                self._heard_at = time.monotonic()
-            uploader.answered(sequence, answer if isinstance(answer, Acknowledgement) else None, time.monotonic())
-            self._changed.notify_all()
+                self._presence.heard()
+            acknowledgement = answer if isinstance(answer, Acknowledgement) else None
+            in_flight.acknowledge(sequence, acknowledgement, time.monotonic())
+            self._lock.announce_change()

@@ -17,8 +17,8 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 
+from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.learner_queries import LearnerQueries
-from daedalus.actor.session.uploader import Uploader
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -59,16 +59,16 @@ class Simulated:
         transport = connect_with_retry([address], threading.Event(), _WAIT_SECONDS)
         assert transport is not None  # the event is never set
         self._transport = transport
-        self._link = LearnerQueries(self._transport)
+        self._queries = LearnerQueries(self._transport)
         self._changed = threading.Condition()
-        self._uploader = Uploader(window=1)
+        self._in_flight = InFlightRollouts(window=1)
         self._sequence, self._version = 0, -1
         self._sent_at = 0.0
         self.latencies: list[float] = []
         self.came: list[tuple[int, float]] = []  # policy version and time of each snapshot received
         incarnation = secrets.randbits(62)
         join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
-        self._welcome = self._link.find(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
+        self._welcome = self._queries.join_learner(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
         run = self._welcome.run
         self._inbox = self._transport.subscribe(keys.snapshots(run), self._on_news)
         self._transport.declare_presence(keys.presence(run, name, incarnation))
@@ -83,11 +83,11 @@ class Simulated:
     @property
     def verdicts(self) -> Counter[str]:
         """Number of answers by verdict."""
-        return self._uploader.verdicts
+        return self._in_flight.verdicts
 
     def has_policy(self) -> bool:
         """Query the newest snapshot and return whether there is one."""
-        for message in self._link.newest(self._welcome.run):
+        for message in self._queries.newest_snapshot(self._welcome.run):
             if isinstance(message, Snapshot):
                 self._version = max(self._version, message.policy_version)
         return self._version >= 0
@@ -110,17 +110,17 @@ class Simulated:
                 self._changed.wait(max(min(due, until) - now, 0.0)) if now < due else None
                 if time.monotonic() < due:
                     continue
-                self._changed.wait_for(lambda: self._uploader.has_room or self._uploader.next_due() is not None, 1.0)
-                if self._uploader.has_room:
+                self._changed.wait_for(lambda: self._in_flight.has_room or self._in_flight.next_due() is not None, 1.0)
+                if self._in_flight.has_room:
                     identity = replace(self._rollout.identity, sequence=self._sequence)
                     payload = encode(replace(self._rollout, identity=identity, policy_version=max(self._version, 0)))
-                    self._uploader.add(self._sequence, payload)
+                    self._in_flight.add(self._sequence, payload)
                     self._sequence += 1
                     self._sent_at = time.monotonic()
                     due = max(due + pause, self._sent_at)
-                wanted = self._uploader.next_due()
+                wanted = self._in_flight.next_due()
                 self._changed.wait(max((wanted or 0.0) - time.monotonic(), 0.0)) if wanted else None
-                ready = self._uploader.due(time.monotonic())
+                ready = self._in_flight.take_due(time.monotonic())
             for sequence, payload in ready:
                 self._transport.query_async(
                     self._key,
@@ -134,7 +134,7 @@ class Simulated:
         answer = message if isinstance(message, Acknowledgement) else None
         now = time.monotonic()
         with self._changed:
-            self._uploader.answered(sequence, answer, now)
+            self._in_flight.acknowledge(sequence, answer, now)
             if answer is not None and answer.verdict == "accepted":
                 self.latencies.append(now - self._sent_at)  # from the first attempt, with the time of busy answers
             self._changed.notify_all()

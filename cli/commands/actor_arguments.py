@@ -105,7 +105,7 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         runtime=arguments.runtime,
         wrap=arguments.wrap,
         link=arguments.link,
-        hint=authorization_hint(credentials),
+        authorization_hint=authorization_hint(credentials),
         timeout=arguments.timeout,
     )
 

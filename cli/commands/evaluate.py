@@ -19,7 +19,7 @@ from daedalus.actor.evaluation.episodes import Evaluation, environments_for, pla
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
@@ -203,4 +203,5 @@ class _Progress:
 
 
 if __name__ == "__main__":
+    exit_on_thread_exceptions()
     sys.exit(main(stop=stop_on_signals()))

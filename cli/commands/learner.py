@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_to_resume
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -178,4 +178,5 @@ def _status(outcome: Outcome, spec: RunSpec) -> int:
 
 
 if __name__ == "__main__":
+    exit_on_thread_exceptions()
     sys.exit(main())

@@ -6,7 +6,7 @@ import sys
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import STATUS_LIMITS
 from daedalus.protocol.messages import StatusReport
 from daedalus.protocol.status import ActorStatus, RunStatus
 from daedalus.transport.interface import Transport, TransportError
@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
 def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
     """Return the status of each learner that answers within 5 s. Raises TransportError or ProtocolError."""
     answers = transport.query(keys.status(run), timeout=5.0)
-    reports = [decode(answer, Limits()) for answer in answers]
+    reports = [decode(answer, STATUS_LIMITS) for answer in answers]
     return [report.status for report in reports if isinstance(report, StatusReport)]
 
 

@@ -1,1 +1,1 @@
-"""Metrics, their writers, the status, the progress line."""
+"""Metrics and their writers, status, summary, progress line."""

@@ -1,4 +1,4 @@
-"""Metrics as a CSV file."""
+"""Metrics writer for a CSV file."""
 
 import csv
 import io
@@ -10,20 +10,20 @@ from daedalus.learner.reporting.metrics import COLUMNS, Details
 
 
 class CsvWriter:
-    """One line a row, appended; a resumed run continues its file, in the columns that it was begun with.
+    """Writer that appends one line for each row. A resumed run continues its file, with the columns of its header.
 
-    A line is there whole or not at all, also where the disk takes only a part of it.
+    Lines are complete: if the disk is full, a partly written line is removed.
     """
 
     def __init__(self, path: Path) -> None:
-        begun = _header(path)  # another release may have had other columns
-        self._columns = begun or COLUMNS
+        header = _header(path)  # another release may have had other columns
+        self._columns = header or COLUMNS
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
-        if not begun:
+        if not header:
             self._append(COLUMNS)
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """See MetricsWriter."""
+        """Append a line. See MetricsWriter."""
         self._append([_cell(row.get(name)) for name in self._columns])
 
     def _append(self, cells: Sequence[str]) -> None:
@@ -34,18 +34,18 @@ class CsvWriter:
         try:
             written = self._file.write(data)
             if written != len(data):
-                self._file.write(data[written:])  # says why there was no room for the rest
+                self._file.write(data[written:])  # raises the error that limited the first write
         except OSError:
             self._file.truncate(before)
             raise
 
     def close(self) -> None:
-        """See MetricsWriter."""
+        """Close the file. See MetricsWriter."""
         self._file.close()
 
 
 def _header(path: Path) -> Sequence[str]:
-    """The columns of a file; none if it is empty or not there."""
+    """Return the column names of a file, or an empty sequence if the file is empty or missing."""
     if not path.exists():
         return ()
     with open(path, newline="", encoding="utf-8") as file:

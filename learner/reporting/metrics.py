@@ -1,4 +1,4 @@
-"""What is recorded of a run, and the interface of whatever records it."""
+"""Columns of the metrics, and the interface of a metrics writer."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -43,21 +43,21 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Details:
-    """Metrics that are no single number: they tell convergence apart from collapse."""
+    """Metrics that are not single numbers: distributions and a picture of an observation."""
 
     returns: Sequence[float] = ()  # of the newest episodes
     lengths: Sequence[int] = ()
-    action_counts: Sequence[int] = ()  # since the details before
-    picture: np.ndarray | None = None  # what the network saw at one row: uint8 [H, W] or [H, W, 3]
+    action_counts: Sequence[int] = ()  # by action, since the previous details
+    picture: np.ndarray | None = None  # one observation as the network receives it: uint8 [H, W] or [H, W, 3]
 
 
 class MetricsWriter(Protocol):
-    """A place that metrics go to, one row at a time. The recorder's thread is the only caller."""
+    """Interface of a destination of metrics rows. Only the recorder's thread calls it."""
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """Record a row; its keys are among COLUMNS, and those it lacks are unknown yet. Raises OSError."""
+        """Write a row. Its keys are in COLUMNS; columns without a value yet are absent. Raises OSError."""
         ...
 
     def close(self) -> None:
-        """Write what is buffered, and let go of the files."""
+        """Write buffered rows and close the files. Raises OSError."""
         ...

@@ -1,15 +1,15 @@
-"""How a run looks while it goes on: one line that is rewritten on a terminal, a line now and then elsewhere."""
+"""Progress of a run: one line that is rewritten on a terminal, or a new line every few seconds elsewhere."""
 
 import time
 from collections.abc import Mapping
 from typing import TextIO
 
-_LINE_SECONDS = 5.0  # between lines where they cannot be rewritten
+_LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
 
 
 class Progress:
-    """Shows the newest metrics row."""
+    """Display of the newest metrics row."""
 
     def __init__(self, stream: TextIO, env_steps_budget: int) -> None:
         self._stream = stream
@@ -19,7 +19,7 @@ class Progress:
         self._rewriting = False
 
     def show(self, row: Mapping[str, float]) -> None:
-        """Shows a row of metrics, if it is time to."""
+        """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds."""
         if not self._terminal:
             if time.monotonic() < self._next_line:
                 return
@@ -33,13 +33,13 @@ class Progress:
         self._stream.flush()
 
     def say(self, text: str) -> None:
-        """Says something that stays on the screen."""
+        """Print a permanent line."""
         self.end()
         self._stream.write(text + "\n")
         self._stream.flush()
 
     def end(self) -> None:
-        """Leaves the rewritten line as it is and goes to a new one."""
+        """End the line that is being rewritten."""
         if self._rewriting:
             self._stream.write("\n")
             self._stream.flush()

@@ -1,6 +1,6 @@
-"""Hands metrics rows to the writers and to the progress line.
+"""Recording of metrics rows with the writers and the progress line.
 
-Works on a thread of its own: a slow disk, or a writer that takes long to start, costs training nothing.
+The recorder has its own thread, so a slow disk or a slow start of a writer does not delay training.
 """
 
 import contextlib
@@ -13,35 +13,40 @@ from collections.abc import Callable, Sequence
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.reporting.progress import Progress
 
-_QUEUED_ROWS = 256  # rows beyond that are dropped
-_RETRY_SECONDS = 10.0  # after a writer refused a row
+_QUEUED_ROWS = 256  # further rows are dropped
+_RETRY_SECONDS = 10.0  # after a writer failed
 _CLOSE_SECONDS = 5.0
 
 _logger = logging.getLogger(__name__)
 
-OpenWriter = Callable[[], MetricsWriter]  # opens the files, or raises OSError
+OpenWriter = Callable[[], MetricsWriter]  # opens the files; raises OSError
 
 
 class Recorder:
-    """Writes rows in the order they come, from construction to `close`."""
+    """Recorder of metrics rows, in order, from construction to `close`."""
 
     def __init__(self, open_writers: Sequence[OpenWriter], progress: Progress) -> None:
-        """`open_writers` are called when the first row comes, and again after a writer failed."""
+        """Construct the recorder and start its thread.
+
+        Args:
+          open_writers: called at the first row, and again after a writer failed.
+          progress: shows each row.
+        """
         self._open_writers, self._progress = open_writers, progress
         self._writers: list[MetricsWriter] = []
-        self._refused_at: float | None = None
+        self._failed_at: float | None = None
         self._rows: queue.Queue[tuple[dict[str, float], Details] | None] = queue.Queue(_QUEUED_ROWS)
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
     def record(self, row: dict[str, float], details: Details) -> None:
-        """Take a row; never wait."""
+        """Queue a row. Does not block; drops the row if the queue is full."""
         with contextlib.suppress(queue.Full):
             self._rows.put_nowait((row, details))
 
     def close(self) -> None:
-        """Write what is left."""
-        with contextlib.suppress(queue.Full):  # a writer hangs: its rows are lost, and the run ends all the same
+        """Write the queued rows, and close the writers."""
+        with contextlib.suppress(queue.Full):  # a writer hangs: its rows are lost, but the run must end
             self._rows.put(None, timeout=_CLOSE_SECONDS)
         self._thread.join(timeout=_CLOSE_SECONDS)
         self._progress.end()
@@ -49,12 +54,12 @@ class Recorder:
     def _work(self) -> None:
         while (taken := self._rows.get()) is not None:
             self._progress.show(taken[0])
-            if self._refused_at is None or time.monotonic() >= self._refused_at + _RETRY_SECONDS:
+            if self._failed_at is None or time.monotonic() >= self._failed_at + _RETRY_SECONDS:
                 self._write(*taken)
         self._close_writers()
 
     def _write(self, row: dict[str, float], details: Details) -> None:
-        """Write a row. One that a writer refuses is dropped, and the files are opened again for a later one."""
+        """Write a row. If a writer fails, drop the row and reopen the files for a later row."""
         try:
             if not self._writers:
                 for open_writer in self._open_writers:
@@ -63,16 +68,20 @@ class Recorder:
                 writer.write(row, details)
         except OSError as error:
             self._close_writers()
-            if self._refused_at is None:
-                _logger.warning("metrics cannot be written (%s); training goes on", error.strerror)
-            self._refused_at = time.monotonic()
+            if self._failed_at is None:
+                _logger.warning(
+                    "metrics not written: %s; training continues, and writing is retried every %g s",
+                    error.strerror,
+                    _RETRY_SECONDS,
+                )
+            self._failed_at = time.monotonic()
             return
-        if self._refused_at is not None:
-            self._refused_at = None
+        if self._failed_at is not None:
+            self._failed_at = None
             _logger.info("metrics are written again")
 
     def _close_writers(self) -> None:
         for writer in self._writers:
-            with contextlib.suppress(OSError):  # what it could not write was logged already
+            with contextlib.suppress(OSError):  # the failed write was logged before
                 writer.close()
         self._writers.clear()

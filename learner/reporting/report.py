@@ -1,4 +1,4 @@
-"""What a run tells of itself: metrics rows, the status, the summary. Reads counters and fleet; no I/O."""
+"""Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,26 +10,31 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
-_STALLED_SECONDS = 60.0  # without an update for so long, something is wrong
-_ALONE_SECONDS = 10.0  # and without an actor
+_STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+_NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
 @dataclass(slots=True)
 class Health:
-    """What the service observes of itself, on the monotonic clock; from it come the problems that a status tells of."""
+    """Health of the learner process. Times are on the monotonic clock, in seconds."""
 
     started: float
-    updated: float  # the last update, or the start
-    attended: float  # when an actor last took part, or the start
-    saved: float | None = None  # the last checkpoint
-    save_fault: str = ""  # why the newest attempt at one failed
-    gradient_fault: bool = False  # the last update was skipped
+    updated: float  # time of the last update, or the start
+    actor_seen: float  # last time with a live actor, or the start
+    saved: float | None = None  # time of the last checkpoint
+    save_fault: str = ""  # error of the last checkpoint, if it failed
+    gradient_fault: bool = False  # whether the last update was skipped
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
-        """What keeps the service from doing its work, worst first; none if it is healthy."""
+        """Return descriptions of the problems, most severe first; empty if the service is healthy.
+
+        Args:
+          now: time on the monotonic clock, in seconds.
+          live: number of live actors.
+        """
         found = []
-        if not live and now - self.attended > _ALONE_SECONDS:
-            found.append(f"no actor has taken part for {now - self.attended:.0f} s")
+        if not live and now - self.actor_seen > _NO_ACTOR_SECONDS:
+            found.append(f"no live actor for {now - self.actor_seen:.0f} s")
         elif now - self.updated > _STALLED_SECONDS:
             found.append(f"no update for {now - self.updated:.0f} s")
         if self.gradient_fault:
@@ -40,36 +45,39 @@ class Health:
 
 
 class RateMeter:
-    """Rates since the last look."""
+    """Rates since the last measurement."""
 
     def __init__(self, counters: RunCounters, now: float) -> None:
-        self.rates: dict[str, float] = {}  # as of the last look
-        self._actors: dict[str, tuple[int, int, int]] = {}  # their env_steps, bytes received, bytes of answers
+        self.rates: dict[str, float] = {}  # of the last measurement
+        self._actors: dict[str, tuple[int, int, int]] = {}  # env_steps, received bytes, answered bytes
         self._pushed_bytes = 0
         self._begun, self._first_env_steps = now, counters.env_steps
         self._mark(counters, now)
 
     def overall(self, counters: RunCounters, now: float) -> float:
-        """Return env_steps a second since construction."""
+        """Return env_steps per second since construction."""
         return (counters.env_steps - self._first_env_steps) / max(now - self._begun, 1e-9)
 
     def _mark(self, counters: RunCounters, now: float) -> None:
         self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
         self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
 
-    def look(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
-        """env_steps and updates a second, and the mean policy lag, since the last look; each actor is told its own."""
+    def measure(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
+        """Return env_steps and updates per second and the mean policy lag, since the last measurement.
+
+        Also sets the rates of each actor in `fleet`. `now` is on the monotonic clock, in seconds.
+        """
         seconds = max(now - self._then, 1e-9)
         pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
         for actor in fleet.actors.values():
-            now_at = actor.env_steps, actor.received_bytes, actor.answered_bytes
-            env_steps, received, answered = np.subtract(now_at, self._actors.get(actor.name, (0, 0, 0))) / seconds
-            self._actors[actor.name] = now_at
-            followed = 0.0 if actor.compact_snapshots or not fleet.is_live(actor) else pushed / seconds
+            totals = actor.env_steps, actor.received_bytes, actor.answered_bytes
+            env_steps, received, answered = np.subtract(totals, self._actors.get(actor.name, (0, 0, 0))) / seconds
+            self._actors[actor.name] = totals
+            subscribed = 0.0 if actor.compact_snapshots or not fleet.is_live(actor) else pushed / seconds
             actor.env_steps_per_second = float(env_steps)
             actor.bytes_up_per_hour = 3600 * float(received)
-            actor.bytes_down_per_hour = 3600 * float(answered + followed)
-        self._actors = {name: self._actors[name] for name in fleet.actors}  # whom the fleet forgot is forgotten here
+            actor.bytes_down_per_hour = 3600 * float(answered + subscribed)
+        self._actors = {name: self._actors[name] for name in fleet.actors}  # without evicted actors
         rollouts = max(counters.rollouts_trained - self._rollouts, 1)
         self.rates = {
             "env_steps_per_second": (counters.env_steps - self._env_steps) / seconds,
@@ -81,7 +89,7 @@ class RateMeter:
 
 
 def episode_statistics(counters: RunCounters) -> dict[str, float]:
-    """How the newest training episodes went; empty before the first."""
+    """Return statistics of the newest training episodes; empty before the first episode."""
     if not counters.returns:
         return {}
     returns = np.array(counters.returns)
@@ -101,7 +109,15 @@ def metrics_row(
     learning: dict[str, float],
     wall_seconds: float,
 ) -> dict[str, float]:
-    """One row of learner/reporting/metrics.py; `learning` is what the learner measured."""
+    """Return one metrics row, with columns of learner/reporting/metrics.py.
+
+    Args:
+      counters: counters of the run.
+      fleet: the actors.
+      rates: result of `RateMeter.measure`.
+      learning: metrics of the updates and of the newest evaluation.
+      wall_seconds: duration of the run.
+    """
     return {
         "wall_seconds": wall_seconds,
         "env_steps": counters.env_steps,
@@ -129,7 +145,7 @@ def run_status(
     queue_bytes: int,
     now: float,
 ) -> RunStatus:
-    """The answer to a status query; `now` is on the monotonic clock."""
+    """Return the answer to a status query. `now` is on the monotonic clock, in seconds."""
     return RunStatus(
         run=run,
         learner_epoch=learner_epoch,
@@ -164,7 +180,7 @@ def summary(
     wall_seconds: float,
     env_steps_per_second: float,
 ) -> dict[str, Any]:
-    """What summary.json holds when training ends; the evaluation is added by who makes it."""
+    """Return the content of summary.json at the end of training. A final evaluation adds its results later."""
     return {
         "run": run,
         "algorithm": spec.training.algorithm,

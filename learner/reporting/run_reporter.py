@@ -1,4 +1,4 @@
-"""Metrics rows, status and summary of one run, made from what its parts have counted."""
+"""Metrics rows, status and summary of one run, from its counters, fleet and health."""
 
 import threading
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class RunReporter:
-    """Reads counters, fleet and health under their lock. No I/O."""
+    """Reporter of one run. Reads the counters and the fleet under their lock. No I/O."""
 
     def __init__(
         self,
@@ -31,33 +31,33 @@ class RunReporter:
         health: Health,
         started: float,
     ) -> None:
-        """`started`, on the monotonic clock, is what the run's seconds count from; `lock` guards counters and fleet."""
+        """Construct the reporter. `lock` guards counters and fleet; `started` is on the monotonic clock, in seconds."""
         self._run, self._spec, self._epoch = run, spec, learner_epoch
         self._counters, self._fleet, self._lock = counters, fleet, lock
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
 
     def begin(self, now: float) -> None:
-        """Start to measure rates: learning begins."""
+        """Start to measure rates, at the begin of training."""
         self._meter = RateMeter(self._counters, now)
-        self._health.updated = self._health.attended = now
+        self._health.updated = self._health.actor_seen = now
 
     def wall_seconds(self, now: float) -> float:
-        """Return the seconds that the run has taken, resumed parts included."""
+        """Return the duration of the run in seconds, including the processes before a resume."""
         return self._counters.wall_seconds + now - self._started
 
     def counters_state(self, now: float) -> dict[str, Any]:
-        """Return the counters as a checkpoint holds them."""
+        """Return the counters in the form that a checkpoint stores."""
         with self._lock:
             return self._counters.state(self.wall_seconds(now))
 
     def row(self, learner: "Learner", now: float) -> dict[str, float]:
-        """Return a metrics row: rates and means since the row before."""
+        """Return a metrics row, with rates and means since the previous row."""
         with self._lock:
             progress = self._counters.env_steps / self._spec.training.env_steps
-            rates = self._meter.look(self._counters, self._fleet, now)
+            rates = self._meter.measure(self._counters, self._fleet, now)
             if self._fleet.live:
-                self._health.attended = now
+                self._health.actor_seen = now
             learning = {
                 **learner.metrics.take_means(),
                 **self._evaluations.take_newest(),
@@ -67,7 +67,7 @@ class RunReporter:
             return metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
 
     def details(self, learner: "Learner") -> Details:
-        """Return what belongs to a row and is no single number."""
+        """Return the distributions and the picture that belong to a metrics row."""
         with self._lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(
@@ -78,7 +78,7 @@ class RunReporter:
         )
 
     def status(self, queue_bytes: int, now: float) -> RunStatus:
-        """Return the answer to a status query. Called with the lock held."""
+        """Return the answer to a status query. The caller holds the lock."""
         return run_status(
             self._run,
             self._epoch,
@@ -92,7 +92,7 @@ class RunReporter:
         )
 
     def summary(self, *, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> dict[str, Any]:
-        """Return what summary.json holds at the end; the rate is over this process's learning."""
+        """Return the content of summary.json. Its env_steps_per_second is over the training of this process."""
         return summary(
             self._run,
             self._spec,

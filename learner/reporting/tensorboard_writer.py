@@ -1,4 +1,4 @@
-"""Metrics as TensorBoard's event files."""
+"""Metrics writer for TensorBoard event files."""
 
 import io
 import itertools
@@ -15,20 +15,20 @@ from daedalus.learner.reporting.metrics import Details
 
 
 class TensorBoardWriter:
-    """Scalars, distributions and pictures against env_steps, in TensorBoard's own files.
+    """Writer of scalars, histograms and images against env_steps.
 
-    Its record writer without its event writer: that one writes on a thread which dies of a full disk, and which waits
-    for an hour where the clock is set back by one.
+    It uses TensorBoard's record writer, but not its event writer: the thread of the event writer dies when the disk is
+    full, and waits for an hour after the clock is set back by an hour.
     """
 
     _numbers = itertools.count()
 
     def __init__(self, directory: Path) -> None:
-        # Loaded here: a quarter of a second that no run should wait for before it has begun.
+        # Imported here, because the import takes a quarter of a second that must not delay the start of a run.
         from tensorboard.compat.proto import event_pb2, summary_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
-        # protobuf makes these classes when it is loaded: no type checker finds them
+        # protobuf creates these classes at import, so a type checker cannot find them.
         self._event: Any = vars(event_pb2)["Event"]
         self._summary: Any = vars(summary_pb2)["Summary"]
         self._histogram_proto: Any = vars(summary_pb2)["HistogramProto"]
@@ -38,7 +38,7 @@ class TensorBoardWriter:
         self._add(self._event(wall_time=now, file_version="brain.Event:2"))
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """See MetricsWriter."""
+        """Write one event. See MetricsWriter."""
         values: list[Any] = [
             self._summary.Value(tag=name, simple_value=float(value))
             for name, value in row.items()
@@ -62,7 +62,10 @@ class TensorBoardWriter:
         self._writer.flush()
 
     def _histogram(self, counts: np.ndarray, edges: np.ndarray, numbers: Sequence[float]) -> Any:
-        """TensorBoard's histogram of counts between edges; sums are of the numbers themselves where there are any."""
+        """Return TensorBoard's histogram of `counts` between `edges`.
+
+        Its sums are exact if `numbers` is given, else they are computed from the middles of the bins.
+        """
         middles = (edges[1:] + edges[:-1]) / 2
         exact = np.array(numbers, np.float64) if len(numbers) else np.repeat(middles, counts)
         return self._histogram_proto(
@@ -76,7 +79,7 @@ class TensorBoardWriter:
         )
 
     def _image(self, picture: np.ndarray) -> Any:
-        from PIL import Image  # a requirement of TensorBoard's
+        from PIL import Image  # installed with TensorBoard
 
         png = io.BytesIO()
         Image.fromarray(picture).save(png, "png")
@@ -88,5 +91,5 @@ class TensorBoardWriter:
         )
 
     def close(self) -> None:
-        """See MetricsWriter."""
+        """Close the file. See MetricsWriter."""
         self._writer.close()

@@ -1,4 +1,4 @@
-"""Which checkpoints of a run may be its best, once it is over."""
+"""Candidates for the best checkpoint of a finished run."""
 
 import logging
 from dataclasses import dataclass
@@ -13,26 +13,29 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A checkpoint that is whole, and what evaluations gave it; the newest may have none."""
+    """Undamaged checkpoint with its evaluation score. The newest checkpoint may have no score."""
 
     directory: Path
     policy_version: int
     score: float | None
 
     def rescore(self, score: float) -> None:
-        """Keeps it under another score. Raises OSError if the disk refuses."""
+        """Store the checkpoint under a new score. Raises OSError on a disk error."""
         rescore(self.directory, score, self.policy_version)
 
 
 def candidates(run_directory: Path) -> list[Candidate]:
-    """Those that scored highest, and the newest if it is none of them. Of a run that was never evaluated: none."""
+    """Return the checkpoints with the best scores, and the newest checkpoint.
+
+    Returns an empty list if the run was never evaluated. Logs a warning for each damaged checkpoint.
+    """
     best = best_checkpoints(run_directory)
     found: dict[int, Candidate] = {}
     for directory in [*best, *checkpoints(run_directory)[:1]] if best else []:
         try:
             version = read_policy(directory).policy_version
         except DamagedError as error:
-            _logger.warning("passed over: %s", error)
+            _logger.warning("damaged checkpoint skipped: %s", error)
         else:
             found.setdefault(
                 version, Candidate(directory, version, best_score(directory) if is_best(directory) else None)

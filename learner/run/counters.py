@@ -1,4 +1,4 @@
-"""What a run has done so far: counters and recent episodes. State, saved with every checkpoint."""
+"""Counters and newest episodes of a run. State, saved with every checkpoint."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -26,22 +26,22 @@ _SAVED = (
 
 @dataclass(slots=True)
 class RunCounters:
-    """Counts over the whole run, resumes included."""
+    """Counts over the whole run, including the processes before a resume."""
 
-    target_episodes: int  # how many episodes the mean return is over
-    env_steps: int = 0  # real steps that were trained on
+    target_episodes: int  # number of newest episodes in the mean return
+    env_steps: int = 0  # environment steps that were trained on
     updates: int = 0
-    updates_skipped: int = 0  # of them, for a gradient that was not finite
+    updates_skipped: int = 0  # updates without an optimiser step, because the gradient was not finite
     episodes: int = 0
     rollouts_accepted: int = 0
     rollouts_rejected: Counter[str] = field(default_factory=Counter)  # by cause
     rollouts_trained: int = 0
-    rollout_bytes: int = 0  # of the accepted, as they came over the wire
+    rollout_bytes: int = 0  # of accepted rollouts, compressed
     accepted_env_steps: int = 0
     policy_lag_sum: int = 0
     policy_lag_max: int = 0
     snapshots_published: int = 0
-    wall_seconds: float = 0.0  # of the lives before this one
+    wall_seconds: float = 0.0  # of the learner processes before this one
     returns: deque[float] = field(init=False)
     lengths: deque[int] = field(init=False)
 
@@ -50,13 +50,19 @@ class RunCounters:
         self.lengths = deque(maxlen=self.target_episodes)
 
     def accepted(self, rollout: Rollout, size: int) -> None:
-        """Counts a rollout that was accepted as a message of `size` bytes."""
+        """Count an accepted rollout that came in a message of `size` bytes."""
         self.rollouts_accepted += 1
         self.rollout_bytes += size
         self.accepted_env_steps += int(np.count_nonzero(rollout.valid))
 
     def trained(self, rollouts: Sequence[Rollout], policy_version: int, updates: int) -> None:
-        """Counts a batch that is about to be learned from, by so many updates."""
+        """Count a batch that the learner is about to train on.
+
+        Args:
+          rollouts: the rollouts of the batch.
+          policy_version: newest policy version; the policy lag is relative to it.
+          updates: number of updates that the batch makes.
+        """
         for rollout in rollouts:
             lag = policy_version - rollout.policy_version
             self.policy_lag_sum += lag
@@ -70,21 +76,21 @@ class RunCounters:
 
     @property
     def episode_return_mean(self) -> float | None:
-        """Mean over the last `target_episodes` training episodes; None before the first."""
+        """Mean return of the newest `target_episodes` training episodes; None before the first episode."""
         return float(np.mean(self.returns)) if self.returns else None
 
     @property
     def policy_lag_mean(self) -> float:
-        """Mean policy lag of the rollouts trained on, in updates."""
+        """Mean policy lag of the rollouts that were trained on, in updates."""
         return self.policy_lag_sum / max(self.rollouts_trained, 1)
 
     def reached(self, target: float | None) -> bool:
-        """Whether the last `target_episodes` episodes are there and their mean is at least the target."""
+        """Return whether there are `target_episodes` episodes and their mean return is at least the target."""
         mean = self.episode_return_mean
         return target is not None and mean is not None and len(self.returns) == self.target_episodes and mean >= target
 
     def state(self, wall_seconds: float) -> dict[str, Any]:
-        """Everything as plain JSON; `wall_seconds` is the whole run's so far."""
+        """Return all counters as plain JSON values; `wall_seconds` is the duration of the whole run so far."""
         return {
             **{name: getattr(self, name) for name in _SAVED},
             "rollouts_rejected": dict(self.rollouts_rejected),
@@ -94,9 +100,9 @@ class RunCounters:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continues from what `state` returned."""
+        """Restore the counters from a result of `state`."""
         for name in _SAVED:
-            setattr(self, name, state.get(name, 0))  # an earlier release counted fewer things
+            setattr(self, name, state.get(name, 0))  # absent in checkpoints of earlier releases
         self.rollouts_rejected = Counter(state["rollouts_rejected"])
         self.wall_seconds = state["wall_seconds"]
         self.returns.extend(state["returns"])

@@ -1,8 +1,8 @@
-"""The directory of a run: what lies where, and how it gets there.
+"""The directory of a run: its files, and functions that read and write them.
 
-config.toml      complete; reproduces the run          metrics.csv   one row a log interval
-versions.json    what it ran on                        checkpoints/  by policy version, newest kept
-summary.json     how it ended                          events.*      the same metrics for TensorBoard
+config.toml      all settings; reproduces the run      metrics.csv   one row for each log interval
+versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
+summary.json     result of the run                     events.*      the same metrics for TensorBoard
 """
 
 import json
@@ -33,25 +33,25 @@ _PACKAGES = (
 
 
 def default_directory(name: str, spec: RunSpec) -> Path:
-    """Where a run goes that was not told where: runs/NAME-ALGORITHM-SEED-TIME."""
+    """Return the default directory of a new run: runs/NAME-ALGORITHM-sSEED-TIME."""
     plain = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
     stamp = time.strftime("%Y%m%d-%H%M%S")
     return Path("runs") / f"{plain}-{spec.training.algorithm}-s{spec.training.seed}-{stamp}"
 
 
 def check_free(directory: Path) -> None:
-    """Raises SettingsError if a new run cannot go there, because something else is there already."""
+    """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty."""
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise SettingsError(
-            f"run directory {directory} exists: continue it with `daedalus resume {directory}`, "
-            "or name another with --run-dir"
+            f"run directory {directory} exists: continue the run with `daedalus resume {directory}`, "
+            "or choose another directory with --run-dir"
         )
 
 
 def create(directory: Path, spec: RunSpec) -> None:
-    """Makes the directory of a new run and writes what is known before it starts.
+    """Create the directory of a new run, with config.toml and versions.json.
 
-    Raises SettingsError if it exists and is not empty.
+    Raises SettingsError if the directory is not empty or cannot be created.
     """
     check_free(directory)
     try:
@@ -63,31 +63,31 @@ def create(directory: Path, spec: RunSpec) -> None:
 
 
 def write_config(directory: Path, spec: RunSpec) -> None:
-    """Writes config.toml: every setting, the defaults too; those that are unset are left out."""
+    """Write config.toml: all settings, including defaults; unset settings are omitted."""
     text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True))
     _replace(directory / CONFIG, text)
 
 
 def read_config(directory: Path) -> RunSpec:
-    """The specification of a run. Raises SettingsError if the directory holds none."""
+    """Return the specification of a run. Raises SettingsError if the directory has no valid config.toml."""
     if not (directory / CONFIG).is_file():
         raise SettingsError(f"{directory} is not a run directory: it has no {CONFIG}")
     return run_spec(read_file(directory / CONFIG))
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a JSON file as a whole or not at all."""
+    """Write a JSON file atomically. Raises OSError."""
     _replace(path, json.dumps(content, indent=2) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file of a run directory. Raises SettingsError if it is not there or not whole."""
+    """Read a JSON file of a run directory. Raises SettingsError if it is missing or damaged."""
     try:
         return json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}") from None
     except ValueError:
-        raise SettingsError(f"{path} is damaged") from None
+        raise SettingsError(f"{path} is damaged: it is not valid JSON") from None
 
 
 def _replace(path: Path, text: str) -> None:
@@ -97,7 +97,7 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _versions() -> dict[str, Any]:
-    import importlib.metadata  # only a new run wants it
+    import importlib.metadata  # imported here, because only a new run needs it
 
     versions: dict[str, Any] = {"python": platform.python_version(), "platform": platform.platform()}
     versions["processors"] = os.cpu_count()
@@ -110,7 +110,7 @@ def _versions() -> dict[str, Any]:
 
 
 def with_budget(spec: RunSpec, env_steps: int) -> RunSpec:
-    """The same run with another budget. Raises SettingsError if it is none."""
+    """Return the specification with another budget. Raises SettingsError if `env_steps` is out of range."""
     settings = spec.model_dump(mode="json", exclude_none=True)
     settings["training"]["env_steps"] = env_steps
     return run_spec(settings)

@@ -1,4 +1,4 @@
-"""Presets, files and `--set` -> a checked RunSpec. Every complaint is one line that says what to do."""
+"""Presets, TOML files and `--set` assignments -> a validated RunSpec. Every error message is one line."""
 
 import difflib
 import importlib.resources
@@ -13,41 +13,41 @@ from daedalus.protocol.spec import RunSpec
 
 
 class SettingsError(Exception):
-    """Settings that make no run; the message says which, why, and what would."""
+    """Error for invalid settings. The message names the setting, the reason and the correction."""
 
 
 def preset_names() -> list[str]:
-    """The presets that ship with the package."""
+    """Return the names of the presets that ship with the package, sorted."""
     folder = importlib.resources.files("daedalus.learner.run.presets")
     return sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def read_preset(name: str) -> dict[str, Any]:
-    """The settings of a preset, or of a TOML file where `name` is a path to one. Raises SettingsError."""
+    """Return the settings of a preset, or of a TOML file if `name` ends with ".toml". Raises SettingsError."""
     if name.endswith(".toml"):
         return read_file(Path(name))
     if name not in preset_names():
         near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(preset_names())}"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"the presets are {', '.join(preset_names())}"
         raise SettingsError(f"unknown preset {name!r}: {hint}; any gymnasium environment runs with --env ID")
     text = (importlib.resources.files("daedalus.learner.run.presets") / f"{name}.toml").read_text("utf-8")
     return tomllib.loads(text)
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """The settings in a TOML file, such as a run's config.toml. Raises SettingsError."""
+    """Return the settings in a TOML file, such as the config.toml of a run. Raises SettingsError."""
     try:
         return tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path} is not TOML: {error}") from None
+        raise SettingsError(f"{path} is not valid TOML: {error}") from None
 
 
 def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
-    """Apply `section.key=value` assignments in place; values are TOML, or plain text where they are not.
+    """Apply `section.key=value` assignments in place. A value that is not valid TOML is a plain string.
 
-    Raises SettingsError for an assignment that names nothing.
+    Raises SettingsError for an assignment that is not of this form.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
@@ -64,7 +64,7 @@ def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
 
 
 def assign(settings: dict[str, Any], path: str, value: Any) -> None:
-    """Set `section.key` to a value in place; None and "none" unset it. Raises SettingsError if the path is none."""
+    """Set `section.key` to a value in place; None and "none" unset it. Raises SettingsError for an invalid path."""
     *sections, key = path.strip().split(".")
     if not sections:
         raise SettingsError(f"{path!r} has no section: write section.key, such as training.learning_rate")
@@ -72,14 +72,14 @@ def assign(settings: dict[str, Any], path: str, value: Any) -> None:
     for name in sections:
         section = section.setdefault(name, {})
         if not isinstance(section, dict):
-            raise SettingsError(f"{name} is a value, not a section")
+            raise SettingsError(f"{name} is a value, not a section: remove the part after {name}")
     _assign(section, key, value)
 
 
 def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
-    """Sets the algorithm, if one is named, and applies what a preset keeps for it in `[for_algorithm.NAME]`.
+    """Set the algorithm, unless it is None, and apply the preset's `[for_algorithm.NAME]` settings for it.
 
-    Raises SettingsError if that is no table of sections.
+    Raises SettingsError if `for_algorithm` is not a table of sections.
     """
     training = settings.setdefault("training", {})
     if algorithm is not None:
@@ -87,21 +87,24 @@ def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
     tables = settings.pop("for_algorithm", {})
     table = tables.get(training.get("algorithm"), {}) if isinstance(tables, dict) else tables
     if not isinstance(table, dict) or not all(isinstance(section, dict) for section in table.values()):
-        raise SettingsError("for_algorithm: write [for_algorithm.NAME.SECTION], such as [for_algorithm.a3c.training]")
+        raise SettingsError(
+            "for_algorithm is not a table of sections: write [for_algorithm.NAME.SECTION], "
+            "such as [for_algorithm.a3c.training]"
+        )
     for section, values in table.items():
         for key, value in values.items():
             _assign(settings.setdefault(section, {}), key, value)
 
 
 def _assign(section: dict[str, Any], key: str, value: Any) -> None:
-    if value is None or (isinstance(value, str) and value == "none"):  # TOML has no word for it
+    if value is None or (isinstance(value, str) and value == "none"):  # TOML has no null value
         section.pop(key, None)
     else:
         section[key] = value
 
 
 def run_spec(settings: dict[str, Any]) -> RunSpec:
-    """The specification that the settings make. Raises SettingsError, naming the first that is wrong."""
+    """Return the validated specification. Raises SettingsError, which names the first invalid setting."""
     try:
         return RunSpec.model_validate(settings)
     except ValidationError as error:
@@ -115,10 +118,10 @@ def _one_line(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         known = _known_names(path[:-1])
         near = difflib.get_close_matches(path[-1], known, 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
         return f"unknown setting {name}: {hint}"
     if first["type"] == "missing":
-        return f"setting {name} is missing"
+        return f"setting {name} is missing: add it"
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if not name:
         return message
@@ -142,7 +145,7 @@ def _model(path: list[str]) -> type[BaseModel] | None:
 
 
 def _bounds(path: list[str]) -> str:
-    """The whole range that a setting allows, where it has one."""
+    """Return the allowed range of a setting in words, or an empty string if it has no bounds."""
     model = _model(path[:-1])
     field = model.model_fields.get(path[-1]) if model else None
     words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}

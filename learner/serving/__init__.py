@@ -1,1 +1,1 @@
-"""What serves the actors: joins, intake, buffers, publishing."""
+"""Serving of actors: joins, intake of rollouts, buffers, publication of snapshots, evaluations."""

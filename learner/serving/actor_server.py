@@ -1,11 +1,11 @@
-"""The learner's side of the wire: joins, presence, status; and the parts that take rollouts and give snapshots.
+"""The learner's side of the protocol: joins, presence, status, intake of rollouts, publication of snapshots.
 
-    transport's threads            answer queries at once; rollouts only go onto a bounded queue
-    intake thread                  rollout_intake.py
-    compact snapshots' thread      compact_snapshot_server.py
-    watchdog thread                session_watchdog.py
+    transport's threads         answer queries immediately, and queue rollouts
+    intake thread               rollout_intake.py
+    compact snapshot thread     compact_snapshot_server.py
+    watchdog thread             session_watchdog.py
 
-The learner's thread takes batches out and publishes snapshots: the network never waits for learning.
+The learner's thread takes batches and publishes snapshots. Network threads never wait for an update.
 """
 
 import logging
@@ -28,14 +28,14 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
-_RIVAL_SECONDS = 2.0  # for another learner of this run to answer
-_HINT_SECONDS = 3.0  # without an actor for so long, tell how to start one
+_OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
+_HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
 _logger = logging.getLogger(__name__)
 
 
 class ActorServer:
-    """Serves one run's actors from `open` to `close`."""
+    """Server of the actors of one run, from `open` to `close`."""
 
     def __init__(
         self,
@@ -52,34 +52,34 @@ class ActorServer:
         """Construct the server.
 
         Args:
-          run: its name.
-          spec: what the run plays and learns.
+          run: name of the run.
+          spec: specification of the run.
           transport: the network.
-          counters: counted here, read by others under `lock`.
-          status: makes the answer to a status query; called with the lock held.
-          learner_epoch: of this learner process.
-          start_version, spaces: those of the checkpoint that a run continues from, else 0 and None.
+          counters: updated by the server; other threads read them under `lock`.
+          status: function that returns the answer to a status query; called with the lock held.
+          learner_epoch: epoch of this learner process.
+          start_version, spaces: from the checkpoint that the run continues from, else 0 and None.
         """
-        self.lock = threading.Condition()  # guards fleet, counters and what the parts share
+        self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
         self._run, self._transport, self._status = run, transport, status
-        self._over = False
+        self._closed = False
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
-        life = {"learner_epoch": learner_epoch, "start_version": start_version}
+        start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
-            run, spec, transport, self._responses, self.fleet, self.lock, counters, **life
+            run, spec, transport, self._responses, self.fleet, self.lock, counters, **start
         )
-        self.rollouts = RolloutIntake(spec, self.lock, self.fleet, counters, lambda: self.publisher.version, **life)
+        self.rollouts = RolloutIntake(spec, self.lock, self.fleet, counters, lambda: self.publisher.version, **start)
         self.evaluations = EvaluationQueue()
         self._watchdog = SessionWatchdog(transport, keys.status(run))
 
     def open(self) -> None:
-        """Let actors in. Raises TransportError if another learner serves a run of this name."""
+        """Start to serve actors. Raises TransportError if another learner serves a run of this name."""
         transport, run, responses = self._transport, self._run, self._responses
-        if transport.query(keys.status(run), timeout=_RIVAL_SECONDS):
+        if transport.query(keys.status(run), timeout=_OTHER_LEARNER_SECONDS):
             raise TransportError(
-                f"another learner serves run {run!r} there already: stop it, "
-                "or give this run another name (the last part of --run-dir)"
+                f"another learner already serves run {run!r}: stop that learner, "
+                "or rename this run (the last part of --run-dir)"
             )
         self.rollouts.open()
         self.publisher.open()
@@ -90,7 +90,7 @@ class ActorServer:
         self._serve(keys.status(run), self._on_status)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer)
         transport.declare_presence(keys.learner(run))
-        # Last: an actor that is let in finds everything else there.
+        # Last, because an actor that has joined uses all other keys.
         self._serve(keys.join(run), lambda query: query.reply(responses.join(query.payload, time.monotonic())))
         self._watchdog.open()
 
@@ -102,11 +102,11 @@ class ActorServer:
         self._transport.serve(key, handle)
 
     def close(self, reason: str) -> None:
-        """Tell the actors that the run is over, and take nothing more. Idempotent."""
+        """Publish the end of the run with `reason`, and stop to serve. Idempotent."""
         with self.lock:
-            if self._over:
+            if self._closed:
                 return
-            self._over = True
+            self._closed = True
             self.rollouts.end()
             self.lock.notify_all()
         self.publisher.close(reason)
@@ -115,18 +115,18 @@ class ActorServer:
         self.rollouts.close()
 
     def await_spaces(self, stop: threading.Event) -> Spaces | None:
-        """Wait for an actor that knows the environment's spaces; return None if told to stop first."""
+        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first."""
         hint_at: float | None = time.monotonic() + _HINT_SECONDS
         with self.lock:
             while self.fleet.spaces is None and not stop.is_set():
                 self.lock.wait(HEARTBEAT_SECONDS)
                 if hint_at is not None and time.monotonic() > hint_at:
-                    _logger.info("waiting for the first actor: `daedalus actor --connect ADDRESS` starts one")
+                    _logger.info("waiting for the first actor: start one with `daedalus actor --connect ADDRESS`")
                     hint_at = None
             return self.fleet.spaces
 
     def offer_policy(self, program: bytes, state_size: int) -> None:
-        """Hold the policy program ready; rollouts come with `state_size` numbers of memory."""
+        """Make the policy program available to actors. `state_size` is the size of the recurrent state in rollouts."""
         self.rollouts.expect_state_size(state_size)
         self.publisher.offer_program(program)
         self.evaluations.open()
@@ -134,10 +134,10 @@ class ActorServer:
     # ----------------------------------------------------------------------------- the transport's threads
 
     def _on_presence(self, key: str, present: bool) -> None:
-        life = keys.parse_presence(key)
-        if life is not None:
+        actor = keys.parse_presence(key)
+        if actor is not None:
             with self.lock:
-                self.fleet.set_present(*life, present)
+                self.fleet.set_present(*actor, present)
                 self.lock.notify_all()
 
     def _on_status(self, request: Request) -> None:

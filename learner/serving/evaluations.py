@@ -1,5 +1,6 @@
-"""What evaluators play and how it went: the policy of each is kept as a checkpoint until it is reported on, the best
-for good. State; no threads, no wire.
+"""Evaluations in progress and their results. State; no threads, no network.
+
+The checkpoint of a policy is kept while an evaluator plays the policy. The best checkpoints are kept permanently.
 """
 
 from dataclasses import dataclass, field
@@ -10,43 +11,47 @@ import numpy as np
 from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 
-_MOST_PLAYING = 16
+_MAX_IN_PROGRESS = 16
 
 
 @dataclass(slots=True)
 class Evaluations:
-    """The evaluations of one run and one life of its learner."""
+    """Evaluations of one run during one learner epoch."""
 
     learner_epoch: int
-    playing: dict[str, tuple[Path, int, int]] = field(default_factory=dict)  # by evaluator: where, version, env_steps
-    newest: dict[str, float] = field(default_factory=dict)  # as columns of learner/reporting/metrics.py, until taken
+    # By evaluator: checkpoint directory, policy version, env_steps.
+    in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
+    newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics.py, until taken
 
     @property
-    def kept(self) -> set[Path]:
-        """The checkpoints that must not be pruned."""
-        return {directory for directory, _, _ in self.playing.values()}
+    def checkpoints_in_use(self) -> set[Path]:
+        """Directories of the checkpoints that must not be pruned."""
+        return {directory for directory, _, _ in self.in_progress.values()}
 
     def begin(self, evaluator: str, directory: Path, policy_version: int, env_steps: int) -> None:
-        """An evaluator plays the policy that was saved in `directory`; what it played before is given up.
+        """Start the evaluation of the policy in `directory`; it replaces the evaluator's previous evaluation.
 
-        Of more evaluators than a run has use for, those that asked first are given up: each holds a checkpoint.
+        At capacity, drop the oldest evaluation, because each evaluation keeps a checkpoint on disk.
         """
-        self.playing.pop(evaluator, None)
-        while len(self.playing) >= _MOST_PLAYING:
-            del self.playing[next(iter(self.playing))]
-        self.playing[evaluator] = directory, policy_version, env_steps
+        self.in_progress.pop(evaluator, None)
+        while len(self.in_progress) >= _MAX_IN_PROGRESS:
+            del self.in_progress[next(iter(self.in_progress))]
+        self.in_progress[evaluator] = directory, policy_version, env_steps
 
     def report(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:
-        """Takes in how a policy played: the answer to who played it, and what to tell the user."""
+        """Record the result of an evaluation. Return the answer to the evaluator and a log message.
+
+        The log message is empty if the report is not accepted.
+        """
         if report.learner_epoch != self.learner_epoch:
-            return Acknowledgement(verdict="fenced", reason="meant for another life of the learner"), ""
-        directory, version, env_steps = self.playing.get(report.evaluator, (None, -1, 0))
+            return Acknowledgement(verdict="fenced", reason="the report is for another learner epoch"), ""
+        directory, version, env_steps = self.in_progress.get(report.evaluator, (None, -1, 0))
         if directory is None or version != report.policy_version:
-            reason = f"{report.evaluator!r} was not given version {report.policy_version} to play"
+            reason = f"evaluator {report.evaluator!r} has no evaluation of policy version {report.policy_version}"
             return Acknowledgement(verdict="rejected", reason=reason), ""
         if not np.isfinite(report.returns).all():
             return Acknowledgement(verdict="rejected", reason="returns has a value that is not finite"), ""
-        del self.playing[report.evaluator]
+        del self.in_progress[report.evaluator]
         mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
         self.newest = {
             "evaluation_return_mean": mean,
@@ -58,10 +63,10 @@ class Evaluations:
         try:
             text += ", the best so far" if keep_if_best(directory, mean, version) else ""
         except OSError as error:
-            text += f"; among the best so far, but it could not be kept ({error.strerror})"
+            text += f", the best so far, but its checkpoint was not kept: {error.strerror}"
         return Acknowledgement(verdict="accepted"), text
 
     def take_newest(self) -> dict[str, float]:
-        """The newest evaluation as metrics; empty if there was none since the last call."""
+        """Return the newest evaluation as metrics; empty without an evaluation since the last call."""
         newest, self.newest = self.newest, {}
         return newest

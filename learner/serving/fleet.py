@@ -1,6 +1,6 @@
-"""The actors as the learner knows them: who takes part, with which identity, how they fare. State, no I/O.
+"""State of all actors: presence, incarnations, received sequence numbers, statistics. No I/O.
 
-The service owns the lock that guards it.
+The lock of the actor server guards it.
 """
 
 import zlib
@@ -14,25 +14,25 @@ from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.status import ActorStatus
 
-_MOST_ACTORS = 16_384  # remembered at once
-_REMEMBERED_LIVES = 8
-_UNFIT_IN_A_ROW = 3  # rollouts, after which nothing more is taken from that life of the actor
-_REORDERING = 1024  # sequence numbers that may arrive out of order before the missing ones are given up
+_MAX_ACTORS = 16_384
+_MAX_WINDOWS = 8  # incarnations of an actor whose sequence numbers are kept
+_MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
+_REORDERING = 1024  # largest distance of sequence numbers that arrive out of order
 
 
 @dataclass(slots=True)
 class SequenceWindow:
-    """Which sequence numbers of one incarnation were taken: each at most once, gaps counted."""
+    """Received sequence numbers of one incarnation. Each number is accepted at most once; gaps are counted."""
 
-    low: int = 0  # all below were taken or given up
-    gaps: int = 0  # how many were given up
-    _above: set[int] = field(default_factory=set)  # taken, from `low` on
+    low: int = 0  # all numbers below were received or given up
+    gaps: int = 0  # numbers that were given up
+    _above: set[int] = field(default_factory=set)  # received numbers that are at least `low`
 
     def __contains__(self, sequence: int) -> bool:
         return sequence < self.low or sequence in self._above
 
     def add(self, sequence: int) -> None:
-        """Marks one as taken."""
+        """Mark a sequence number as received."""
         self._above.add(sequence)
         if sequence - self.low >= _REORDERING:
             low = sequence - _REORDERING + 1
@@ -47,75 +47,79 @@ class SequenceWindow:
 
 @dataclass(slots=True)
 class Actor:
-    """One actor, over all its lives."""
+    """State of one actor, over all its incarnations."""
 
     name: str
     incarnation: int = -1  # the newest; -1 before the first Join
-    lives: int = 0
-    environments: int = 0  # 0 until it has joined with its spaces
+    incarnations: int = 0  # number of incarnations that joined
+    environments: int = 0  # 0 before the actor has joined with its spaces
     last_seen: float = 0.0
     windows: dict[int, SequenceWindow] = field(default_factory=dict)  # by incarnation, the newest last
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
-    busy: int = 0  # answers that told it to come again later
-    unfit: int = 0  # rollouts in a row whose content no healthy actor sends
-    quarantined: str = ""  # why nothing more is taken from its newest incarnation
+    busy: int = 0  # number of `busy` answers
+    consecutive_unfit: int = 0  # rollouts that violate the specification
+    quarantined: str = ""  # the reason, if the newest incarnation is quarantined
     env_steps: int = 0
     env_steps_per_second: float = 0.0
-    policy_lag: int = 0  # of its newest rollout
-    compact_snapshots: bool = False  # it asks for snapshots that fit its link; to all others they are pushed
-    received_bytes: int = 0  # rollouts, whatever became of them
-    answered_bytes: int = 0  # snapshots that it asked for
+    policy_lag: int = 0  # of the newest rollout
+    compact_snapshots: bool = False  # whether the actor fetches compact snapshots instead of subscribing
+    received_bytes: int = 0  # rollouts, accepted or not
+    answered_bytes: int = 0  # compact snapshots
     bytes_up_per_hour: float = 0.0
     bytes_down_per_hour: float = 0.0
 
     @property
     def sequences(self) -> SequenceWindow:
-        """What was taken of its newest incarnation."""
+        """Sequence numbers received from the newest incarnation."""
         return self.windows[self.incarnation]
 
     @property
     def missed(self) -> int:
-        """Rollouts that never came, of the incarnations that are remembered."""
+        """Number of rollouts that never arrived, over the last incarnations."""
         return min(sum(window.gaps for window in self.windows.values()), 2**53)
 
-    def note_unfit(self, fault: str) -> None:
-        """Counts a rollout of unfit content; the third in a row is the last that is looked at.
+    def count_unfit(self, violation: str) -> None:
+        """Count a rollout that violates the specification. Quarantine the actor after three in a row.
 
-        In a row: a simulator that blows up once in a thousand rollouts loses those, a broken machine is shut out.
+        Only consecutive rollouts count: an occasional failure of a simulator does not exclude the actor.
         """
-        self.unfit += 1
-        if self.unfit >= _UNFIT_IN_A_ROW:
-            self.quarantined = f"{self.unfit} unfit rollouts in a row, the last: {fault}"
+        self.consecutive_unfit += 1
+        if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
+            self.quarantined = f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}"
 
-    def begin_life(self, incarnation: int) -> None:
-        """A new process bears the name: it begins with a clean record.
+    def start_incarnation(self, incarnation: int) -> None:
+        """Set the newest incarnation, without quarantine.
 
-        A life that comes back, after another that used its name, has what it sent remembered.
+        If the incarnation joined before, its received sequence numbers are still known.
         """
         self.incarnation = incarnation
-        self.lives += 1
-        self.unfit, self.quarantined, self.compact_snapshots = 0, "", False
+        self.incarnations += 1
+        self.consecutive_unfit, self.quarantined, self.compact_snapshots = 0, "", False
         self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
-        while len(self.windows) > _REMEMBERED_LIVES:
+        while len(self.windows) > _MAX_WINDOWS:
             del self.windows[next(iter(self.windows))]
 
 
 class Fleet:
-    """All actors of a run, and the spaces they must share."""
+    """All actors of a run, and the spaces that they share."""
 
     def __init__(self, seed: int, spaces: Spaces | None) -> None:
         self._seed = seed
-        self.spaces = spaces  # the first actor's, or those of the checkpoint
-        self.actors: dict[str, Actor] = {}  # that joined
-        self.pushed_bytes = 0  # snapshots, to each that follows them
-        self._present: dict[str, set[int]] = {}  # by name, the incarnations that liveliness tells of
+        self.spaces = spaces  # from the first actor or the checkpoint
+        self.actors: dict[str, Actor] = {}  # joined actors, by name
+        self.pushed_bytes = 0  # snapshots published so far, as sent to each subscriber
+        self._present: dict[str, set[int]] = {}  # by name, the incarnations with a liveliness token
 
     def join(self, join: Join, now: float) -> Refusal | None:
-        """Takes in an actor; returns why not, if it cannot take part.
+        """Add an actor. Return None, or the Refusal if the actor cannot join.
 
-        A new incarnation of a known name replaces the old one, once that is gone. Who comes without spaces only asks
-        what is played.
+        A new incarnation of a known name replaces the previous one if that is absent or quarantined. A Join without
+        spaces only asks for the specification and changes nothing.
+
+        Args:
+          join: the message.
+          now: time on the monotonic clock, in seconds.
         """
         try:
             keys.check_name(join.actor, "actor name")
@@ -125,45 +129,48 @@ class Fleet:
         if known is not None and known.incarnation != join.incarnation and self.is_live(known):
             return Refusal(
                 code="name_taken",
-                reason=f"an actor named {join.actor!r} takes part already: give this one another --name",
+                reason=f"actor name {join.actor!r} is already in use: choose another --name",
             )
         if join.spaces is None:
             return None
         if not 1 <= join.environments <= 4096:
-            return Refusal(code="malformed", reason=f"{join.environments} environments: must be 1 to 4096")
+            return Refusal(code="malformed", reason=f"environments is {join.environments}: it must be from 1 to 4096")
         if self.spaces is not None and join.spaces != self.spaces:
             return Refusal(
                 code="mismatch",
-                reason=f"its environment has {join.spaces}; this run has {self.spaces}: "
-                "install the same version of the environment",
+                reason=f"the actor's environment has {join.spaces}, but this run has {self.spaces}: "
+                "install the version of the environment that the other actors use",
             )
-        if join.actor not in self.actors and not self._make_room():
-            return Refusal(code="full", reason=f"{_MOST_ACTORS} actors take part already")
+        if join.actor not in self.actors and not self._ensure_capacity():
+            return Refusal(code="full", reason=f"{_MAX_ACTORS} actors have already joined")
         self.spaces = join.spaces
         actor = self.actors.setdefault(join.actor, Actor(join.actor))
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
-            actor.begin_life(join.incarnation)
+            actor.start_incarnation(join.incarnation)
         actor.environments = join.environments
         return None
 
-    def _make_room(self) -> bool:
-        """Forgets, where as many as there may be are known, who is away and was not seen for longest."""
-        if len(self.actors) < _MOST_ACTORS:
+    def _ensure_capacity(self) -> bool:
+        """Return whether one more actor can join. At capacity, evict the actor that has been absent longest."""
+        if len(self.actors) < _MAX_ACTORS:
             return True
-        away = [actor for actor in self.actors.values() if not self.is_present(actor)]
-        if away:
-            del self.actors[min(away, key=lambda actor: actor.last_seen).name]
-        return bool(away)
+        absent = [actor for actor in self.actors.values() if not self.is_present(actor)]
+        if absent:
+            del self.actors[min(absent, key=lambda actor: actor.last_seen).name]
+        return bool(absent)
 
     def seed_for(self, name: str, start_version: int) -> int:
-        """The seed of an actor's environments and samples: its own for each life of it, and after each resume."""
-        lives = self.actors[name].lives if name in self.actors else 0
-        entropy = [self._seed, zlib.crc32(name.encode()), lives, start_version]
+        """Return the seed of an actor's environments and samples.
+
+        It differs by name, by incarnation and by `start_version`, the policy version that the run continued from.
+        """
+        incarnations = self.actors[name].incarnations if name in self.actors else 0
+        entropy = [self._seed, zlib.crc32(name.encode()), incarnations, start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def set_present(self, name: str, incarnation: int, present: bool) -> None:
-        """What liveliness says of one life of an actor."""
+        """Record whether the liveliness token of an incarnation is present."""
         if present:
             self._present.setdefault(name, set()).add(incarnation)
         elif name in self._present:
@@ -172,20 +179,20 @@ class Fleet:
                 del self._present[name]
 
     def is_present(self, actor: Actor) -> bool:
-        """Whether its newest incarnation is there."""
+        """Return whether the newest incarnation of an actor is present."""
         return actor.incarnation in self._present.get(actor.name, ())
 
     def is_live(self, actor: Actor) -> bool:
-        """Whether it takes part: it has joined, is present, and what it sends is taken."""
+        """Return whether an actor is live: it has joined, is present and is not quarantined."""
         return self.is_present(actor) and actor.environments > 0 and not actor.quarantined
 
     def received(self, name: str, size: int) -> None:
-        """Counts what an actor sent."""
+        """Count `size` bytes received from an actor."""
         if name in self.actors:
             self.actors[name].received_bytes += size
 
-    def expected(self, identity: RolloutIdentity) -> Actor | None:
-        """The actor a rollout is from, or None if that life of it has not joined."""
+    def find(self, identity: RolloutIdentity) -> Actor | None:
+        """Return the actor of a rollout, or None if its incarnation is not the newest that has joined."""
         actor = self.actors.get(identity.actor)
         if actor is None or actor.incarnation != identity.incarnation or not actor.environments:
             return None
@@ -193,17 +200,17 @@ class Fleet:
 
     @property
     def live(self) -> frozenset[str]:
-        """The names of those that take part: the ones a synchronous batch waits for."""
+        """Names of the live actors. A synchronous batch waits for all of them."""
         return frozenset(actor.name for actor in self.actors.values() if self.is_live(actor))
 
     def statuses(self, now: float) -> tuple[ActorStatus, ...]:
-        """One line for each actor, by name."""
+        """Return the status of each actor, sorted by name. `now` is on the monotonic clock, in seconds."""
         return tuple(
             ActorStatus(
                 actor=actor.name,
                 alive=self.is_present(actor),
                 quarantined=actor.quarantined,
-                lives=actor.lives,
+                lives=actor.incarnations,
                 seconds_since_seen=max(now - actor.last_seen, 0.0),
                 environments=actor.environments,
                 env_steps=actor.env_steps,

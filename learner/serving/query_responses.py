@@ -1,22 +1,19 @@
-"""What the learner answers to those who ask: joins, the program, the newest snapshot, the status.
+"""Answers to queries for joins, the program and the newest snapshot.
 
-State that several of the transport's threads read; it holds the answers ready and decides, and the service
-puts it on the wire.
+State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
 
 import threading
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import Join, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
 
-_JOIN_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)
-
 
 class QueryResponses:
-    """Answers, as bytes, to the queries that are not rollouts. The lock that it is given guards the fleet."""
+    """Encoded answers to queries that do not carry rollouts. `lock` guards the fleet."""
 
     def __init__(
         self,
@@ -36,17 +33,17 @@ class QueryResponses:
         self._snapshot = encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
         self._program: Program | None = None
         self._encoded_program = b""
-        self._over = False
+        self._closed = False
 
     def join(self, data: bytes, now: float) -> bytes:
-        """The answer to a Join: Welcome, or Refusal with the reason. Wakes who waits for actors."""
+        """Return the answer to a Join: a Welcome, or a Refusal with the reason. Notifies the lock after a Welcome."""
         try:
-            message = decode(data, _JOIN_LIMITS)
+            message = decode(data, JOIN_LIMITS)
         except ProtocolError as error:
             return encode(Refusal(code="mismatch", reason=str(error)))
         if not isinstance(message, Join):
-            return encode(Refusal(code="malformed", reason="only actors that ask to join belong here"))
-        if self._over:
+            return encode(Refusal(code="malformed", reason="expected a Join message"))
+        if self._closed:
             return encode(Refusal(code="finished", reason="the run is over"))
         with self._lock:
             refusal = self._fleet.join(message, now)
@@ -57,24 +54,24 @@ class QueryResponses:
         return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
 
     def offer_program(self, program: Program) -> None:
-        """Has the run's program ready for those who ask for it."""
+        """Set the run's program, the answer to later queries."""
         self._encoded_program, self._program = encode(program), program
 
     def program(self, program_hash: str) -> bytes:
-        """The answer to a query for a program, or for the one that is played (`*`)."""
+        """Return the answer to a query for the program with a hash, or for the current program (`*`)."""
         if self._program is None or program_hash not in ("*", self._program.hash):
-            return encode(Refusal(code="unknown", reason=f"there is no program {program_hash[:64]!r}"))
+            return encode(Refusal(code="unknown", reason=f"no program with hash {program_hash[:64]!r}"))
         return self._encoded_program
 
     def offer_snapshot(self, encoded: bytes) -> None:
-        """Has the newest snapshot ready, as the bytes that were published."""
+        """Set the newest snapshot, as the bytes that were published."""
         self._snapshot = encoded
 
     def close(self, run_ended: bytes) -> None:
-        """Lets nobody in any more, and answers with a run_ended where there were snapshots."""
-        self._over = True
+        """Refuse later joins, and answer queries for snapshots with `run_ended`, an encoded RunEnded."""
+        self._closed = True
         self._snapshot = run_ended
 
     def snapshot(self) -> bytes:
-        """The answer to a query for the newest snapshot."""
+        """Return the answer to a query for the newest snapshot."""
         return self._snapshot

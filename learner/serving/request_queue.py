@@ -1,4 +1,4 @@
-"""Requests that wait to be judged, bounded by bytes and by number. State with a lock, no threads of its own."""
+"""Queue of undecoded requests, bounded by bytes and by number. State with a lock, no threads of its own."""
 
 import queue
 import threading
@@ -7,7 +7,7 @@ from daedalus.transport.interface import Request
 
 
 class RequestQueue:
-    """First in, first out. `offer` never waits, `take` does."""
+    """First-in, first-out queue of requests. `offer` does not block, `take` does."""
 
     def __init__(self, max_bytes: int, max_requests: int) -> None:
         self._max_bytes, self._max_requests = max_bytes, max_requests
@@ -16,7 +16,10 @@ class RequestQueue:
         self._requests: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
 
     def offer(self, request: Request) -> bool:
-        """Takes a request unless that would exceed a bound; an empty queue takes any."""
+        """Queue a request and return True, or return False if a bound would be exceeded.
+
+        An empty queue accepts a request of any size.
+        """
         with self._lock:
             full = self._number >= self._max_requests or self._bytes + request.size > self._max_bytes
             if self._number and full:
@@ -27,7 +30,7 @@ class RequestQueue:
         return True
 
     def take(self) -> Request | None:
-        """Waits for the oldest request; None once the queue was closed and is empty."""
+        """Wait for the oldest request and return it, or None if the queue is closed and empty."""
         request = self._requests.get()
         if request is not None:
             with self._lock:
@@ -37,9 +40,9 @@ class RequestQueue:
 
     @property
     def bytes(self) -> int:
-        """What the requests that wait hold."""
+        """Total size of the waiting requests, in bytes."""
         return self._bytes
 
     def close(self) -> None:
-        """Lets `take` return None after what is queued already."""
+        """Close the queue: `take` returns the waiting requests, then None."""
         self._requests.put(None)

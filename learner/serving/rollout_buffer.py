@@ -1,4 +1,4 @@
-"""Accepted rollouts -> the rollouts of one batch. The synchronous barrier lives here. No I/O, no threads."""
+"""Buffers of accepted rollouts: a barrier for synchronous algorithms, a queue for the others. No I/O, no threads."""
 
 from collections import deque
 from collections.abc import Set
@@ -10,33 +10,38 @@ from daedalus.protocol.messages import Rollout
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TakenRollouts:
-    """One batch's rollouts, and those that grew too old while they waited."""
+    """Rollouts of one batch, and rollouts that became stale in the buffer."""
 
     rollouts: list[Rollout]
     stale: list[Rollout]
 
 
 class RolloutBuffer(Protocol):
-    """Holds rollouts until a batch is complete."""
+    """Interface of a buffer that holds rollouts until a batch is complete."""
 
     def has_room_for(self, rollout: Rollout) -> bool:
-        """Whether `add` may be called; if not, whether it may later is the buffer's own law."""
+        """Return whether `add` may be called with this rollout now."""
         ...
 
     def add(self, rollout: Rollout) -> None:
-        """Takes in a rollout."""
+        """Add a rollout. The caller has checked `has_room_for`."""
         ...
 
     def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
-        """The next batch if it is complete, else no rollouts. `live` are the actors that take part."""
+        """Take the next batch if it is complete, else no rollouts.
+
+        Args:
+          live: names of the live actors.
+          policy_version: newest policy version; rollouts beyond the policy lag bound are returned as stale.
+        """
         ...
 
 
 class BarrierBuffer:
-    """Synchronous: a batch is one rollout of every live actor, in the order of their names.
+    """Buffer of a synchronous algorithm: a batch is one rollout of every live actor, sorted by name.
 
-    The first batch also waits until `first` actors are there. An actor that leaves is no longer waited for;
-    what it had sent under the current version counts.
+    The first batch also waits for `first` live actors. A batch does not wait for an actor that has left, but contains
+    its rollout of the current version.
     """
 
     def __init__(self, first: int) -> None:
@@ -45,7 +50,7 @@ class BarrierBuffer:
         self._waiting: dict[str, Rollout] = {}
 
     def has_room_for(self, rollout: Rollout) -> bool:
-        """See RolloutBuffer: an actor has one rollout a batch."""
+        """Return whether the batch has no rollout of this actor yet. See RolloutBuffer."""
         return rollout.identity.actor not in self._waiting
 
     def add(self, rollout: Rollout) -> None:
@@ -65,10 +70,10 @@ class BarrierBuffer:
 
 
 class StreamBuffer:
-    """Asynchronous: a batch is the next `batch_rollouts` rollouts that are not too old, whoever sent them.
+    """Buffer of an asynchronous algorithm: a batch is the next `batch_rollouts` rollouts that are not stale.
 
-    Holds the batch that the learner takes next, and two rollouts at least: enough to keep it busy, and every one more
-    would only add policy lag.
+    The capacity is one batch, and at least two rollouts. This keeps the learner busy; more rollouts would only add
+    policy lag.
     """
 
     def __init__(self, batch_rollouts: int, max_policy_lag: int) -> None:
@@ -77,7 +82,7 @@ class StreamBuffer:
         self._waiting: deque[Rollout] = deque()
 
     def has_room_for(self, rollout: Rollout) -> bool:
-        """See RolloutBuffer: there is room again once a batch was taken."""
+        """Return whether the buffer is below its capacity. See RolloutBuffer."""
         return len(self._waiting) < max(self._batch_rollouts, 2)
 
     def add(self, rollout: Rollout) -> None:

@@ -1,11 +1,11 @@
-"""A rollout's way from the network to a batch: a bounded queue, a thread that judges, a buffer.
+"""Intake of rollouts, from the network to a batch: a bounded queue, a thread that judges rollouts, a buffer.
 
     transport's threads   `offer`: put the undecoded rollout on the queue, or answer busy
-    intake thread         decodes and judges rollouts, answers them, fills the buffer
+    intake thread         decodes, judges and answers rollouts, and fills the buffer
     learner's thread      `take_batch`: takes complete batches out of the buffer
 
-One condition, shared with the actor server, guards the fleet, the buffer, the counters and the version that rollouts
-are judged against.
+One condition, shared with the actor server, guards the fleet, the buffer, the counters and the version that the policy
+lag of rollouts is relative to.
 """
 
 import threading
@@ -25,12 +25,12 @@ from daedalus.protocol.messages import Acknowledgement, Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request
 
-HEARTBEAT_SECONDS = 0.2  # how soon a wait notices that it should stop
-_CLOSE_SECONDS = 4.0  # for the intake thread to answer what is queued
+HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
+_CLOSE_SECONDS = 4.0  # for the intake thread to answer the queued rollouts
 
 
 class RolloutIntake:
-    """Serves the `rollouts` keys from `open` to `close`."""
+    """Server of the `rollouts` keys, from `open` to `close`."""
 
     def __init__(
         self,
@@ -43,42 +43,51 @@ class RolloutIntake:
         learner_epoch: int,
         start_version: int,
     ) -> None:
-        """`published_version` returns the newest policy version that actors can have."""
+        """Construct the intake.
+
+        Args:
+          spec: specification of the run.
+          lock: the condition shared with the actor server.
+          fleet, counters: guarded by `lock`.
+          published_version: function that returns the newest published policy version.
+          learner_epoch: epoch of this learner process.
+          start_version: policy version of the checkpoint that the run continues from, else 0.
+        """
         self._spec, self._lock, self._fleet, self._counters = spec, lock, fleet, counters
         self._published_version = published_version
-        self._version = start_version  # rollouts of it are on-policy
+        self._version = start_version  # rollouts of this version have a policy lag of 0
         self._intake = Intake(spec, learner_epoch, fleet)
         self._buffer = _buffer(spec)
         self._requests = _queue(spec)
-        self._over = False
+        self._closed = False
         self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
 
     def open(self) -> None:
-        """Start to judge."""
+        """Start the intake thread."""
         self._thread.start()
 
     def end(self) -> None:
-        """Answer every rollout `finished` from now on. Called with the lock held."""
-        self._over = True
+        """Answer every rollout `finished` from now on. The caller holds the lock."""
+        self._closed = True
 
     def close(self) -> None:
-        """Answer what is queued, and stop. Called after `end`, without the lock."""
+        """Answer the queued rollouts, and stop the thread. Call after `end`, without the lock."""
         self._requests.close()
         if self._thread.is_alive():
             self._thread.join(timeout=_CLOSE_SECONDS)
 
     @property
     def queue_bytes(self) -> int:
-        """How much waits to be judged."""
+        """Total size of the queued rollouts, in bytes."""
         return self._requests.bytes
 
     def expect_state_size(self, state_size: int) -> None:
-        """Say how many numbers of memory a rollout comes with; before any actor has the program."""
+        """Set the size of the recurrent state in a rollout. Call before any actor has the program."""
         self._intake.state_size = state_size
 
     def offer(self, request: Request) -> None:
-        """Take in a rollout, or answer busy. Never waits."""
-        if self._over:
+        """Queue a rollout, or answer busy. Does not block."""
+        if self._closed:
             request.reply(encode(Acknowledgement(verdict="finished")))
         elif not self._requests.offer(request):
             request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
@@ -90,9 +99,13 @@ class RolloutIntake:
     # ------------------------------------------------------------------------------------ the learner's thread
 
     def take_batch(self, version: int) -> list[Rollout]:
-        """Return the rollouts of the next update, counted; none if no batch is complete within a heartbeat.
+        """Return the rollouts of the next batch, or an empty list if no batch is complete within a heartbeat.
 
-        `version` is the newest; from here on, rollouts of the version that this batch makes are on-policy.
+        The rollouts are counted as trained. From now on the policy lag is relative to the version after this batch,
+        because actors may have its snapshot before the next batch is complete.
+
+        Args:
+          version: newest policy version, before this batch.
         """
         with self._lock:
             taken = self._take(version)
@@ -107,7 +120,7 @@ class RolloutIntake:
         return self._buffer.take(self._fleet.live, version)
 
     def _count(self, taken: TakenRollouts, version: int) -> None:
-        actors = self._fleet.actors  # one that was absent for long may have been evicted
+        actors = self._fleet.actors  # an actor that was absent for long may have been evicted
         for rollout in taken.stale:
             self._counters.rollouts_rejected["stale"] += 1
             if rollout.identity.actor in actors:
@@ -129,11 +142,13 @@ class RolloutIntake:
             content = self._intake.read(sender, payload)
             with self._lock:
                 answer = self._judge(sender, content, len(payload))
-            request.reply(encode(Acknowledgement(verdict="finished") if self._over else answer))
+            request.reply(encode(Acknowledgement(verdict="finished") if self._closed else answer))
 
     def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
-            content = Rejected(verdict="rejected", cause="surplus", reason="an update takes one rollout of an actor")
+            content = Rejected(
+                verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
+            )
         verdict = self._intake.judge(sender, content, self._version, time.monotonic())
         self._fleet.received(sender, size)
         if isinstance(verdict, Rollout):
@@ -143,13 +158,16 @@ class RolloutIntake:
         return acknowledgement(verdict, self._published_version())
 
     def _is_surplus(self, content: Rollout | Rejected) -> bool:
-        """Whether a barrier holds a rollout of the same actor already: waiting for room would wait for that actor."""
+        """Return whether the barrier already holds a rollout of the actor.
+
+        Such a rollout is rejected: waiting for room would block the intake thread, and with it all other actors.
+        """
         synchronous = self._spec.algorithm.synchronous
         return synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content)
 
     def _store(self, rollout: Rollout, size: int) -> None:
-        """Put a rollout into the buffer, waiting for room: the late answer is what holds its sender back."""
-        while not self._buffer.has_room_for(rollout) and not self._over:
+        """Put a rollout into the buffer, and wait for room first. The late answer slows the sender down."""
+        while not self._buffer.has_room_for(rollout) and not self._closed:
             self._lock.wait(HEARTBEAT_SECONDS)
         self._buffer.add(rollout)
         self._counters.accepted(rollout, size)
@@ -157,10 +175,9 @@ class RolloutIntake:
 
 
 def _queue(spec: RunSpec) -> RequestQueue:
-    """Return a queue as long as its last rollout can still be learned from when its turn comes.
+    """Return a queue that holds only as many rollouts as can be trained on before they are stale.
 
-    Rollouts beyond that are answered busy: waiting here they would only grow too old, and their senders would give up
-    waiting for the answers.
+    Further rollouts are answered busy: in the queue they would become stale, and their senders would time out.
     """
     batches = spec.training.policy_lag_bound // spec.training.updates_per_batch + 1
     return RequestQueue(spec.service.queue_bytes, max(batches * spec.batch_rollouts, 2 * spec.collection.actors))

@@ -1,4 +1,4 @@
-"""Reopens the transport's session where nobody is heard and nobody could reach the learner. A thread of its own."""
+"""Watchdog that reopens the transport's session if requests no longer reach the learner. Has its own thread."""
 
 import contextlib
 import threading
@@ -6,33 +6,38 @@ import time
 
 from daedalus.transport.interface import Transport, TransportError
 
-_SILENCE_SECONDS = 10.0  # without a request from anybody for so long, the session may be dead
+_SILENCE_SECONDS = 10.0  # without any request for so long, the session may be dead
 
 
 class SessionWatchdog:
-    """Watches one transport from `open` to `close`."""
+    """Watchdog of one transport, from `open` to `close`."""
 
     def __init__(self, transport: Transport, own_key: str) -> None:
-        """`own_key` is served here: a session is dead if, seen from outside, nobody answers there."""
+        """Construct the watchdog. `own_key` is a key that this process serves.
+
+        The session is dead if a query on `own_key` over another session has no answer.
+        """
         self._transport, self._own_key = transport, own_key
         self._heard_at = time.monotonic()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="session watchdog", daemon=True)
 
     def open(self) -> None:
-        """Start to watch."""
+        """Start the watchdog thread."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop to watch; does not wait for a session that is being opened."""
+        """Stop the watchdog. Does not wait for a session that is being opened."""
         self._closed.set()
 
     def heard(self) -> None:
-        """Note that a request came in. From any thread."""
+        """Record that a request was received. Any thread may call this method."""
         self._heard_at = time.monotonic()
 
     def _watch(self) -> None:
         while not self._closed.wait(_SILENCE_SECONDS / 2):
             if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
-                with contextlib.suppress(TransportError):  # no router there now: the present session goes on looking
+                with contextlib.suppress(
+                    TransportError
+                ):  # no router is reachable: the present session keeps trying to connect
                     self._transport.reopen(unless_served=self._own_key)

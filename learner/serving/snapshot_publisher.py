@@ -1,4 +1,4 @@
-"""What actors play with: the program, and snapshots, which are pushed, asked for, or fetched in compact form."""
+"""Publication of the program and of snapshots, by push, by query, and as compact snapshots."""
 
 import contextlib
 import threading
@@ -18,7 +18,10 @@ from daedalus.transport.interface import Request, Transport, TransportError
 
 
 class SnapshotPublisher:
-    """Publishes for one learner epoch. Publishing is for one thread, answering for any."""
+    """Publisher of the program and snapshots during one learner epoch.
+
+    One thread publishes; any thread may answer queries.
+    """
 
     def __init__(
         self,
@@ -33,54 +36,71 @@ class SnapshotPublisher:
         learner_epoch: int,
         start_version: int,
     ) -> None:
-        """`lock` guards the fleet."""
+        """Construct the publisher.
+
+        Args:
+          run: name of the run.
+          spec: specification of the run.
+          transport: the network.
+          responses: answers to queries, updated with each snapshot.
+          fleet: the actors; guarded by `lock`.
+          lock: the condition shared with the actor server.
+          counters: counters of the run.
+          learner_epoch: epoch of this learner process.
+          start_version: policy version of the checkpoint that the run continues from, else 0.
+        """
         self._key, self._spec, self._epoch = keys.snapshots(run), spec, learner_epoch
         self._transport, self._responses, self._counters = transport, responses, counters
         self._fleet, self._lock = fleet, lock
         self._compact = CompactSnapshotServer(learner_epoch, responses.snapshot, self._count_compact)
-        self._unpublished_rollouts = 0  # learned from since the last snapshot
+        self._unpublished_rollouts = 0  # trained on since the last snapshot
         self._program_hash = ""
-        self.version = start_version  # the newest that actors can have
+        self.version = start_version  # the newest published version
 
     def open(self) -> None:
-        """Start to answer."""
+        """Start to answer requests for compact snapshots."""
         self._compact.open()
 
     def close(self, reason: str) -> None:
-        """Tell actors that the run has ended, in place of snapshots."""
+        """Publish RunEnded with `reason` in place of snapshots, and stop."""
         ended = encode(RunEnded(learner_epoch=self._epoch, reason=reason))
         self._responses.close(ended)
         self._push(ended)
         self._compact.close()
 
     def answer(self, request: Request) -> None:
-        """Answer a query on `snapshots`, now or soon. Never waits."""
+        """Answer a query on `snapshots`, or queue it if it requests a compact snapshot. Does not block."""
         if request.size:
             self._compact.offer(request)
         else:
             request.reply(self._responses.snapshot())
 
     def offer_program(self, model: bytes) -> None:
-        """Hold the policy program ready for those who ask."""
+        """Make the policy program available to queries."""
         self._program_hash = program_hash(model)
         self._responses.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
     def publish_if_due(self, policy_version: int, weights: dict[str, np.ndarray], rollouts: int) -> None:
-        """Publish a version that was made of so many rollouts, if enough actors would play it.
+        """Publish a policy version if enough rollouts were trained on since the last snapshot.
 
-        An actor takes one snapshot a rollout. In a small fleet every update is published. With a large fleet, publish
-        after a quarter of the actors have contributed: each snapshot is sent to all of them. The versions that are
-        played must stay well within the policy lag that is learned from.
+        With a small fleet, publish every update. With a large fleet, publish after a quarter of the actors have
+        contributed: each snapshot is sent to all actors, and an actor uses at most one snapshot for each rollout.
+        Publish in any case after a quarter of the policy lag bound, so that rollouts stay well within the bound.
+
+        Args:
+          policy_version: the version of the weights.
+          weights: numpy arrays by parameter name.
+          rollouts: number of rollouts in the batch that made the version.
         """
         self._unpublished_rollouts += rollouts
         with self._lock:
             live = len(self._fleet.live)
-        ages = 4 * (policy_version - self.version) >= self._spec.training.policy_lag_bound
-        if self._spec.algorithm.synchronous or ages or 4 * self._unpublished_rollouts >= live:
+        version_due = 4 * (policy_version - self.version) >= self._spec.training.policy_lag_bound
+        if self._spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
             self.publish(policy_version, weights)
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
-        """Encode a snapshot once, for subscribers and for queries."""
+        """Publish a snapshot. It is encoded once, for subscribers and for queries."""
         snapshot = encode(
             Snapshot(
                 learner_epoch=self._epoch,
@@ -96,15 +116,15 @@ class SnapshotPublisher:
         self._counters.snapshots_published += 1
 
     def newest(self) -> bytes:
-        """Return the snapshot that was published last, encoded."""
+        """Return the newest published snapshot, encoded."""
         return self._responses.snapshot()
 
     def _push(self, payload: bytes) -> None:
-        with contextlib.suppress(TransportError):  # the session is being replaced; actors ask for what they miss
+        with contextlib.suppress(TransportError):  # the session is being replaced; actors query a missed snapshot
             self._transport.publish(self._key, payload)
 
     def _count_compact(self, name: str, size: int) -> None:
-        """Called on the compact snapshot server's thread."""
+        """Count an answer to an actor. Called on the thread of the compact snapshot server."""
         with self._lock:
             actor = self._fleet.actors.get(name)
             if actor is not None:

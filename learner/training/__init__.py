@@ -1,1 +1,1 @@
-"""The update: optimisers, precision, checkpoints."""
+"""The update: learner, optimisers, metrics of updates, checkpoints."""

@@ -1,4 +1,4 @@
-"""glibc's allocator, told to keep what it has: by default it halves the learner's speed."""
+"""Configuration of glibc's allocator: with its default thresholds the learner runs at half the speed."""
 
 import ctypes
 import sys
@@ -8,9 +8,9 @@ _NEVER = 2**31 - 1
 
 
 def keep_freed_memory() -> None:
-    """Large tensors come from the heap and stay there, instead of being mapped and unmapped at each step.
+    """Make the allocator keep freed memory, instead of mapping and unmapping large tensors at each step.
 
-    To be called before the first tensor. Does nothing where the C library is not glibc.
+    Call this function before the first tensor is created. It does nothing if the C library is not glibc.
     """
     if not sys.platform.startswith("linux"):
         return

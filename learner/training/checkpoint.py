@@ -1,7 +1,7 @@
-"""Checkpoints: the learner's full restart state, written atomically, verified when read.
+"""Checkpoints: the learner's full restart state, written atomically and verified on load.
 
-A checkpoint is a sealed directory (policy/saving/sealed.py) named by its policy version. Its policy part is read by
-policy/saving/saved_policy.py too; this file adds what learning goes on from.
+A checkpoint is a sealed directory (policy/saving/sealed.py) named by its policy version. Its policy part can also be
+read by policy/saving/saved_policy.py; this file adds the state that training continues from.
 """
 
 import logging
@@ -29,11 +29,11 @@ _STATE_FILE = "learner.safetensors"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Checkpoint:
-    """What a learner continues from."""
+    """Full restart state of a learner."""
 
     policy: SavedPolicy
-    state: dict[str, Tensor]  # optimiser statistics and random state, as Learner.state gave them
-    counters: dict[str, Any]  # as RunCounters.state gave them
+    state: dict[str, Tensor]  # optimiser statistics and random state, from Learner.state
+    counters: dict[str, Any]  # from RunCounters.state
 
 
 def save_checkpoint(
@@ -49,9 +49,9 @@ def save_checkpoint(
     keep: int,
     also_keep: Set[Path] = frozenset(),
 ) -> Path:
-    """Writes a checkpoint, then removes all but the newest `keep` and `also_keep`.
+    """Write a checkpoint, remove all others but the newest `keep` and `also_keep`, and return its directory.
 
-    Raises OSError if the disk refuses.
+    Raises OSError on a disk error; the existing checkpoints then stay.
     """
     directory = run_directory / "checkpoints" / f"{policy_version:010d}"
     files = {
@@ -66,36 +66,38 @@ def save_checkpoint(
         "counters": counters,
     }
     write_sealed(directory, files, content)
-    # A damaged one of a higher version may be there: the learner then went on from an earlier one.
+    # A damaged checkpoint of a higher version may exist, if the learner resumed from an earlier checkpoint.
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         if old not in also_keep:
             shutil.rmtree(old, ignore_errors=True)
-    for unfinished in directory.parent.glob(".*"):  # what a crash left
+    for unfinished in directory.parent.glob(".*"):  # left by a crash
         shutil.rmtree(unfinished, ignore_errors=True)
     return directory
 
 
 def load_checkpoint(directory: Path) -> Checkpoint:
-    """Reads one checkpoint; raises DamagedError if it is not what was written."""
+    """Read one checkpoint. Raises DamagedError if its files differ from the files that were written."""
     policy = read_policy(directory)
     sealed = SealedDirectory(directory)
     try:
         state = safetensors.torch.load(sealed.read(_STATE_FILE))
         counters = sealed.content["counters"]
     except (KeyError, safetensors.SafetensorError) as error:
-        raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None
+        raise DamagedError(
+            f"{directory}: written by another release ({type(error).__name__}): resume the run with that release"
+        ) from None
     return Checkpoint(policy=policy, state=state, counters=counters)
 
 
 def load_newest(run_directory: Path) -> Checkpoint:
-    """The newest checkpoint that is whole; names each damaged one that it passes over.
+    """Return the newest undamaged checkpoint, and log a warning for each damaged checkpoint.
 
-    Raises DamagedError if none is left.
+    Raises DamagedError if there is no undamaged checkpoint.
     """
     for directory in checkpoints(run_directory):
         try:
             return load_checkpoint(directory)
         except DamagedError as error:
-            _logger.warning("checkpoint passed over: %s", error)
-    raise DamagedError(f"{run_directory} has no checkpoint that can be read")
+            _logger.warning("damaged checkpoint skipped: %s", error)
+    raise DamagedError(f"{run_directory} has no readable checkpoint: start a new run with another --run-dir")

@@ -1,4 +1,4 @@
-"""Saves a run's checkpoints while it learns; a disk that refuses costs a warning, not the run."""
+"""Saving of checkpoints during training. A disk error is logged as a warning and does not end the run."""
 
 import logging
 import time
@@ -17,7 +17,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Checkpointer:
-    """Saves one learner's state into its run directory."""
+    """Writer of one learner's checkpoints into its run directory."""
 
     def __init__(
         self,
@@ -34,19 +34,19 @@ class Checkpointer:
         """Construct the checkpointer.
 
         Args:
-          directory: of the run.
-          spec, spaces, program: stored with every checkpoint.
-          learner: whose state is saved.
-          counters: returns the run's counters as of now.
-          evaluations: its checkpoints are kept while they are played.
-          health: is told when a checkpoint was saved, and why one was not.
+          directory: the run directory.
+          spec, spaces, program: content of every checkpoint.
+          learner: source of the parameters and the optimiser state.
+          counters: function that returns the current counters of the run.
+          evaluations: checkpoints that are being evaluated are not pruned.
+          health: record of the last saved checkpoint and of the last error.
         """
         self._directory, self._spec, self._spaces = directory, spec, spaces
         self._learner, self._program = learner, program
         self._counters, self._evaluations, self._health = counters, evaluations, health
 
     def save(self) -> Path | None:
-        """Save a checkpoint and return its directory; None if the disk refuses."""
+        """Save a checkpoint and return its directory, or None on a disk error."""
         try:
             directory = save_checkpoint(
                 self._directory,
@@ -58,13 +58,13 @@ class Checkpointer:
                 state=self._learner.state(),
                 counters=self._counters(),
                 keep=self._spec.service.keep_checkpoints,
-                also_keep=self._evaluations.kept,
+                also_keep=self._evaluations.checkpoints_in_use,
             )
         except OSError as error:
             if not self._health.save_fault:
                 _logger.warning(
-                    "no checkpoint could be saved (%s); the last one stays, training goes on, and saving is tried "
-                    "again every %g s",
+                    "checkpoint not saved: %s; the previous checkpoint is kept, training continues, "
+                    "and saving is retried every %g s",
                     error.strerror,
                     self._spec.service.checkpoint_seconds,
                 )

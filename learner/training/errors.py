@@ -1,5 +1,5 @@
-"""Errors of training that a command reports in one line; torch-free, so that it can name them before torch loads."""
+"""Errors of training that a command reports in one line. Without torch, so that a command can import them early."""
 
 
 class CheckpointMismatchError(Exception):
-    """A checkpoint that another network or optimiser wrote."""
+    """Error for a checkpoint of another network or optimiser."""

@@ -1,4 +1,4 @@
-"""One update at a time: owns the parameters, the optimiser and the policy version. No threads, no I/O."""
+"""The parameters, the optimiser and the policy version, and their updates. No threads, no I/O."""
 
 import math
 from collections.abc import Sequence
@@ -21,14 +21,17 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 
 class Learner:
-    """Turns batches into new policy versions: computes gradients (daedalus/algorithms), then applies them."""
+    """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
     def __init__(self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces) -> None:
-        """Raises SettingsError if the device is not there, NetworkError if the policy is not for such spaces."""
+        """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
+
+        Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces.
+        """
         if spec.device == "cuda" and not torch.cuda.is_available():
             raise SettingsError(
-                "training.device is cuda, but torch sees none here: install a torch built for CUDA and the driver, "
-                "or set training.device=cpu"
+                "training.device is cuda, but torch finds no CUDA device: install the NVIDIA driver and a CUDA "
+                "build of torch, or set training.device=cpu"
             )
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
@@ -42,19 +45,19 @@ class Learner:
         self._assembler = BatchAssembler(spaces.observation, self._device)
         self.metrics = UpdateMetrics(spaces, self._device)
         self.policy_version = 0
-        self.updates_skipped = 0  # whose gradient was not finite: versions that are the same as those before them
+        self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
 
     @property
     def state_size(self) -> int:
-        """S, how many numbers the policy remembers from row to row."""
+        """S, the size of the recurrent state of the policy; 0 without memory."""
         return self._network.state_size
 
     def step(self, rollouts: Sequence[Rollout], progress: float) -> None:
         """Make all updates of one batch.
 
         Args:
-          rollouts: those of the batch, in its order.
-          progress: the share of the budget that is used up; it anneals the rates.
+          rollouts: the rollouts of the batch, in order.
+          progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
         batch = self._assembler.join(rollouts).to(self._device)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
@@ -64,51 +67,61 @@ class Learner:
         self.metrics.add_batch(batch)
 
     def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:
-        """Take one optimiser step down the gradients that were computed last."""
+        """Take one optimiser step with the gradients that were computed last."""
         norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-        if not math.isfinite(norm):  # one such step would end the run: no weight comes back from nan
+        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
             self.updates_skipped += 1
             return
         self._optimizer.step(self._flat.values, self._flat.gradients, learning_rate)
         self.metrics.add_update(terms, norm)
 
     def learning_rate(self, progress: float) -> float:
-        """Return the optimiser's rate at a share of the budget."""
+        """Return the learning rate at a share of the budget."""
         return _annealed(self._spec.learning_rate, self._spec.learning_rate_final, progress)
 
     def entropy_bonus(self, progress: float) -> float:
-        """Return the entropy's weight in the loss at a share of the budget."""
+        """Return the weight of the entropy in the loss at a share of the budget."""
         return _annealed(self._spec.entropy_bonus, self._spec.entropy_bonus_final, progress)
 
-    # ------------------------------------------------------------------------------ to actors and checkpoints
+    # ----------------------------------------------------------------------------- for actors and checkpoints
 
     def program(self) -> bytes:
         """Return the policy program (daedalus/policy/acting/program.py)."""
         return export_program(self._network, self._spaces.observation)
 
     def weights(self) -> dict[str, np.ndarray]:
-        """Return all parameters as numpy arrays that share their memory: copy or encode them before the next step."""
+        """Return all parameters as numpy arrays.
+
+        The arrays may share memory with the parameters: copy or encode them before the next step.
+        """
         return {name: parameter.detach().cpu().numpy() for name, parameter in self._parameters.items()}
 
     def state(self) -> dict[str, Tensor]:
-        """Return what decides the next update beyond the parameters: optimiser statistics, random state."""
+        """Return the training state besides the parameters: optimiser statistics and random state."""
         kind = self._spec.optimizer
         statistics = {f"{kind}/{name}": value for name, value in self._optimizer.statistics.items()}
         return {"torch_random_state": torch.get_rng_state(), **statistics}
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
-        """Continue exactly where `weights` and `state` were taken. Raises CheckpointMismatchError."""
+        """Restore a version from the results of `weights` and `state`; training then continues exactly as before.
+
+        Raises CheckpointMismatchError if they belong to another network or optimiser.
+        """
         shapes = {name: tuple(array.shape) for name, array in parameters.items()}
         expected = {name: tuple(parameter.shape) for name, parameter in self._parameters.items()}
         if shapes != expected:
-            raise CheckpointMismatchError("the checkpoint holds the parameters of another network")
+            raise CheckpointMismatchError(
+                "the parameters of the checkpoint are of another network: restore the [policy] settings of the run"
+            )
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(parameters[name].copy()))
         for name, statistic in self._optimizer.statistics.items():
             saved = state.get(f"{self._spec.optimizer}/{name}")
             if saved is None or saved.shape != statistic.shape:
-                raise CheckpointMismatchError("the checkpoint holds the statistics of another optimiser")
+                raise CheckpointMismatchError(
+                    "the statistics of the checkpoint are of another optimiser: restore training.optimizer of the run"
+                )
             statistic.copy_(saved)
         torch.set_rng_state(state["torch_random_state"])
         self.policy_version = version

@@ -1,7 +1,7 @@
-"""The two optimisers, over one flat vector of all parameters (daedalus/algorithms/flat_parameters.py).
+"""Adam and RMSProp over one flat vector of all parameters (daedalus/algorithms/flat_parameters.py).
 
-A checkpoint holds one vector for each statistic. Torch's optimiser classes import its compiler when the first one is
-constructed, which takes as long as a whole CartPole run; its functions do not.
+A checkpoint holds one vector for each statistic. This file uses torch's optimiser functions, because the first
+construction of a torch optimiser class imports torch's compiler, which takes as long as a whole CartPole run.
 """
 
 from typing import Protocol
@@ -14,17 +14,17 @@ from daedalus.protocol.spec import TrainingSpec
 
 
 class Optimizer(Protocol):
-    """Turns a gradient into a step. Its statistics are tensors, to be saved and restored by name."""
+    """Interface of an optimiser. Its statistics are tensors that a checkpoint saves and restores by name."""
 
     statistics: dict[str, Tensor]
 
     def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
-        """Moves `values` [P] in place."""
+        """Update `values` [P] in place, by one step along `gradients` [P]."""
         ...
 
 
 class Adam:
-    """Kingma & Ba (2015), algorithm 1, with the usual decays of 0.9 and 0.999: torch's, all in one pass."""
+    """Adam: Kingma & Ba (2015), algorithm 1, with decays of 0.9 and 0.999. Uses torch's fused kernel."""
 
     _FIRST, _SECOND = 0.9, 0.999
 
@@ -33,7 +33,7 @@ class Adam:
         self.statistics = {
             "mean": torch.zeros_like(values),
             "square": torch.zeros_like(values),
-            "steps": torch.zeros((), device=values.device),  # float32: it stops at 2^24, where it has no say any more
+            "steps": torch.zeros((), device=values.device),  # float32: stops at 2^24, where the bias correction is 1
         }
 
     def step(self, values: Tensor, gradients: Tensor, learning_rate: float) -> None:
@@ -60,7 +60,7 @@ class RmsProp:
     """RMSProp without momentum: g = a g + (1 - a) d^2, theta = theta - rate d / sqrt(g + epsilon).
 
     Mnih et al. (2016), equations S2 and S3. The statistics are the paper's shared ones by construction: there is
-    one learner.
+    only one learner.
     """
 
     def __init__(self, values: Tensor, epsilon: float, decay: float) -> None:
@@ -76,7 +76,7 @@ class RmsProp:
 
 
 def build_optimizer(spec: TrainingSpec, values: Tensor) -> Optimizer:
-    """Return the optimiser that the run names, for a vector of parameters [P]."""
+    """Return the optimiser named by `spec.optimizer`, for a vector of parameters [P]."""
     if spec.optimizer == "adam":
         return Adam(values, spec.optimizer_epsilon)
     return RmsProp(values, spec.optimizer_epsilon, spec.rmsprop_decay)

@@ -1,4 +1,4 @@
-"""What the updates were like, and what the batches held, since somebody last asked. State; no I/O."""
+"""Metrics of updates and batches since the last metrics row. State; no I/O."""
 
 import numpy as np
 import torch
@@ -13,7 +13,10 @@ METRICS = (*Terms._fields, GRADIENT_NORM)
 
 
 class UpdateMetrics:
-    """Sums over updates, kept on the learner's device: reading them there would wait for each update."""
+    """Sums over updates, on the learner's device.
+
+    They are read once for each metrics row, because reading them after each update would wait for the device.
+    """
 
     def __init__(self, spaces: Spaces, device: torch.device) -> None:
         self._observation = spaces.observation
@@ -23,18 +26,18 @@ class UpdateMetrics:
         self._newest: Tensor | None = None  # the first observation of the newest batch
 
     def add_update(self, terms: Terms, gradient_norm: Tensor) -> None:
-        """Count an update that changed the parameters."""
+        """Add the metrics of an update that changed the parameters."""
         self._sums += torch.stack([*terms, gradient_norm])
         self._updates += 1
 
     def add_batch(self, batch: Batch) -> None:
-        """Count the actions of a batch, and remember one of its observations."""
+        """Count the actions of a batch, and keep one of its observations."""
         self._newest = batch.observations[0, 0]
         chosen = torch.bincount(batch.actions.flatten(), batch.valid.flatten(), len(self._action_counts))
         self._action_counts += chosen.to(torch.int64)
 
     def take_means(self) -> dict[str, float]:
-        """Return means over the updates since the last call; empty if there were none."""
+        """Return means over the updates since the last call, by name; empty if there were no updates."""
         if not self._updates:
             return {}
         means = (self._sums / self._updates).tolist()
@@ -43,15 +46,15 @@ class UpdateMetrics:
         return dict(zip(METRICS, means, strict=True))
 
     def take_action_counts(self) -> list[int]:
-        """Return how often each action was chosen in the batches since the last call."""
+        """Return the number of times each action was chosen in the batches since the last call."""
         counts = self._action_counts.tolist()
         self._action_counts.zero_()
         return counts
 
     def take_observation_image(self) -> np.ndarray | None:
-        """Return an observation of the newest batch, its stack side by side: uint8 [H, W] or [H, W, 3].
+        """Return an observation of the newest batch, with its frames side by side: uint8 [H, W] or [H, W, 3].
 
-        None where observations are no images, or there was no batch since the last call.
+        Returns None if observations are not images, or without a batch since the last call.
         """
         newest, self._newest = self._newest, None
         return None if newest is None else _image(newest, self._observation)

@@ -1,1 +1,1 @@
-"""Programs and what runs them: how a policy is exported, and how an actor plays it."""
+"""Exporting a policy as a program, and running it to choose actions."""

@@ -1,25 +1,29 @@
-"""Weights made constants of a program, without the `onnx` package, which an actor does not have.
+"""Turning the weight inputs of a program into constants, without the `onnx` package, which an actor does not have.
 
-A program declares its weights as inputs. onnxruntime lays constant kernels out for the processor before it runs, which
-makes convolutions nearly twice as fast, and takes milliseconds for each snapshot. Its own `add_initializer` will not
-do: the layout is then that of the numbers that stand in the model, and not of those that were added.
+A program declares its weights as inputs. If they are constants, onnxruntime arranges convolution kernels for the
+processor when it loads the program: convolutions are then nearly twice as fast, at a cost of milliseconds for each
+snapshot. onnxruntime's `add_initializer` does not help: it arranges the values in the model, not the added ones.
 """
 
 import numpy as np
 
-# Field numbers of ONNX's messages (onnx.proto); bytes that follow a field's tag are preceded by their number.
+# Field numbers of ONNX's messages (onnx.proto). A field of bytes is its tag, the number of bytes and the bytes.
 _MODEL_IR_VERSION, _MODEL_GRAPH, _GRAPH_INITIALIZER = 1, 7, 5
 _TENSOR_DIMS, _TENSOR_DATA_TYPE, _TENSOR_NAME, _TENSOR_RAW_DATA = 1, 2, 8, 9
 _FLOAT = 1
 _VARINT, _BYTES = 0, 2  # protobuf's wire types
-# In models before version 4 an initializer of an input's name is that input's value; from 4 on merely its default.
+# Before IR version 4 an initializer with the name of an input is that input's value; from 4 on only its default.
 _IR_VERSION = 3
 
 
 def with_initializers(model: bytes, weights: dict[str, np.ndarray]) -> bytes:
-    """The program with these of its inputs set for good: float32 arrays of the inputs' shapes.
+    """Return the program with constants for some of its inputs.
 
-    Two serialized protobuf messages in a row are their merger: repeated fields add up, of others the last one counts.
+    Concatenating two serialized protobuf messages merges them: repeated fields are joined, other fields overwritten.
+
+    Args:
+      model: a serialized ONNX model.
+      weights: float32 arrays of the inputs' shapes, by the inputs' names.
     """
     tensors = [_chunk(_GRAPH_INITIALIZER, _tensor(name, array)) for name, array in weights.items()]
     graph = [part for tensor in tensors for part in tensor]
@@ -38,7 +42,7 @@ def _tensor(name: str, array: np.ndarray) -> list[bytes]:
 
 
 def _chunk(field: int, parts: list[bytes]) -> list[bytes]:
-    """A field of bytes, or of a message; in parts, so that weights are copied once."""
+    """Encode a field of bytes or of a message, in parts, so that weights are copied only once."""
     return [_varint(field << 3 | _BYTES), _varint(sum(map(len, parts))), *parts]
 
 
@@ -47,7 +51,7 @@ def _number(field: int, value: int) -> list[bytes]:
 
 
 def _varint(value: int) -> bytes:
-    """Seven bits a byte, the lowest first; the top bit says that more follow."""
+    """Encode an integer with seven bits a byte, lowest first; the top bit marks that more bytes follow."""
     encoded = bytearray()
     while value > 0x7F:
         encoded.append(value & 0x7F | 0x80)

@@ -1,8 +1,7 @@
-"""Torch network -> ONNX program: the acting half of the forward pass, its weights left open.
+"""Exporting a torch network as an ONNX program: the part of the forward pass that acting needs, without weights.
 
-Weights become inputs of the program, named like the parameters; a runtime binds those of a snapshot. So the
-program travels once, and any torch module whose acting half can be exported runs where torch is not
-installed.
+The weights are inputs of the program, named like the parameters; a runtime binds the weights of a snapshot. So the
+program travels once, and every torch module that can be exported runs where torch is not installed.
 """
 
 import io
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.acting.runtime import LOGITS, NEXT_STATE, OBSERVATIONS, STATE, OnnxRuntime, PolicyError
+from daedalus.policy.acting.runtime import NEXT_STATE, OBSERVATIONS, STATE, OnnxRuntime, PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.errors import NetworkError
@@ -22,24 +21,25 @@ _OPSET = 17
 
 
 class _Acting(nn.Module):
-    """The network, called by its acting half; shares parameters and their names."""
+    """A module whose `forward` is the network's `act`; shares the parameters and their names."""
 
     def __init__(self, network: ActorCritic) -> None:
         super().__init__()
-        self._network = [network]  # in a list, so that parameters keep their own names
+        self._network = [network]  # in a list, so that it is not registered and parameters keep their names
         for name, child in network.named_children():
             self.add_module(name, child)
 
     def forward(self, observations: Tensor, state: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        logits, next_state = self._network[0].act(observations, state)
-        return (logits, next_state) if self._network[0].state_size else logits
+        parameters, next_state = self._network[0].act(observations, state)
+        return (parameters, next_state) if self._network[0].state_size else parameters
 
 
 def export_program(network: ActorCritic, observation: ArraySpace) -> bytes:
-    """The program of a network.
+    """Return the ONNX program of a network.
 
-    `observations` [N, *stacked_shape] and weights in, `logits` [N, A] out; with a memory also `state` [N, S] in and
-    `next_state` [N, S] out. Raises NetworkError if a user's encoder cannot be exported.
+    Its inputs are `observations` [N, *stacked_shape] and the weights; its output holds the parameters of the action
+    distributions [N, P] (`logits` [N, A] for a discrete space). A network with a memory adds the input `state` [N, S]
+    and the output `next_state` [N, S]. Raises NetworkError if a user's encoder cannot be exported.
     """
     if not isinstance(network.encoder, CustomEncoder):
         return _export(network, observation)
@@ -48,8 +48,8 @@ def export_program(network: ActorCritic, observation: ArraySpace) -> bytes:
         weights = {name: parameter.detach().cpu().numpy() for name, parameter in network.named_parameters()}
         OnnxRuntime(program).load(weights)
     except PolicyError as error:
-        raise NetworkError(f"the program made of the encoder is of no use to actors: {error}") from None
-    except Exception as error:  # the exporter calls the user's code, and raises whatever that does
+        raise NetworkError(f"actors cannot run the program of the encoder: {error}") from None
+    except Exception as error:  # the exporter calls the user's code, which may raise anything
         first_line = next(iter(str(error).strip().splitlines()), "")
         raise NetworkError(f"the encoder cannot be exported to ONNX: {type(error).__name__}: {first_line}") from error
     return program
@@ -59,12 +59,13 @@ def _export(network: ActorCritic, observation: ArraySpace) -> bytes:
     device = next(network.parameters()).device
     observations = torch.zeros((2, *observation.stacked_shape), dtype=getattr(torch, observation.dtype), device=device)
     state = torch.zeros((2, network.state_size), device=device)
-    inputs, outputs = (
-        ([OBSERVATIONS, STATE], [LOGITS, NEXT_STATE]) if network.state_size else ([OBSERVATIONS], [LOGITS])
-    )
-    program: Any = io.BytesIO()  # torch takes a file, whatever its annotation says
+    parameters = network.distribution.program_output
+    inputs, outputs = [OBSERVATIONS], [parameters]
+    if network.state_size:
+        inputs, outputs = [OBSERVATIONS, STATE], [parameters, NEXT_STATE]
+    program: Any = io.BytesIO()  # torch accepts a file, although its annotation does not
     with warnings.catch_warnings(), torch.no_grad():
-        # The TorchScript exporter is deprecated, and a fifth of a second; its successor takes several times that.
+        # The TorchScript exporter is deprecated, but takes 0.2 s; its successor takes several times as long.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             _Acting(network),
@@ -72,9 +73,9 @@ def _export(network: ActorCritic, observation: ArraySpace) -> bytes:
             program,
             dynamo=False,
             export_params=False,
-            # Without this the exporter makes one input of parameters that hold the same numbers, as new biases do.
+            # Otherwise the exporter merges parameters with equal values, such as new biases, into one input.
             keep_initializers_as_inputs=True,
-            # It would make weights of its own of what is computed from weights alone.
+            # Folding would turn values computed from weights alone into constants.
             do_constant_folding=False,
             opset_version=_OPSET,
             input_names=inputs,

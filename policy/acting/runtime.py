@@ -1,7 +1,6 @@
-"""What an actor asks of a policy: load a snapshot, act. OnnxRuntime is the one for everywhere.
+"""The runtime of a policy at an actor: loads snapshots and chooses actions. OnnxRuntime is the default.
 
-TorchRuntime (policy/acting/torch_runtime.py) does the same with the network itself, for those who have torch
-at the actor anyway.
+TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actors that have torch installed.
 """
 
 import hashlib
@@ -12,41 +11,41 @@ import numpy as np
 import onnxruntime
 
 from daedalus.policy.acting.onnx_initializers import with_initializers
-from daedalus.policy.acting.sampling import greedy_categorical, sample_categorical
+from daedalus.policy.acting.sampling import SAMPLERS
 
 OBSERVATIONS, STATE = "observations", "state"
-LOGITS, NEXT_STATE = "logits", "next_state"
+NEXT_STATE = "next_state"
 _MAX_STATE_SIZE = 1 << 16
 
 
 class PolicyError(Exception):
-    """A program or weights that do not fit together, or not the spaces; the sender's fault."""
+    """A program or weights that do not fit together or do not fit the spaces: a fault of the sender."""
 
 
 class PolicyRuntime(Protocol):
-    """A policy that can act. One owner, no threads."""
+    """Policy that can act. It has one owner and is not safe to share between threads."""
 
     @property
     def state_size(self) -> int:
-        """S, how many numbers the policy remembers from row to row; 0 for most."""
+        """S, the size of the policy's memory; 0 for a policy without one."""
         ...
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
-        """Binds weights for all later calls; raises PolicyError if they do not fit.
+        """Use these weights in all later calls. Raises PolicyError if names, shapes or dtypes do not fit.
 
-        They are not copied: whoever gives them away does not change them any more.
+        The arrays are not copied: the caller must not change them afterwards.
         """
         ...
 
     def act(
         self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Chooses one action for each observation: sampled with `random`, the most probable without.
+        """Choose one action for each observation: a sample if `random` is given, otherwise the most probable.
 
         Args:
           observations: [E, *stacked_shape].
-          state: [E, S] float32, the policy's memory before this row, zeros where an episode starts.
-          random: source of the samples, or None for greedy actions.
+          state: [E, S] float32, the policy's memory before this row; zeros where an episode starts.
+          random: source of random numbers, or None for greedy actions.
 
         Returns: actions [E] int64, their log-probabilities [E] float32, and the state [E, S] float32 for the
         next row.
@@ -55,29 +54,32 @@ class PolicyRuntime(Protocol):
 
 
 def program_hash(model: bytes) -> str:
-    """The name of a program: SHA-256 of its bytes, hexadecimal."""
+    """Return the name of a program: the SHA-256 of its bytes, in hexadecimal."""
     return hashlib.sha256(model).hexdigest()
 
 
 class OnnxRuntime:
     """Runs a program with onnxruntime on one thread.
 
-    Weights are fed as inputs with every call, which costs less than anything that could be done beforehand; except
-    where there are convolutions: their program is made anew with the weights of each snapshot as constants.
+    Weights are passed as inputs with every call, which is the fastest way for small networks. A program with
+    convolutions is instead loaded again for each snapshot, with the weights as constants.
     """
 
     def __init__(self, model: bytes) -> None:
-        """Raises PolicyError if it is no program."""
+        """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it."""
         self._model = model
         self._session = _session(model)
         inputs = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
         outputs = {entry.name: entry.type for entry in self._session.get_outputs()}
-        ends = [LOGITS, NEXT_STATE] if STATE in inputs else [LOGITS]
-        if OBSERVATIONS not in inputs or list(outputs) != ends or set(outputs.values()) != {"tensor(float)"}:
+        self._parameters = next(iter(outputs), "")  # name of the first output
+        expected = [self._parameters, NEXT_STATE] if STATE in inputs else [self._parameters]
+        known = OBSERVATIONS in inputs and self._parameters in SAMPLERS
+        if not known or list(outputs) != expected or set(outputs.values()) != {"tensor(float)"}:
             raise PolicyError(
-                f"the program must turn {OBSERVATIONS!r} into {LOGITS!r}, and {STATE!r} into {NEXT_STATE!r} "
-                "if it has a memory"
+                f"the program must compute {' or '.join(map(repr, SAMPLERS))} from {OBSERVATIONS!r}, "
+                f"and {NEXT_STATE!r} from {STATE!r} if it has a memory"
             )
+        self._sampler = SAMPLERS[self._parameters]
         del inputs[OBSERVATIONS]
         self._state_size = _state_size(inputs.pop(STATE)) if STATE in inputs else 0
         self._shapes = inputs
@@ -91,7 +93,7 @@ class OnnxRuntime:
 
     @property
     def weight_names(self) -> tuple[str, ...]:
-        """The weights that the program wants bound."""
+        """Names of the weights that the program requires."""
         return tuple(self._shapes)
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
@@ -102,7 +104,7 @@ class OnnxRuntime:
             given = weights[name]
             if given.shape != shape or given.dtype != np.float32:
                 raise PolicyError(
-                    f"weights {name!r} are {given.dtype} {given.shape}, the program wants float32 {shape}"
+                    f"weights {name!r} are {given.dtype} {given.shape}, the program requires float32 {shape}"
                 )
         bound = {name: weights[name] for name in self._shapes}
         if self._convolutional:
@@ -113,7 +115,7 @@ class OnnxRuntime:
     def act(
         self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See PolicyRuntime. Raises PolicyError if the program fails, or does not make what it should."""
+        """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
         self._feed[OBSERVATIONS] = observations
         if self._state_size:
             self._feed[STATE] = state
@@ -121,24 +123,27 @@ class OnnxRuntime:
             outputs: Any = self._session.run(None, self._feed)
         except Exception as error:  # onnxruntime's exceptions share no base of their own
             raise PolicyError(f"the program failed: {_first_line(error)}") from None
-        logits = outputs[0]  # [E, A]
-        if logits.ndim != 2 or logits.shape[0] != len(observations) or not logits.shape[1]:
-            raise PolicyError(f"the program makes {LOGITS!r} {logits.shape} of {len(observations)} observations")
+        parameters = outputs[0]  # [E, P]
+        if parameters.ndim != 2 or parameters.shape[0] != len(observations) or not parameters.shape[1]:
+            raise PolicyError(
+                f"the program returns {self._parameters!r} {parameters.shape} for {len(observations)} observations"
+            )
         if self._state_size:
             if outputs[1].shape != state.shape:
-                raise PolicyError(f"the program makes {NEXT_STATE!r} {outputs[1].shape} of {STATE!r} {state.shape}")
+                raise PolicyError(f"the program returns {NEXT_STATE!r} {outputs[1].shape} for {STATE!r} {state.shape}")
             state = outputs[1]
-        actions, log_probs = greedy_categorical(logits) if random is None else sample_categorical(logits, random)
+        sampler = self._sampler
+        actions, log_probs = sampler.mode(parameters) if random is None else sampler.sample(parameters, random)
         return actions, log_probs, state
 
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    # An actor has a core at most; threads that spin would cost the learner its own.
+    # An actor has one core at most; spinning threads would take time from other processes.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    # A model may name files to take weights from. None lie here: whoever sends a program shall not read with it.
+    # A model may name files to read weights from. A received program must not read files: no such file exists here.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     try:
         return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -150,7 +155,9 @@ def _state_size(shape: tuple[Any, ...]) -> int:
     match shape:
         case (_, int(size)) if 0 < size <= _MAX_STATE_SIZE:
             return size
-    raise PolicyError(f"the program's {STATE!r} is {shape}, it must be [rows, S] with S from 1 to {_MAX_STATE_SIZE}")
+    raise PolicyError(
+        f"the program's {STATE!r} has shape {shape}, it must be [rows, S] with S from 1 to {_MAX_STATE_SIZE}"
+    )
 
 
 def _first_line(error: Exception) -> str:

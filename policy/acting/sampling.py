@@ -1,28 +1,57 @@
-"""Action distributions in numpy, for acting. policy/network/distributions.py is the same in torch."""
+"""Drawing actions from the distributions of a policy, in numpy. policy/network/distributions.py has them in torch."""
+
+from typing import Protocol
 
 import numpy as np
 
-
-def sample_categorical(logits: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """One action from each softmax policy, by inverting its cumulative distribution.
-
-    Args:
-      logits: [E, A] float32.
-      random: where the one uniform number for each row comes from.
-
-    Returns: actions [E] int64 and their log-probabilities [E] float32.
-    """
-    shifted = logits - logits.max(axis=-1, keepdims=True)
-    cumulative = np.exp(shifted).cumsum(axis=-1)  # [E, A], not normalised
-    total = cumulative[:, -1]
-    threshold = random.random(len(logits), dtype=np.float32) * total
-    # The last column is left out: rounding may never push a sample past the last action.
-    actions = (cumulative[:, :-1] <= threshold[:, None]).sum(axis=-1)
-    return actions, shifted[np.arange(len(logits)), actions] - np.log(total)
+LOGITS = "logits"
 
 
-def greedy_categorical(logits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable action of each softmax policy; same shapes as `sample_categorical`."""
-    shifted = logits - logits.max(axis=-1, keepdims=True)
-    actions = shifted.argmax(axis=-1)
-    return actions, -np.log(np.exp(shifted).sum(axis=-1))
+class ActionSampler(Protocol):
+    """Draws actions from the parameters that a program computes."""
+
+    def sample(self, parameters: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw one action for each row.
+
+        Args:
+          parameters: [E, P] float32.
+          random: source of the random numbers.
+
+        Returns: actions [E] and their log-probabilities [E] float32.
+        """
+        ...
+
+    def mode(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the most probable action of each row and its log-probability; shapes as for `sample`."""
+        ...
+
+
+class CategoricalSampler:
+    """Samples softmax policies; the parameters are logits."""
+
+    def sample(self, parameters: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw one action from each softmax policy, by inverting its cumulative distribution.
+
+        Args:
+          parameters: logits [E, A] float32.
+          random: source of one uniform number for each row.
+
+        Returns: actions [E] int64 and their log-probabilities [E] float32.
+        """
+        shifted = parameters - parameters.max(axis=-1, keepdims=True)
+        cumulative = np.exp(shifted).cumsum(axis=-1)  # [E, A], not normalised
+        total = cumulative[:, -1]
+        threshold = random.random(len(parameters), dtype=np.float32) * total
+        # Without the last column: rounding must never push a sample past the last action.
+        actions = (cumulative[:, :-1] <= threshold[:, None]).sum(axis=-1)
+        return actions, shifted[np.arange(len(parameters)), actions] - np.log(total)
+
+    def mode(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the most probable action of each softmax policy; shapes as for `sample`."""
+        shifted = parameters - parameters.max(axis=-1, keepdims=True)
+        actions = shifted.argmax(axis=-1)
+        return actions, -np.log(np.exp(shifted).sum(axis=-1))
+
+
+# By the name of the program's output that holds the parameters.
+SAMPLERS: dict[str, ActionSampler] = {LOGITS: CategoricalSampler()}

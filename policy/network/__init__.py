@@ -1,1 +1,1 @@
-"""The network, in torch. An actor that plays the exported program imports none of these files."""
+"""The network in torch. An actor that runs the exported program imports none of these files."""

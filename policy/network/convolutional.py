@@ -1,4 +1,4 @@
-"""The encoders of images. `uint8` observations count as numbers from 0 to 1."""
+"""Encoders of images. `uint8` observations are scaled to [0, 1]."""
 
 import math
 from collections.abc import Callable
@@ -12,16 +12,24 @@ from daedalus.policy.network.images import ImageLayout, as_floats
 from daedalus.policy.network.layers import BytesConv2d, PReLU, orthogonal
 from daedalus.protocol.spaces import ArraySpace
 
-_GAIN = math.sqrt(2.0)  # of a layer before a rectifier
+_GAIN = math.sqrt(2.0)  # of a layer followed by a ReLU
 
 
 class ImageEncoder(nn.Module):
-    """Convolutions, then a head over all that they leave of an image: [N, *stacked_shape] -> [N, features]."""
+    """Convolutions, then a head on their flattened output: [N, *stacked_shape] -> [N, features]."""
 
     def __init__(
         self, layout: ImageLayout, convolutions: nn.Sequential, head: Callable[[int], tuple[nn.Module, int]]
     ) -> None:
-        """`head` makes the head for a number of inputs, and says how many outputs it has."""
+        """Build the encoder.
+
+        Args:
+          layout: how observations become images.
+          convolutions: [N, C, H, W] -> [N, C', H', W'].
+          head: takes the number of inputs; returns the head and its number of outputs.
+
+        Raises NetworkError if the images are too small for the convolutions.
+        """
         super().__init__()
         self.layout = layout
         self.convolutions = convolutions
@@ -30,32 +38,32 @@ class ImageEncoder(nn.Module):
                 inputs = convolutions(torch.zeros(1, *layout.shape)).numel()
         except RuntimeError:
             raise NetworkError(
-                f"the encoder {layout.encoder!r} leaves nothing of a {layout.space}: enlarge the images "
+                f"the encoder {layout.encoder!r} needs images larger than a {layout.space}: enlarge them "
                 "(environment.resize) or set policy.encoder to impala"
             ) from None
         self.head, self.features = head(inputs)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """[N, *stacked_shape] -> [N, features]."""
+        """Encode observations: [N, *stacked_shape] -> [N, features]."""
         return self.head(self.convolutions(self.layout.arrange(self.prepare(observations))).flatten(1))
 
     def prepare(self, observations: Tensor) -> Tensor:
-        """What is done to the numbers before the first convolution, which scales them."""
+        """Convert observations to the numbers that the first convolution takes; that convolution scales bytes."""
         return as_floats(observations)
 
 
 def nature(space: ArraySpace) -> ImageEncoder:
-    """The network of Mnih et al. (2015), "Human-level control through deep reinforcement learning"."""
+    """Build the network of Mnih et al. (2015), "Human-level control through deep reinforcement learning"."""
     return _atari("nature", space, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512)
 
 
 def small(space: ArraySpace) -> ImageEncoder:
-    """The network of Mnih et al. (2013), which A3C also used: a third of nature's work."""
+    """Build the network of Mnih et al. (2013), also used by A3C: a third of the computation of `nature`."""
     return _atari("small", space, ((16, 8, 4), (32, 4, 2)), 256)
 
 
 def impala(space: ArraySpace) -> ImageEncoder:
-    """The residual network of Espeholt et al. (2018), figure 3, right; without its memory."""
+    """Build the residual network of Espeholt et al. (2018), figure 3 right, without its LSTM."""
     layout = ImageLayout("impala", space)
     first = _first(space)
     stages = [_stage(first(layout.shape[0], 16, 3, padding=1))]
@@ -64,10 +72,11 @@ def impala(space: ArraySpace) -> ImageEncoder:
 
 
 class ArticleEncoder(ImageEncoder):
-    """The network of the article that this project follows, for a memory to follow on.
+    """The network of the article that this project follows, to be combined with a memory.
 
-    Its batch normalisations are normalisations of each image by itself, which are the same for one row and for many.
-    The first has no weights of its own: the convolution after it has as many, and learning through it costs much.
+    Each batch normalisation of the article is replaced by a normalisation of each image by itself, which gives the same
+    result for one row and for many. The first has no weights: the next convolution can represent them, and computing
+    gradients through it is slow.
     """
 
     def __init__(self, space: ArraySpace) -> None:
@@ -80,17 +89,17 @@ class ArticleEncoder(ImageEncoder):
             layers += [convolution, PReLU()]
         super().__init__(layout, nn.Sequential(*layers), lambda inputs: (nn.LayerNorm(inputs), inputs))
         unit = 255.0 if space.dtype == "uint8" else 1.0
-        self._epsilon = 1e-5 * unit**2  # below the variance of an image that shows anything
+        self._epsilon = 1e-5 * unit**2  # below the variance of any image that is not uniform
 
     def prepare(self, observations: Tensor) -> Tensor:
-        """Each image's numbers, brought to mean 0 and variance 1."""
-        # One group of one channel: torch is far slower at normalising what lies pixel by pixel.
+        """Normalise each image to mean 0 and variance 1."""
+        # One group of one channel: torch normalises channels_last images far more slowly.
         images = as_floats(observations).flatten(1).unsqueeze(1)
         return functional.group_norm(images, 1, eps=self._epsilon)
 
 
 def _atari(name: str, space: ArraySpace, convolutions: tuple[tuple[int, int, int], ...], units: int) -> ImageEncoder:
-    """Rectified convolutions (filters, kernel, stride), then a rectified layer of so many units."""
+    """Build convolutions (filters, kernel, stride) with ReLUs, then a fully connected layer of `units` with a ReLU."""
     layout = ImageLayout(name, space)
     inputs, make, layers = layout.shape[0], _first(space), []
     for filters, kernel, stride in convolutions:
@@ -100,7 +109,7 @@ def _atari(name: str, space: ArraySpace, convolutions: tuple[tuple[int, int, int
 
 
 class _Residual(nn.Module):
-    """x + conv(relu(conv(relu(x)))), [N, C, H, W] -> the same."""
+    """Residual block x + conv(relu(conv(relu(x)))): [N, C, H, W] -> the same shape."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -116,7 +125,7 @@ class _Residual(nn.Module):
 
 
 def _stage(convolution: nn.Conv2d) -> nn.Sequential:
-    """The convolution, pooled to half the size, and two residual blocks."""
+    """Build a convolution, max pooling to half the size, and two residual blocks."""
     channels = convolution.out_channels
     return nn.Sequential(
         orthogonal(convolution), nn.MaxPool2d(3, 2, padding=1), _Residual(channels), _Residual(channels)

@@ -1,7 +1,7 @@
-"""The user's own encoder, `module:Class`: any torch.nn.Module that a program can be made of.
+"""An encoder supplied by the user as `module:Class`: any torch.nn.Module that can be exported to ONNX.
 
 The class is constructed with one argument, the shape of an observation, frame stack included. It is called with
-observations [N, *shape] just as the environment shows them, float32 or uint8, and returns features [N, F] float32.
+observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32.
 """
 
 import importlib
@@ -16,14 +16,14 @@ from daedalus.protocol.spaces import ArraySpace
 
 
 class CustomEncoder(nn.Module):
-    """The user's module, found, constructed and tried."""
+    """The user's module, imported, constructed and checked."""
 
     def __init__(self, name: str, space: ArraySpace) -> None:
-        """Raises NetworkError, naming the encoder, if there is none of that name or it is no encoder."""
+        """Raise NetworkError, naming the encoder, if it cannot be imported, constructed or called."""
         super().__init__()
         try:
             self.module = _find(name)(space.stacked_shape)
-            self.features = _tried(self.module, space)
+            self.features = _checked_features(self.module, space)
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
@@ -31,7 +31,7 @@ class CustomEncoder(nn.Module):
             raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}") from error
 
     def forward(self, observations: Tensor) -> Tensor:
-        """[N, *stacked_shape] -> [N, features]."""
+        """Encode observations: [N, *stacked_shape] -> [N, features]."""
         return self.module(observations)
 
 
@@ -42,30 +42,30 @@ def _find(name: str) -> type[nn.Module]:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise NetworkError(f"{error}; install it, or run where {module_name}.py lies") from error
+        raise NetworkError(f"{error}; install it, or run in the folder of {module_name}.py") from error
     found = getattr(module, class_name, None)
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
         raise NetworkError(f"{module.__file__} has no torch.nn.Module {class_name!r}; name one of its classes")
     return found
 
 
-def _tried(module: nn.Module, space: ArraySpace) -> int:
-    """The features it makes of observations of zeros; raises NetworkError if it is not fit for an encoder."""
+def _checked_features(module: nn.Module, space: ArraySpace) -> int:
+    """Return the number of features, from a call with zeros. Raises NetworkError if the module is not an encoder."""
     buffers = [name for name, _ in module.named_buffers()]
     if buffers:
         raise NetworkError(
-            f"its buffer {buffers[0]!r} would not reach the actors, whom only parameters are sent: do without "
-            "(LayerNorm in place of BatchNorm)"
+            f"its buffer {buffers[0]!r} would not reach the actors, which receive only parameters: avoid buffers "
+            "(use LayerNorm instead of BatchNorm)"
         )
     zeros = torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype))
     with torch.no_grad():
         features = module(zeros)
-    said = getattr(module, "features", None)
+    declared = getattr(module, "features", None)
     if not isinstance(features, Tensor) or features.ndim != 2 or len(features) != 2:
         shape = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
-        raise NetworkError(f"makes {shape} of 2 observations {tuple(zeros.shape)}; it must return [2, features]")
+        raise NetworkError(f"returns {shape} for 2 observations {tuple(zeros.shape)}; it must return [2, features]")
     if features.dtype != torch.float32:
         raise NetworkError(f"returns {features.dtype}; it must return torch.float32")
-    if isinstance(said, int) and said != features.shape[1]:
-        raise NetworkError(f"says features={said} but returns {tuple(features.shape)}; make them agree")
+    if isinstance(declared, int) and declared != features.shape[1]:
+        raise NetworkError(f"has features={declared} but returns {tuple(features.shape)}; make them agree")
     return features.shape[1]

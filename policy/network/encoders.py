@@ -1,6 +1,6 @@
-"""The encoders by their names. Torch: the actor never imports this file.
+"""The encoders by name. Needs torch: actors do not import this file.
 
-Each is an nn.Module [N, *stacked_shape] -> [N, features] that says what `features` is.
+Each is an nn.Module [N, *stacked_shape] -> [N, features] with the attribute `features`.
 """
 
 import math
@@ -19,9 +19,9 @@ _GAIN = math.sqrt(2.0)
 
 
 class MultilayerPerceptron(nn.Module):
-    """Flattens an observation and passes it through fully connected layers, of which there may be none.
+    """Fully connected layers (possibly none) on the flattened observation: [N, *stacked_shape] -> [N, features].
 
-    [N, *stacked_shape] -> [N, features]. `uint8` observations are scaled to [0, 1].
+    `uint8` observations are scaled to [0, 1].
     """
 
     def __init__(self, space: ArraySpace, hidden: tuple[int, ...], activation: str) -> None:
@@ -36,7 +36,7 @@ class MultilayerPerceptron(nn.Module):
         self.features = width
 
     def forward(self, observations: Tensor) -> Tensor:
-        """[N, *stacked_shape] -> [N, features]."""
+        """Encode observations: [N, *stacked_shape] -> [N, features]."""
         flat = observations.flatten(1)  # [N, prod(stacked_shape)]
         if self._scale is not None:
             flat = flat.to(torch.float32) * self._scale
@@ -47,9 +47,9 @@ Encoder = MultilayerPerceptron | ImageEncoder | CustomEncoder
 
 
 def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
-    """The encoder that the specification names, for observations of the space.
+    """Return the encoder that the specification names, for observations of the space.
 
-    Raises NetworkError if there is none such, or it is not for observations like these.
+    Raises NetworkError if a custom encoder cannot be imported, or the encoder does not accept such observations.
     """
     match spec.encoder:
         case "mlp":

@@ -1,5 +1,5 @@
-"""What can be wrong with a network before it has learned anything."""
+"""Errors in building a network."""
 
 
-class NetworkError(ValueError):
+class NetworkError(Exception):
     """The network of a PolicySpec cannot be built for the spaces; the message says why and what to do."""

@@ -1,4 +1,4 @@
-"""Observations as images: from the layouts that environments show to the one that convolutions are fast on."""
+"""Arranging image observations in the memory layout on which convolutions are fast."""
 
 import torch
 from torch import Tensor
@@ -6,20 +6,20 @@ from torch import Tensor
 from daedalus.policy.network.errors import NetworkError
 from daedalus.protocol.spaces import ArraySpace
 
-_MAX_COLOURS = 4  # a last axis of at most so many holds the colours of a pixel
+_MAX_COLOURS = 4  # a last axis of at most this size holds the colours of a pixel
 
 
 class ImageLayout:
-    """How the observations of a space become [N, channels, height, width].
+    """Conversion of the observations of a space to [N, channels, height, width].
 
     A frame is (H, W), (H, W, C) with C <= 4, or (C, H, W). Stacked frames become channels, oldest first.
     """
 
     def __init__(self, encoder: str, space: ArraySpace) -> None:
-        """Raises NetworkError, naming the encoder and the space, if a frame is none of these."""
+        """Raise NetworkError, naming the encoder and the space, if a frame has none of these shapes."""
         if len(space.shape) not in (2, 3):
             raise NetworkError(
-                f"the encoder {encoder!r} sees images, (H, W), (H, W, C) or (C, H, W), and not a {space}: "
+                f"the encoder {encoder!r} takes images, (H, W), (H, W, C) or (C, H, W), not a {space}: "
                 "set policy.encoder to mlp or to your own module:Class"
             )
         self.encoder, self.space = encoder, space
@@ -30,7 +30,7 @@ class ImageLayout:
         self.shape = (space.frames * colours, height, width)
 
     def arrange(self, observations: Tensor) -> Tensor:
-        """[N, *stacked_shape] -> [N, channels, height, width], lying in memory pixel by pixel (channels_last)."""
+        """Convert [N, *stacked_shape] to [N, channels, height, width] in the memory format channels_last."""
         frames = observations.reshape(-1, *self._split)  # [N, k, C, H, W] or [N, k, H, W, C]
         if self._colours_last:
             frames = frames.permute(0, 1, 4, 2, 3)
@@ -38,7 +38,7 @@ class ImageLayout:
 
 
 def as_floats(observations: Tensor) -> Tensor:
-    """The same numbers in the precision of convolutions. A byte is exact in bfloat16, its 255th part is not."""
+    """Convert observations to the precision of convolutions. A byte is exact in bfloat16, a byte / 255 is not."""
     device = observations.device.type
-    # Not in one call with the change of layout: that takes twice as long.
+    # Separate from the change of layout: one call for both takes twice as long.
     return observations.to(torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32)

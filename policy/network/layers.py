@@ -1,4 +1,4 @@
-"""Layers that torch lacks, or has slower."""
+"""Layers that torch does not have, or that are slower in torch."""
 
 from typing import Any, TypeVar
 
@@ -10,7 +10,7 @@ Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
 def orthogonal(layer: Layer, gain: float = 1.0) -> Layer:
-    """The layer, its weights orthogonal (Saxe et al. 2014) and its biases zero."""
+    """Return the layer with orthogonal weights (Saxe et al. 2014), scaled by `gain`, and zero biases."""
     nn.init.orthogonal_(layer.weight, gain)
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
@@ -18,29 +18,29 @@ def orthogonal(layer: Layer, gain: float = 1.0) -> Layer:
 
 
 class BytesConv2d(nn.Conv2d):
-    """A convolution of bytes as numbers from 0 to 1: scales its weights, which are fewer, and in full precision."""
+    """Convolution of bytes scaled to [0, 1]. Scales the weights instead: they are fewer, and have full precision."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """[N, C, H, W] in 0 to 255 -> [N, out_channels, ...]."""
+        """Convolve images: [N, C, H, W] with values 0 to 255 -> [N, out_channels, ...]."""
         return self._conv_forward(input, self.weight * (1.0 / 255.0), self.bias)
 
 
 class PReLU(nn.Module):
-    """x where it is positive, elsewhere x times one learned slope (He et al. 2015)."""
+    """max(x, 0) + slope * min(x, 0) with one learned slope (He et al. 2015)."""
 
     def __init__(self) -> None:
         super().__init__()
         self.slope = nn.Parameter(torch.full((1,), 0.25))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """[N, C, H, W] -> the same."""
+        """Apply the function to each element: [N, C, H, W] -> the same shape."""
         if inputs.is_cuda:
             return functional.prelu(inputs, self.slope.to(inputs.dtype))
         return _Rectify.apply(inputs, self.slope)  # pyright: ignore[reportReturnType]
 
 
 class _Rectify(torch.autograd.Function):
-    """PReLU's two passes; on a CPU torch's own backward takes seven times as long."""
+    """Forward and backward pass of PReLU; on a CPU torch's backward takes seven times as long."""
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, slope: Tensor) -> Tensor:
@@ -57,12 +57,12 @@ class _Rectify(torch.autograd.Function):
 
     @staticmethod
     def symbolic(graph: Any, inputs: Any, slope: Any) -> Any:
-        """The same for the ONNX exporter: onnxruntime takes twice as long for an article network with its PRelu."""
+        """Export as Relu, Sub, Mul and Add: with PRelu, onnxruntime takes twice as long for the `article` network."""
         positive = graph.op("Relu", inputs)
         negative = graph.op("Sub", inputs, positive)
         return graph.op("Add", positive, graph.op("Mul", negative, slope)).setType(inputs.type())
 
 
 def _pixels(images: Tensor) -> Tensor:
-    """[N, C, H, W] -> [N, H * W * C]; a view where the images lie pixel by pixel (channels_last)."""
+    """Flatten [N, C, H, W] to [N, H * W * C]; a view if the images are channels_last."""
     return images.movedim(1, -1).flatten(1)

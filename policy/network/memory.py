@@ -1,4 +1,4 @@
-"""What a policy remembers between rows: nothing, or the state of a gated recurrent unit."""
+"""Memory of a policy between rows: none, or a gated recurrent unit."""
 
 from typing import Protocol
 
@@ -7,22 +7,22 @@ from torch import Tensor, nn
 
 
 class Memory(Protocol):
-    """Turns the features of a row and the state before it into what the heads see, and the state after it."""
+    """Module that maps the features of a row and the state before it to the inputs of the heads and the next state."""
 
     state_size: int  # S
-    features: int  # F', what the heads see
+    features: int  # F', the number of inputs of the heads
 
     def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """One row: features [N, F], state [N, S] -> [N, F'], next state [N, S]."""
+        """Process one row: features [N, F], state [N, S] -> [N, F'], next state [N, S]."""
         ...
 
     def unroll(self, features: Tensor, state: Tensor, starts: Tensor) -> Tensor:
-        """R rows in their order, each remembering those before it.
+        """Process R consecutive rows.
 
         Args:
           features: [R, B, F].
           state: [B, S] float32, before row 0.
-          starts: [R, B] bool, whether an episode starts with the row: it remembers nothing.
+          starts: [R, B] bool, whether an episode starts with the row; the state is then reset to zeros.
 
         Returns: [R, B, F'].
         """
@@ -30,7 +30,7 @@ class Memory(Protocol):
 
 
 class NoMemory(nn.Module):
-    """Remembers nothing: S is 0, and the heads see the features themselves."""
+    """No memory: S is 0, and the inputs of the heads are the features."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Gru(nn.Module):
         return torch.stack(states)
 
     def _next(self, inputs: Tensor, state: Tensor) -> Tensor:
-        """Projected inputs [N, 3S], state [N, S] -> next state [N, S]."""
+        """Return the next state: projected inputs [N, 3S], state [N, S] -> [N, S]."""
         input_r, input_z, input_n = inputs.split(self.state_size, -1)
         hidden_r, hidden_z, hidden_n = self.hidden(state).split(self.state_size, -1)
         reset = (input_r + hidden_r).sigmoid()

@@ -1,1 +1,1 @@
-"""Policies that ship with the package, a folder each: `daedalus evaluate --pretrained NAME`."""
+"""Policies that ship with the package, one folder each: `daedalus evaluate --pretrained NAME`."""

@@ -1,1 +1,1 @@
-"""Policies on disk: sealed directories, and the names of checkpoints."""
+"""Policies on disk: directories with checksums, and the names of checkpoints."""

@@ -1,4 +1,4 @@
-"""The best checkpoints of a run: a few that scored highest, each under its score. Names, links and renames on disk."""
+"""The best checkpoints of a run: those with the highest scores, named by their score. Functions on directories."""
 
 import math
 import os
@@ -7,54 +7,54 @@ import shutil
 from pathlib import Path
 
 _BEST = re.compile(r"best_(-?\d+\.\d)_(\d{10,})", re.ASCII)
-_KEPT = 3  # a score over few episodes flatters; more of them can be played where there is a choice
+_KEPT = 3  # scores over few episodes are noisy: with several, the best can be selected over more episodes
 
 
 def best_name(score: float, policy_version: int) -> str:
-    """What a checkpoint is called that evaluations found to be among the best: best_812.3_0000012345.
+    """Return the name of a checkpoint that is among the best, such as best_812.3_0000012345.
 
     Raises ValueError if the score is not finite.
     """
     if not math.isfinite(score):
-        raise ValueError(f"a score must be finite, not {score}")
+        raise ValueError(f"the score must be finite, not {score}")
     return f"best_{score:.1f}_{policy_version:010d}"
 
 
 def is_best(directory: Path) -> bool:
-    """Whether a checkpoint bears a `best_name`."""
+    """Return whether a checkpoint has a name made by `best_name`."""
     return _BEST.fullmatch(directory.name) is not None
 
 
 def best_score(directory: Path) -> float:
-    """The score in a `best_name`, rounded as it stands there. Raises ValueError if the name is another."""
+    """Return the rounded score in a name made by `best_name`. Raises ValueError for another name."""
     return _score_and_version(directory)[0]
 
 
 def best_checkpoints(run_directory: Path) -> list[Path]:
-    """The checkpoints of a run that bear a score, the best first, of equals the newest."""
+    """Return the checkpoints of a run that have a score, best first; of equal scores the newest first."""
     folder = run_directory / "checkpoints"
     scored = [entry for entry in folder.iterdir() if is_best(entry)] if folder.is_dir() else []
     return sorted(scored, key=_score_and_version, reverse=True)
 
 
 def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
-    """Keeps a checkpoint under its score if no version of it is, and it is among the best; whether it is the best.
+    """Keep a checkpoint under its score if it is among the best and its version is not kept yet.
 
-    Those that it displaces go once it is there. Raises OSError if the disk refuses.
+    Removes the checkpoints that it displaces. Returns whether it is the best. Raises OSError if writing fails.
     """
     target = checkpoint.with_name(best_name(score, policy_version))
     kept = best_checkpoints(checkpoint.parent.parent)
-    place = sum(_score_and_version(other)[0] >= best_score(target) for other in kept)
-    if place >= _KEPT or any(_score_and_version(other)[1] == policy_version for other in kept):
+    rank = sum(_score_and_version(other)[0] >= best_score(target) for other in kept)
+    if rank >= _KEPT or any(_score_and_version(other)[1] == policy_version for other in kept):
         return False
     _link(checkpoint, target)
     for other in kept[_KEPT - 1 :]:
         shutil.rmtree(other, ignore_errors=True)
-    return place == 0
+    return rank == 0
 
 
 def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
-    """Gives a checkpoint another score; where it lies then. Raises OSError if the disk refuses."""
+    """Give a checkpoint another score and return its new path. Raises OSError if writing fails."""
     target = checkpoint.with_name(best_name(score, policy_version))
     if target != checkpoint:
         _link(checkpoint, target)
@@ -64,11 +64,11 @@ def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
 
 
 def _link(checkpoint: Path, target: Path) -> None:
-    """The same files under another name, at once or not at all. Raises OSError if the disk refuses."""
-    begun = target.with_name(f".{target.name}")
-    shutil.rmtree(begun, ignore_errors=True)
-    shutil.copytree(checkpoint, begun, copy_function=os.link)
-    os.replace(begun, target)
+    """Create `target` atomically with hard links to the files of `checkpoint`. Raises OSError if writing fails."""
+    partial = target.with_name(f".{target.name}")
+    shutil.rmtree(partial, ignore_errors=True)
+    shutil.copytree(checkpoint, partial, copy_function=os.link)
+    os.replace(partial, target)
 
 
 def _score_and_version(directory: Path) -> tuple[float, int]:

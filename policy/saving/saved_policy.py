@@ -1,8 +1,8 @@
-"""The part of a checkpoint that can play: program, weights, and what environment they are for.
+"""Reading a policy from a checkpoint: the program, its weights, and the specification of the environment.
 
-A checkpoint (learner/training/checkpoint.py) is a sealed directory; this file knows the entries of it that acting
-needs, so that an evaluator reads them without torch and without the learner's code. It knows too by what names
-they lie: a run's by policy version, those that ship with the package by their own. The best: best_checkpoints.py.
+A checkpoint (learner/training/checkpoint.py) is a sealed directory. This file reads only the entries that acting needs,
+so an evaluator needs neither torch nor the learner's code. Checkpoints of a run are named by policy version, pretrained
+policies by their own names; best_checkpoints.py handles the best of a run.
 """
 
 import difflib
@@ -26,12 +26,12 @@ PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
 class NoPolicyError(Exception):
-    """There is no such policy; the message says what there is."""
+    """No policy has the given name; the message lists the names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SavedPolicy:
-    """A policy as it lies in a checkpoint."""
+    """A policy read from a checkpoint."""
 
     directory: Path
     policy_version: int
@@ -42,7 +42,7 @@ class SavedPolicy:
 
 
 def checkpoints(run_directory: Path) -> list[Path]:
-    """The checkpoints of a run, newest first."""
+    """Return the checkpoints of a run, newest first."""
     folder = run_directory / "checkpoints"
     if not folder.is_dir():
         return []
@@ -50,9 +50,10 @@ def checkpoints(run_directory: Path) -> list[Path]:
 
 
 def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
-    """The policy of a checkpoint; of a run directory its best, or its newest if none is or `newest` is asked for.
+    """Return the policy of a checkpoint, or the best policy of a run directory.
 
-    Damaged ones are named and passed over. Raises DamagedError if none is left.
+    The newest policy of the run is returned if no checkpoint has a score or `newest` is true. Damaged checkpoints are
+    logged and skipped. Raises DamagedError if no checkpoint is readable.
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
@@ -63,25 +64,25 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
         try:
             return read_policy(candidate)
         except DamagedError as error:
-            _logger.warning("passed over: %s", error)
-    raise DamagedError(f"{directory} has no checkpoint that can be read")
+            _logger.warning("skipped a damaged checkpoint: %s", error)
+    raise DamagedError(f"{directory} has no readable checkpoint")
 
 
 def pretrained(name: str) -> Path:
-    """The checkpoint of a policy that ships with the package. Raises NoPolicyError for an unknown name."""
+    """Return the checkpoint of a policy that ships with the package. Raises NoPolicyError for an unknown name."""
     names = sorted(entry.parent.name for entry in PRETRAINED.glob("*/manifest.json"))
     if name not in names:
         near = difflib.get_close_matches(name, names, 1, 0.5)
         hint = f"did you mean {near[0]}? " if near else ""
-        there_are = f"there are {', '.join(names)}" if names else "none ships with this release"
-        raise NoPolicyError(f"no pretrained policy {name!r}: {hint}{there_are}")
+        choices = f"choose from {', '.join(names)}" if names else "none ships with this release"
+        raise NoPolicyError(f"no pretrained policy {name!r}: {hint}{choices}")
     return PRETRAINED / name
 
 
 def export_policy(checkpoint: Path, target: Path) -> None:
-    """Writes the policy of `checkpoint`, without the learner's state, as the sealed directory `target`.
+    """Write the policy of `checkpoint`, without the learner's state, as the sealed directory `target`.
 
-    Raises DamagedError if the checkpoint is not what was written, OSError if the disk refuses.
+    Raises DamagedError if the checkpoint is damaged, OSError if writing fails.
     """
     sealed = SealedDirectory(checkpoint)
     files = {name: sealed.read(name) for name in (PROGRAM_FILE, PARAMETERS_FILE)}
@@ -89,7 +90,7 @@ def export_policy(checkpoint: Path, target: Path) -> None:
 
 
 def read_policy(directory: Path) -> SavedPolicy:
-    """The policy in one checkpoint; raises DamagedError if it is not what was written."""
+    """Return the policy in one checkpoint. Raises DamagedError if the checkpoint is damaged."""
     sealed = SealedDirectory(directory)
     try:
         return SavedPolicy(

@@ -1,8 +1,8 @@
-"""A sealed directory: files, and a manifest that tells whether they are whole.
+"""Sealed directories: files with a manifest of their checksums.
 
-Written beside its final place, synced to the disk, then renamed: it is there entirely or not at all. Every
-file's size and SHA-256 stand in `manifest.json`, whose own are kept in `seal`; reading checks them before
-anything is parsed. Nothing in it can execute: bytes, JSON, safetensors.
+A directory is written under a temporary name, synced to the disk and then renamed, so it exists completely or not at
+all. `manifest.json` holds the size and SHA-256 of every file, and `seal` the SHA-256 of the manifest. Reading checks
+them before anything is parsed. No content can execute: raw bytes, JSON and safetensors.
 """
 
 import hashlib
@@ -17,51 +17,56 @@ _MAX_MANIFEST_BYTES = 16 << 20
 
 
 class DamagedError(Exception):
-    """A sealed directory that is not what was written."""
+    """A sealed directory that is missing, incomplete or changed."""
 
 
 def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, Any]) -> None:
-    """Writes `files` and `content` (kept in the manifest) as the sealed directory `directory`, atomically.
+    """Write a sealed directory atomically.
 
-    Raises OSError if the disk refuses; then nothing is left behind.
+    Args:
+      directory: its path; an existing directory is replaced.
+      files: contents by file name.
+      content: JSON values that are kept in the manifest.
+
+    Raises OSError if writing fails; then no partial directory remains.
     """
     entries = {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()}
     manifest = json.dumps({"files": entries, "content": content}, indent=1).encode()
     seal = hashlib.sha256(manifest).hexdigest().encode()
-    beside = directory.with_name(f".{directory.name}.{os.getpid()}.partial")
-    shutil.rmtree(beside, ignore_errors=True)
+    partial = directory.with_name(f".{directory.name}.{os.getpid()}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
     try:
-        beside.mkdir(parents=True)
+        partial.mkdir(parents=True)
         for name, data in {**files, _MANIFEST: manifest, _SEAL: seal}.items():
-            _write_synced(beside / name, data)
-        _sync_directory(beside)
-        _put_in_place(beside, directory)
+            _write_synced(partial / name, data)
+        _sync_directory(partial)
+        _move_into_place(partial, directory)
         _sync_directory(directory.parent)
     except OSError:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
         raise
 
 
-def _put_in_place(beside: Path, directory: Path) -> None:
-    """Renames; what was there under that name (the same version, saved again) stays if that fails."""
+def _move_into_place(partial: Path, directory: Path) -> None:
+    """Rename `partial` to `directory`; restore an existing directory of that name if renaming fails."""
     if not directory.exists():
-        os.replace(beside, directory)
+        os.replace(partial, directory)
         return
-    aside = directory.with_name(f".{directory.name}.{os.getpid()}.replaced")
-    os.replace(directory, aside)
+    replaced = directory.with_name(f".{directory.name}.{os.getpid()}.replaced")
+    os.replace(directory, replaced)
     try:
-        os.replace(beside, directory)
+        os.replace(partial, directory)
     except OSError:
-        os.replace(aside, directory)
+        os.replace(replaced, directory)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 class SealedDirectory:
-    """A sealed directory whose manifest was verified; files are verified as they are read."""
+    """A sealed directory with a verified manifest; each file is verified when it is read."""
 
     def __init__(self, directory: Path) -> None:
-        """Raises DamagedError, naming the directory, if the manifest is missing or was changed."""
+        """Raise DamagedError, naming the directory, if the manifest is missing or damaged."""
         self._directory = directory
         try:
             if (directory / _MANIFEST).stat().st_size > _MAX_MANIFEST_BYTES:
@@ -77,19 +82,19 @@ class SealedDirectory:
         self.content: dict[str, Any] = parsed["content"]
 
     def read(self, name: str) -> bytes:
-        """The bytes of a file; raises DamagedError if they are not those that were written."""
+        """Return the bytes of a file. Raises DamagedError if it is missing or damaged."""
         entry = self._files.get(name)
         if entry is None:
-            raise DamagedError(f"{self._directory}: has no {name}")
+            raise DamagedError(f"{self._directory}: no file {name}")
         try:
             size = (self._directory / name).stat().st_size
             if size != entry["bytes"]:
-                raise DamagedError(f"{self._directory / name}: {size} bytes, {entry['bytes']} were written")
+                raise DamagedError(f"{self._directory / name}: {size} bytes instead of {entry['bytes']}")
             data = (self._directory / name).read_bytes()
         except OSError as error:
             raise DamagedError(f"{self._directory / name}: {error.strerror}") from None
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise DamagedError(f"{self._directory / name}: damaged, its checksum differs")
+            raise DamagedError(f"{self._directory / name}: damaged: the checksum differs")
         return data
 
 

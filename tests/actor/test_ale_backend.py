@@ -1,4 +1,4 @@
-"""ALE's own vectorised Atari games."""
+"""The backend `ale`."""
 
 import sys
 
@@ -17,16 +17,16 @@ def _spec(name: str, **fields) -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("name", ["Pong", "Pong-v5", "ALE/Pong-v5", "pong"])
-def test_a_game_goes_by_its_usual_names(name: str) -> None:
+def test_game_is_found_by_its_usual_names(name: str) -> None:
     environments = make_environments(_spec(name, grey=True, resize=(84, 84), frame_stack=4), 2)
     assert environments.spaces.observation.stacked_shape == (4, 84, 84)
     assert environments.spaces.action.count == 6
     environments.close()
 
 
-def test_a_game_of_several_words() -> None:
+def test_game_with_a_name_of_several_words_is_found() -> None:
     environments = make_environments(_spec("ALE/MsPacman-v5"), 1)
-    assert environments.spaces.action.count == 9  # eight directions and none; Pong has 6
+    assert environments.spaces.action.count == 9  # eight directions and no move; Pong has 6
     environments.close()
 
 
@@ -34,7 +34,7 @@ def test_a_game_of_several_words() -> None:
     ("fields", "shape"),
     [({}, (210, 160, 3)), ({"grey": True}, (210, 160)), ({"resize": (50, 40)}, (50, 40, 3))],
 )
-def test_frames_are_single_and_shaped_as_asked(fields: dict, shape: tuple[int, ...]) -> None:
+def test_frames_are_single_and_have_the_specified_shape(fields: dict, shape: tuple[int, ...]) -> None:
     environments = make_environments(_spec("Pong", action_repeat=4, **fields), 2)
     first = environments.reset(2**32 - 1)
     before = first.copy()
@@ -47,7 +47,7 @@ def test_frames_are_single_and_shaped_as_asked(fields: dict, shape: tuple[int, .
     environments.close()
 
 
-def test_the_limit_is_in_frames_and_the_next_step_resets() -> None:
+def test_episode_limit_counts_frames_and_the_next_step_resets() -> None:
     environments = make_environments(_spec("Pong", action_repeat=4, max_episode_steps=10, grey=True), 2)
     environments.reset(1)
     rows = [environments.step(np.full(2, row % 6)) for row in range(8)]
@@ -56,7 +56,7 @@ def test_the_limit_is_in_frames_and_the_next_step_resets() -> None:
     environments.close()
 
 
-def test_rewards_are_true() -> None:
+def test_rewards_are_not_clipped() -> None:
     """A target of Space Invaders is worth 5 points or more."""
     environments = make_environments(_spec("SpaceInvaders", action_repeat=4, grey=True, resize=(84, 84)), 2)
     environments.reset(1)
@@ -69,23 +69,23 @@ def test_rewards_are_true() -> None:
     ("spec", "reason"),
     [
         (_spec("Ponk"), "unknown environment 'Ponk': did you mean Pong"),
-        (_spec("Pong", kwargs={"no_such_option": 1}), "cannot be made.*no_such_option"),
-        (_spec("Pong", kwargs={"stack_num": 4}), "cannot be made.*stack_num"),
+        (_spec("Pong", kwargs={"no_such_option": 1}), "cannot be created.*no_such_option"),
+        (_spec("Pong", kwargs={"stack_num": 4}), "cannot be created.*stack_num"),
         (
             _spec("Pong", no_reward_limit=3),
-            "does not do environment.no_reward_limit: .*--set environment.backend=gymnasium",
+            "does not support environment.no_reward_limit: .*--set environment.backend=gymnasium",
         ),
-        (_spec("Pong", crop=(1, 1, 1, 1)), "does not do environment.crop"),
-        (_spec("Pong", action_table=((1.0,), (2.0,))), "does not do environment.action_table"),
+        (_spec("Pong", crop=(1, 1, 1, 1)), "does not support environment.crop"),
+        (_spec("Pong", action_table=((1.0,), (2.0,))), "does not support environment.action_table"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:
+def test_setup_error_is_one_line(spec: EnvironmentSpec, reason: str) -> None:
     with pytest.raises(EnvironmentSetupError, match=reason) as caught:
         make_environments(spec, 2)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_ale_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ale_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ale_py.roms", None)
     with pytest.raises(EnvironmentSetupError, match=r'"daedalus-rl\[atari\]".*--set environment.backend=gymnasium'):
         make_environments(_spec("Pong"), 1)

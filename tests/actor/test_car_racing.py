@@ -1,4 +1,4 @@
-"""CarRacing drawn late and as a sketch, beside gymnasium's own."""
+"""CarRacing rendered on demand and by the fast renderer, compared with gymnasium's own."""
 
 import itertools
 import sys
@@ -12,7 +12,7 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
 TABLE = ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.8), (-0.4, 0.3, 0.0), (0.4, 0.3, 0.0))
-ROAD = slice(0, 84)  # the rows above the dashboard
+ROAD = slice(0, 84)  # the pixel rows above the dashboard
 
 
 def _spec(**fields) -> EnvironmentSpec:
@@ -54,7 +54,7 @@ def drive() -> tuple[int, list[int], int]:
     return 11, actions, 240
 
 
-def test_gymnasiums_own_is_the_same_though_drawn_late(drive: tuple[int, list[int], int]) -> None:
+def test_late_rendering_gives_the_same_episodes_and_frames(drive: tuple[int, list[int], int]) -> None:
     original, ours = _original(*drive), _ours("gymnasium", *drive)
     assert [row[1:] for row in ours] == [row[1:] for row in original]
     assert original[-1][3]
@@ -62,7 +62,7 @@ def test_gymnasiums_own_is_the_same_though_drawn_late(drive: tuple[int, list[int
         np.testing.assert_array_equal(one[0], other[0])
 
 
-def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tuple[int, list[int], int]) -> None:
+def test_fast_renderer_gives_the_same_episodes_and_similar_frames(drive: tuple[int, list[int], int]) -> None:
     original, ours = _original(*drive), _ours("fast", *drive)
     assert [row[1:] for row in ours] == [row[1:] for row in original]
     different = [np.abs(one[0][ROAD].astype(int) - other[0][ROAD]) for one, other in zip(ours, original, strict=True)]
@@ -71,16 +71,16 @@ def test_the_sketch_has_the_same_episodes_and_nearly_the_same_frames(drive: tupl
     beside_the_score = [dashboard[:, 12:] for dashboard in dashboards]
     assert max(dashboard.mean() for dashboard in beside_the_score) < 5.0
     moved = [np.abs(before[0].astype(int) - after[0]).mean() for before, after in itertools.pairwise(ours)]
-    assert np.mean(moved) > 3.0  # than which consecutive frames differ more, so that the bounds above say something
+    assert np.mean(moved) > 3.0  # consecutive frames differ by more than the bounds above
 
 
-def test_the_sketch_is_of_car_racing_only() -> None:
-    with pytest.raises(EnvironmentSetupError, match=r"fast draws CarRacing-v3 only, not CartPole-v1"):
+def test_fast_backend_supports_car_racing_only() -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"fast supports CarRacing-v3 only, not CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPole-v1", backend="fast"), 1)
 
 
 @pytest.mark.parametrize("backend", ["gymnasium", "fast"])
-def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_reported(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [
         name
         for name in sys.modules
@@ -94,12 +94,12 @@ def test_packages_that_are_missing_are_named(backend: str, monkeypatch: pytest.M
 
 
 def brightened(environment: gymnasium.Env) -> gymnasium.Env:
-    """A user's own wrapper, which looks at the frames."""
+    """A user's wrapper that reads the frames."""
     space = environment.observation_space
     return gymnasium.wrappers.TransformObservation(environment, lambda frame: np.minimum(frame, 235) + 20, space)
 
 
-def test_a_users_own_wrapper_sees_the_frames() -> None:
+def test_user_wrapper_receives_the_frames() -> None:
     plain, wrapped = make_environments(_spec(), 1), make_environments(_spec(), 1, wrap=f"{__name__}:brightened")
     try:
         np.testing.assert_array_equal(wrapped.reset(3), np.minimum(plain.reset(3), 235) + 20)

@@ -1,4 +1,4 @@
-"""actor/session/compact_snapshot_fetcher.py over the memory transport, against the learner's answers."""
+"""CompactSnapshotFetcher over the memory transport, against the learner's answers."""
 
 import queue
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from processes import LIMIT
 
-from daedalus.actor.session import compact_snapshot_fetcher as compact_snapshots
+from daedalus.actor.session import compact_snapshot_fetcher
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
 from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
 from daedalus.protocol import keys
@@ -21,7 +21,7 @@ FIRST = {"w": np.random.default_rng(1).normal(size=(500, 800)).astype(np.float32
 
 
 class Learner:
-    """Hands every request to the test, which has it answered."""
+    """A learner whose requests are answered when the test says so."""
 
     def __init__(self, network: MemoryNetwork) -> None:
         self.transport = MemoryTransport(network)
@@ -35,7 +35,7 @@ class Learner:
         return {name: array * np.float32(1 + 1e-3 * self.version) for name, array in FIRST.items()}
 
     def answer(self, count: int | None = None, *, taking: bool = True) -> list[SnapshotRequest]:
-        """Answers what was asked, and what is asked then; an actor that plays meanwhile takes nothing."""
+        """Answer all requests, and those that follow from the answers; `taking`: the actor takes what is complete."""
         asked = []
         while not self.requests.empty() and (count is None or len(asked) < count):
             request = self.requests.get()
@@ -46,14 +46,14 @@ class Learner:
             request.reply(self.cache.answer(message, encode(newest)))
             del request
             if taking:
-                self.link.take_into(self.taken)
+                self.fetcher.take_into(self.taken)
         return asked
 
-    link: "Link"
+    fetcher: "Fetcher"
     taken: list[Message]
 
 
-class Link(CompactSnapshotFetcher):
+class Fetcher(CompactSnapshotFetcher):
     def take_into(self, taken: list[Message]) -> None:
         message = self.take()
         if message is not None:
@@ -61,25 +61,25 @@ class Link(CompactSnapshotFetcher):
 
 
 @pytest.fixture
-def ends(monkeypatch: pytest.MonkeyPatch) -> tuple[Learner, Link]:
-    monkeypatch.setattr(compact_snapshots, "_RETRY_SECONDS", 0.0)
+def ends(monkeypatch: pytest.MonkeyPatch) -> tuple[Learner, Fetcher]:
+    monkeypatch.setattr(compact_snapshot_fetcher, "_RETRY_SECONDS", 0.0)
     network = MemoryNetwork()
     learner = Learner(network)
-    learner.link, learner.taken = Link(MemoryTransport(network), "r", "a", lambda: None), []
-    return learner, learner.link
+    learner.fetcher, learner.taken = Fetcher(MemoryTransport(network), "r", "a", lambda: None), []
+    return learner, learner.fetcher
 
 
-def rested(link: CompactSnapshotFetcher) -> None:
-    link._next_at = 0.0
+def end_rest(fetcher: CompactSnapshotFetcher) -> None:
+    fetcher._next_at = 0.0
 
 
-def test_the_first_is_whole_and_the_next_is_a_difference(ends: tuple[Learner, Link]) -> None:
-    learner, link = ends
+def test_first_snapshot_is_whole_and_the_next_is_a_difference(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
     sizes = []
     for version in (1, 2, 7):
         learner.version = version
-        rested(link)
-        link.want()
+        end_rest(fetcher)
+        fetcher.request_newest()
         asked = learner.answer()
         sizes.append(len(asked))
         (snapshot,) = learner.taken
@@ -92,52 +92,54 @@ def test_the_first_is_whole_and_the_next_is_a_difference(ends: tuple[Learner, Li
     assert [request.held_version for request in asked] == [2] * len(asked)
 
 
-def test_a_few_parts_are_asked_for_at_once_and_no_more(ends: tuple[Learner, Link]) -> None:
-    learner, link = ends
-    link.want()
-    link.want()  # one fetch at a time
+def test_requests_in_parallel_are_limited(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
+    fetcher.request_newest()  # one fetch at a time
     assert learner.requests.qsize() == 1
     for _ in range(3):
         learner.answer(1)
-        assert learner.requests.qsize() == compact_snapshots._AT_ONCE
+        assert learner.requests.qsize() == compact_snapshot_fetcher._PARALLEL_PARTS
 
 
-def test_a_fetch_goes_on_while_the_actor_plays(ends: tuple[Learner, Link]) -> None:
-    learner, link = ends
-    link.want()
-    assert len(learner.answer(taking=False)) > compact_snapshots._AT_ONCE
-    rested(link)
-    link.want()  # not before this one was taken: the next is a difference to it
+def test_fetch_continues_while_the_actor_collects(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
+    assert len(learner.answer(taking=False)) > compact_snapshot_fetcher._PARALLEL_PARTS
+    end_rest(fetcher)
+    fetcher.request_newest()  # not before this snapshot was taken: the next is a difference to it
     assert learner.requests.empty()
-    assert isinstance(link.take(), Snapshot)
-    assert link.take() is None
+    assert isinstance(fetcher.take(), Snapshot)
+    assert fetcher.take() is None
 
 
-def test_the_link_rests_for_as_long_as_it_worked(ends: tuple[Learner, Link], monkeypatch: pytest.MonkeyPatch) -> None:
-    learner, link = ends
+def test_link_rests_for_as_long_as_the_fetch_took(
+    ends: tuple[Learner, Fetcher], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner, fetcher = ends
     now = 100.0
-    monkeypatch.setattr(compact_snapshots.time, "monotonic", lambda: now)
-    link.want()
+    monkeypatch.setattr(compact_snapshot_fetcher.time, "monotonic", lambda: now)
+    fetcher.request_newest()
     now = 107.0
     learner.answer()
     assert len(learner.taken) == 1
     for now, asks in ((113.9, 0), (114.1, 1)):  # noqa: B007 - the clock reads it
-        link.want()
+        fetcher.request_newest()
         assert learner.requests.qsize() == asks
 
 
-def test_a_lost_part_begins_it_anew_and_its_late_answers_count_for_nothing(ends: tuple[Learner, Link]) -> None:
-    learner, link = ends
-    link.want()
+def test_lost_part_restarts_the_fetch_and_late_answers_are_ignored(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
     learner.answer(1)
     lost = learner.requests.get()
     late = [learner.requests.get() for _ in range(learner.requests.qsize())]
-    del lost  # forgotten by who served it: no answer
-    assert link.take() is None
+    del lost  # dropped without an answer
+    assert fetcher.take() is None
     for request in late:
         request.reply(b"junk")
-    rested(link)
-    link.want()
+    end_rest(fetcher)
+    fetcher.request_newest()
     learner.answer()
     assert len(learner.taken) == 1
 
@@ -152,19 +154,19 @@ def only_part(data: bytes, parts: int = 1) -> bytes:
     [b"junk", only_part(b"x", 2**40), only_part(b"x"), only_part(encode(RunEnded(learner_epoch=5, reason="")))],
     ids=["junk", "too many parts", "a part of nothing", "a part of something else"],
 )
-def test_nonsense_is_given_up_and_asked_for_anew(ends: tuple[Learner, Link], answer: bytes) -> None:
-    learner, link = ends
-    link.want()
+def test_invalid_answer_ends_the_fetch_and_the_next_succeeds(ends: tuple[Learner, Fetcher], answer: bytes) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
     learner.requests.get().reply(answer)
-    assert link.take() is None
-    rested(link)
-    link.want()
+    assert fetcher.take() is None
+    end_rest(fetcher)
+    fetcher.request_newest()
     learner.answer()
     assert len(learner.taken) == 1
 
 
-def test_a_farewell_is_passed_on(ends: tuple[Learner, Link]) -> None:
-    learner, link = ends
-    link.want()
+def test_run_ended_is_passed_on(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
     learner.requests.get(timeout=LIMIT).reply(encode(RunEnded(learner_epoch=5, reason="over")))
-    assert link.take() == RunEnded(learner_epoch=5, reason="over")
+    assert fetcher.take() == RunEnded(learner_epoch=5, reason="over")

@@ -1,4 +1,4 @@
-"""What can be played, and what is said about what cannot."""
+"""make_environments: what it creates, and its errors."""
 
 import warnings
 from typing import Literal
@@ -25,7 +25,7 @@ from daedalus.protocol.spec import EnvironmentSpec
     ],
 )
 def test_environments_follow_the_next_step_rule(name: str, backend: Literal["gymnasium", "envpool", "ale"]) -> None:
-    """After an end: a row with reward 0 that shows the first observation next; the same for every way of stepping."""
+    """After an episode's end a step has reward 0 and observes the first frame, with every backend."""
     _needs(backend)
     environments = make_environments(EnvironmentSpec(id=name, backend=backend, max_episode_steps=4), 2)
     observations = environments.reset(5)
@@ -39,7 +39,7 @@ def test_environments_follow_the_next_step_rule(name: str, backend: Literal["gym
 
 
 @pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
-def test_a_reset_row_ignores_its_action(backend: Literal["gymnasium", "envpool"]) -> None:
+def test_reset_step_ignores_its_action(backend: Literal["gymnasium", "envpool"]) -> None:
     _needs(backend)
     starts = []
     for action in (0, 1):
@@ -50,27 +50,27 @@ def test_a_reset_row_ignores_its_action(backend: Literal["gymnasium", "envpool"]
         starts.append(environments.step(np.full(2, action))[0])
         environments.close()
     np.testing.assert_array_equal(*starts)
-    assert (np.abs(starts[0]) <= 0.05).all(), "CartPole starts within 0.05 of the middle"
+    assert (np.abs(starts[0]) <= 0.05).all(), "CartPole starts within 0.05 of zero"
 
 
 def _needs(backend: str) -> None:
     if backend != "gymnasium":
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # envpool's, of its own spaces
+            warnings.simplefilter("ignore", UserWarning)  # envpool warns about its own spaces
             pytest.importorskip({"envpool": "envpool", "ale": "ale_py.vector_env"}[backend])
 
 
-def test_an_unknown_environment_is_named_with_near_matches() -> None:
+def test_unknown_environment_error_suggests_close_matches() -> None:
     with pytest.raises(EnvironmentSetupError, match="unknown environment 'CartPoll-v1': did you mean CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPoll-v1"), 1)
 
 
-def test_a_module_that_is_not_there_is_named() -> None:
+def test_missing_module_is_named() -> None:
     with pytest.raises(EnvironmentSetupError, match="cannot import no_such_module"):
         make_environments(EnvironmentSpec(id="no_such_module:Mine-v0"), 1)
 
 
-def test_continuous_actions_want_a_table() -> None:
+def test_continuous_actions_require_a_table() -> None:
     with pytest.raises(
         EnvironmentSetupError, match=r"action space Box.*must be Discrete.*environment.action_table, 1 number"
     ):
@@ -84,18 +84,20 @@ def test_continuous_actions_want_a_table() -> None:
         (((0.0,), (-2.0,), (2.5,)), r"row 2 is \(2.5,\), outside action space Box"),
     ],
 )
-def test_a_table_that_does_not_fit_is_told_beside_the_space(table: tuple, reason: str) -> None:
+def test_table_that_does_not_fit_is_reported_with_the_space(table: tuple, reason: str) -> None:
     with pytest.raises(EnvironmentSetupError, match=f"environment.action_table {reason}"):
         make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
 
 
-def test_a_table_over_choices_is_refused() -> None:
-    with pytest.raises(EnvironmentSetupError, match=r"action_table has 2 rows, but action space Discrete\(2\).*leave"):
+def test_table_over_a_discrete_space_is_refused() -> None:
+    with pytest.raises(
+        EnvironmentSetupError, match=r"action_table has 2 rows, but action space Discrete\(2\) needs no table"
+    ):
         make_environments(EnvironmentSpec(id="CartPole-v1", action_table=((0.0,), (1.0,))), 1)
 
 
-def test_a_table_names_the_actions() -> None:
-    """Pendulum pays for its torque: 0.001 of its square."""
+def test_table_rows_are_the_actions() -> None:
+    """Pendulum's reward decreases by 0.001 of the squared torque."""
     rewards = []
     for table in (((0.0,), (0.0,)), ((0.0,), (2.0,))):
         environments = make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
@@ -105,26 +107,26 @@ def test_a_table_names_the_actions() -> None:
     assert rewards[0] - rewards[1] == pytest.approx(0.004)
 
 
-def test_observations_that_do_not_travel_are_named() -> None:
+def test_unsupported_observation_space_is_named() -> None:
     with pytest.raises(EnvironmentSetupError, match=r"observation space Discrete.*must be a Box"):
         make_environments(EnvironmentSpec(id="Taxi-v4"), 1)
 
 
 @pytest.mark.parametrize("backend", ["envpool", "ale"])
-def test_what_only_gymnasium_does_is_refused(backend: Literal["envpool", "ale"]) -> None:
-    with pytest.raises(EnvironmentSetupError, match=f"backend={backend} does not do wrap"):
+def test_other_backends_refuse_gymnasium_options(backend: Literal["envpool", "ale"]) -> None:
+    with pytest.raises(EnvironmentSetupError, match=f"backend={backend} does not support wrap"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, wrap="module:function")
-    with pytest.raises(EnvironmentSetupError, match="does not do render_mode"):
+    with pytest.raises(EnvironmentSetupError, match="does not support render_mode"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, render_mode="human")
 
 
-def test_a_keyword_that_the_environment_does_not_take_is_told() -> None:
-    with pytest.raises(EnvironmentSetupError, match=r"cannot be made.*no_such_option"):
+def test_unknown_keyword_argument_is_named() -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"cannot be created.*no_such_option"):
         make_environments(EnvironmentSpec(id="Acrobot-v1", kwargs={"no_such_option": 1}), 1)
 
 
 class _StartsAtFive(gymnasium.Env):
-    """Takes the actions 5 and 6, and nothing else."""
+    """An environment with the actions 5 and 6 only."""
 
     observation_space = gymnasium.spaces.Box(0, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2, start=5)
@@ -137,7 +139,7 @@ class _StartsAtFive(gymnasium.Env):
         return np.zeros(1, np.float32), float(action), False, False, {}
 
 
-def test_choices_are_numbered_from_zero_whatever_the_environments_start() -> None:
+def test_action_indices_start_at_zero_for_a_discrete_space_that_does_not() -> None:
     gymnasium.register("StartsAtFive-v0", lambda **_kwargs: _StartsAtFive())
     environments = make_environments(EnvironmentSpec(id="StartsAtFive-v0"), 2)
     environments.reset(1)

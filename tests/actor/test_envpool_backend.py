@@ -1,4 +1,4 @@
-"""envpool's environments, held against a pool stepped one by one."""
+"""The backend `envpool`, compared with a pool whose environments are stepped one by one."""
 
 import sys
 import warnings
@@ -25,7 +25,7 @@ def _spec(name: str, **fields) -> EnvironmentSpec:
 
 
 class _OneByOne:
-    """The slow oracle: each environment of an identical pool stepped by itself, once at a time, resetting by itself."""
+    """The slow oracle: each environment of an identical pool is stepped and reset individually."""
 
     def __init__(self, name: str, count: int, seed: int, repeat: int, limit: int) -> None:
         with warnings.catch_warnings():
@@ -53,8 +53,10 @@ class _OneByOne:
     ("name", "table", "limit", "rows"), [("CartPole-v1", None, 18, 100), ("CarRacing-v3", GAS, 11, 12)]
 )
 @pytest.mark.parametrize("repeat", [1, 4])
-def test_repeats_are_what_single_steps_are(name: str, table: tuple | None, limit: int, rows: int, repeat: int) -> None:
-    """Frames, rewards and ends of every row, the reset rows and the ends amid a repeat among them."""
+def test_repeated_actions_equal_single_steps(
+    name: str, table: tuple | None, limit: int, rows: int, repeat: int
+) -> None:
+    """Frames, rewards and ends of every row, including reset rows and ends in the middle of a repeat."""
     count = 3
     environments = make_environments(_spec(name, action_repeat=repeat, max_episode_steps=limit, action_table=table), 3)
     oracle = _OneByOne(name, count, seed=5, repeat=repeat, limit=limit)
@@ -73,7 +75,7 @@ def test_repeats_are_what_single_steps_are(name: str, table: tuple | None, limit
     environments.close()
 
 
-def test_an_episode_cut_by_patience_starts_anew_at_the_next_step() -> None:
+def test_episode_truncated_by_no_reward_limit_resets_at_the_next_step() -> None:
     """MountainCar rewards every step with -1 and starts at rest, between -0.6 and -0.4."""
     environments = make_environments(_spec("MountainCar-v0", no_reward_limit=3, action_repeat=2), 2)
     environments.reset(1)
@@ -87,18 +89,18 @@ def test_an_episode_cut_by_patience_starts_anew_at_the_next_step() -> None:
     environments.close()
 
 
-def test_patience_is_counted_for_each_environment() -> None:
-    """The first drives over tiles, the second stands."""
+def test_no_reward_limit_is_counted_per_environment() -> None:
+    """The first environment drives over tiles, the second stands still."""
     environments = make_environments(_spec("CarRacing-v3", no_reward_limit=4, action_repeat=4, action_table=GAS), 2)
     environments.reset(1)
     cuts = np.stack([environments.step(np.array([0, 1]))[3] for _ in range(6)])
     environments.close()
-    assert np.flatnonzero(cuts[:, 1]).tolist() == [4], "the first step earns the tile that it stands on"
+    assert np.flatnonzero(cuts[:, 1]).tolist() == [4], "the first step rewards the tile under the car"
     assert not cuts[:4, 0].any()
 
 
 class _ThreeSteps:
-    """A pool of one environment that gives nothing and terminates at its third step: the little of envpool needed."""
+    """The part of envpool that is needed for a pool of one environment, without rewards and with three steps."""
 
     def make_spec(self, _name: str, **_options) -> SimpleNamespace:
         space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
@@ -117,7 +119,9 @@ class _ThreeSteps:
 
 
 @pytest.mark.parametrize(("no_reward_limit", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [], [1])])
-def test_an_end_of_the_environments_own_stays_one(no_reward_limit: int, terminates: list, truncates: list) -> None:
+def test_termination_takes_precedence_over_no_reward_limit(
+    no_reward_limit: int, terminates: list, truncates: list
+) -> None:
     environments = EnvpoolEnvironments(_ThreeSteps(), "x", {"num_envs": 1}, no_reward_limit=no_reward_limit)
     environments.reset(1)
     rows = [environments.step(np.zeros(1, np.int64)) for _ in range(3)]
@@ -125,7 +129,7 @@ def test_an_end_of_the_environments_own_stays_one(no_reward_limit: int, terminat
     assert [row for row, (_, _, _, truncated) in enumerate(rows) if truncated[0]] == truncates
 
 
-def test_car_racing_has_a_thousand_frames() -> None:
+def test_car_racing_episode_has_a_thousand_frames() -> None:
     environments = make_environments(_spec("CarRacing-v3", action_repeat=64, action_table=GAS), 1)
     environments.reset(1)
     cuts = [bool(environments.step(np.array([1]))[3][0]) for _ in range(17)]
@@ -133,7 +137,7 @@ def test_car_racing_has_a_thousand_frames() -> None:
     assert cuts == [False] * 15 + [True, False]  # 15 x 64 + 40
 
 
-def test_car_racing_looks_the_same_as_gymnasiums() -> None:
+def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
     table = (
         *((steer, gas, 0.0) for steer in (-1.0, -0.5, 0.0, 0.5, 1.0) for gas in (0.0, 0.5)),
         (0, 0, 0.2),
@@ -163,7 +167,7 @@ def test_car_racing_looks_the_same_as_gymnasiums() -> None:
         ({"grey": True, "crop": (34, 16, 0, 0), "resize": (80, 80)}, (80, 80)),
     ],
 )
-def test_atari_frames_are_single_and_shaped_as_asked(fields: dict, shape: tuple[int, ...]) -> None:
+def test_atari_frames_are_single_and_have_the_specified_shape(fields: dict, shape: tuple[int, ...]) -> None:
     environments = make_environments(_spec("Pong-v5", frame_stack=4, action_repeat=4, **fields), 2)
     assert environments.spaces.observation.shape == shape
     assert environments.reset(1).shape == (2, *shape)
@@ -172,7 +176,7 @@ def test_atari_frames_are_single_and_shaped_as_asked(fields: dict, shape: tuple[
     environments.close()
 
 
-def test_ataris_limit_is_in_frames_as_everywhere() -> None:
+def test_atari_episode_limit_counts_frames() -> None:
     environments = make_environments(_spec("Pong-v5", action_repeat=4, max_episode_steps=10), 1)
     environments.reset(1)
     assert [bool(environments.step(np.zeros(1, np.int64))[3][0]) for _ in range(5)] == [
@@ -185,7 +189,7 @@ def test_ataris_limit_is_in_frames_as_everywhere() -> None:
     environments.close()
 
 
-def test_every_seed_is_taken_and_tells_episodes_apart() -> None:
+def test_every_seed_is_accepted_and_determines_the_episodes() -> None:
     environments = make_environments(_spec("CartPole-v1"), 2)
     first = environments.reset(2**32 - 1)
     np.testing.assert_array_equal(environments.reset(2**32 - 1), first)
@@ -199,19 +203,22 @@ def test_every_seed_is_taken_and_tells_episodes_apart() -> None:
     [
         (_spec("CarRacer-v3"), "unknown environment 'CarRacer-v3': did you mean CarRacing-v"),
         (_spec("zzz"), "envpool has none like it"),
-        (_spec("CartPole-v1", kwargs={"no_such_option": 1}), "CartPole-v1 of envpool cannot be made.*no_such_option"),
-        (_spec("CartPole-v1", kwargs={"num_threads": 4}), "names num_threads, which the rest"),
+        (
+            _spec("CartPole-v1", kwargs={"no_such_option": 1}),
+            "CartPole-v1 of envpool cannot be created.*no_such_option",
+        ),
+        (_spec("CartPole-v1", kwargs={"num_threads": 4}), "names num_threads, but other settings"),
         (_spec("Pong-v5", kwargs={"stack_num": 4, "frame_skip": 2}), "names frame_skip and stack_num"),
         (_spec("Pendulum-v1"), "environment.action_table"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_one_line(spec: EnvironmentSpec, reason: str) -> None:
+def test_setup_error_is_one_line(spec: EnvironmentSpec, reason: str) -> None:
     with pytest.raises(EnvironmentSetupError, match=reason) as caught:
         make_environments(spec, 2)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_envpool_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_envpool_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "envpool", None)
     with pytest.raises(EnvironmentSetupError, match=r'"daedalus-rl\[envpool\]".*--set environment.backend=gymnasium'):
         make_environments(_spec("CartPole-v1"), 1)

@@ -1,4 +1,4 @@
-"""Every environment plays its share of whole episodes, whichever end first."""
+"""play_episodes: every environment plays its share of whole episodes."""
 
 import os
 
@@ -26,7 +26,7 @@ class AlwaysZero:
 
 
 class Remembering(AlwaysZero):
-    """An action that shows every frame of its stack, and all that is remembered."""
+    """A policy whose actions depend on every frame of the stack and on the memory."""
 
     state_size = 2
 
@@ -39,7 +39,7 @@ class Remembering(AlwaysZero):
 
 
 def one_action(stack: np.ndarray, memory: np.ndarray) -> tuple[int, list[float]]:
-    """From a stack [4, 2] and a memory [2]: the action, and the memory afterwards."""
+    """The action for a stack [4, 2] and a memory [2], and the memory after it."""
     shown = stack @ [3, 1] @ [1, 2, 3, 5]
     return int(shown + 7 * memory[0] + memory[1]) % 4, [memory[0] + 1, (memory[1] + shown) % 64]
 
@@ -62,7 +62,7 @@ def one_by_one(episodes: int) -> list[tuple[float, int]]:
     return played
 
 
-def test_episodes_are_shared_out_and_counted_whole() -> None:
+def test_each_environment_plays_its_share_of_whole_episodes() -> None:
     """Episodes last 3, 2, 1, 3, ... steps in each environment; by hand: 0+1+2, 10+11, 20, 30+31+32."""
     environments = make_environments(COUNTING, 2)
     evaluation = play_episodes(AlwaysZero(), environments, 7, 1, sampled=False)
@@ -71,18 +71,18 @@ def test_episodes_are_shared_out_and_counted_whole() -> None:
     assert sorted(evaluation.lengths.tolist()) == [1, 1, 2, 2, 3, 3, 3]
 
 
-def test_stacks_and_memory_are_those_of_episodes_played_one_by_one() -> None:
+def test_stacks_and_memory_equal_those_of_episodes_played_one_by_one() -> None:
     environments = make_environments(COUNTING.model_copy(update={"frame_stack": 4}), 3)
     evaluation = play_episodes(Remembering(), environments, 20, 1, sampled=False)
     expected = one_by_one(7) + one_by_one(7) + one_by_one(6)
     returns = [round(float(value), 3) for value in evaluation.returns]
     assert sorted(zip(returns, evaluation.lengths.tolist(), strict=True)) == sorted(expected)
-    # It is a test only if actions differ: those of zeros alone would earn whole numbers.
+    # The actions must differ for this test to mean anything: zeros alone would give whole numbers.
     assert len({round(value % 1, 1) for value in returns}) > 3
 
 
 def test_short_episodes_are_not_favoured() -> None:
-    """Taking whichever end first would count more of the environment whose episodes are short."""
+    """Counting whichever episodes end first would count more short ones."""
     environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 50)
     few = play_episodes(AlwaysZero(), environments, 50, 1, sampled=False)
     many = play_episodes(AlwaysZero(), environments, 2000, 1, sampled=False)
@@ -91,20 +91,25 @@ def test_short_episodes_are_not_favoured() -> None:
     assert abs(few.returns.mean() - many.returns.mean()) < 0.3
 
 
-def test_progress_tells_after_every_step_what_has_been_counted() -> None:
-    told: list[tuple[int, float]] = []
+def test_progress_is_reported_after_every_step() -> None:
+    reports: list[tuple[int, float]] = []
     environments = make_environments(COUNTING, 2)
     evaluation = play_episodes(
-        AlwaysZero(), environments, 3, 1, sampled=False, progress=lambda finished, mean: told.append((finished, mean))
+        AlwaysZero(),
+        environments,
+        3,
+        1,
+        sampled=False,
+        progress=lambda finished, mean: reports.append((finished, mean)),
     )
     # Steps 1 to 3 end the first episode of both; then a reset row, and two steps to the end of the first's second.
-    assert [finished for finished, _ in told] == [0, 0, 2, 2, 2, 3]
-    assert np.isnan([mean for _, mean in told[:2]]).all()
-    assert [mean for _, mean in told[2:]] == [3, 3, 3, 9]
+    assert [finished for finished, _ in reports] == [0, 0, 2, 2, 2, 3]
+    assert np.isnan([mean for _, mean in reports[:2]]).all()
+    assert [mean for _, mean in reports[2:]] == [3, 3, 3, 9]
     assert evaluation.returns.tolist() == [3, 3, 21]
 
 
-def test_environments_in_processes_are_a_few_for_each_processor() -> None:
+def test_environments_in_processes_are_limited_per_processor() -> None:
     processes = EnvironmentSpec(id="CarRacing-v3", processes=True)
     assert environments_for(7) == environments_for(7, COUNTING) == 7
     assert environments_for(1000, COUNTING) == 100

@@ -1,141 +1,22 @@
-"""The evaluator against a learner that is played by the test, over the memory transport."""
+"""Evaluator against a scripted learner, over the memory transport."""
 
-import contextlib
-import queue
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
 from log_lines import LINES
 from processes import LIMIT
+from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_spec
 
-from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.actor.session.service import ActorConfig
-from daedalus.policy.acting.program import export_program
-from daedalus.policy.acting.runtime import program_hash
-from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
-from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
-    Acknowledgement,
-    EvaluationReport,
-    EvaluationRequest,
     Join,
     Message,
-    Program,
     Refusal,
     RunEnded,
-    Snapshot,
-    Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec, RunSpec
-from daedalus.transport.interface import Request
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
-
-
-def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
-    return RunSpec.model_validate(
-        {
-            "environment": {"id": "counting_environment:Counting-v0"},
-            "evaluation": {"seconds": seconds, "episodes": episodes},
-        }
-    )
-
-
-SPACES = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=DiscreteSpace(count=4))
-NETWORK = ActorCritic(PolicySpec(hidden=()), SPACES)
-MODEL = export_program(NETWORK, SPACES.observation)
-
-
-class ScriptedLearner:
-    """Welcomes evaluators and has a program; hands what they ask and tell to the test, which answers it."""
-
-    def __init__(self, network: MemoryNetwork, spec: RunSpec, epoch: int = 1) -> None:
-        self.transport = MemoryTransport(network)
-        self.epoch, self.spec = epoch, spec
-        self.joins: queue.Queue[Join] = queue.Queue()
-        self.told: queue.Queue[Request] = queue.Queue()
-        self.present: list[str] = []
-        self.transport.serve(keys.evaluations("r", "*"), self.told.put)
-        self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
-        self.transport.serve(keys.join("r"), self._join)
-
-    def _join(self, request: Request) -> None:
-        message = decode(request.payload, Limits())
-        assert isinstance(message, Join)
-        self.joins.put(message)
-        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)))
-
-    def _program(self, request: Request) -> None:
-        request.reply(encode(Program(hash=program_hash(MODEL), model=np.frombuffer(MODEL, np.uint8))))
-
-    def snapshot(self, version: int, action: int = 0, epoch: int | None = None) -> Snapshot:
-        """A policy that always plays one action, without a doubt but with others still possible."""
-        weights = {name: np.zeros(tuple(value.shape), np.float32) for name, value in NETWORK.named_parameters()}
-        weights["policy_head.bias"][action] = 1.0
-        return Snapshot(
-            learner_epoch=self.epoch if epoch is None else epoch,
-            policy_version=version,
-            program=program_hash(MODEL),
-            weights=weights,
-        )
-
-    def receive(self) -> tuple[Message, Request]:
-        request = self.told.get(timeout=LIMIT)
-        assert request.key == keys.evaluations("r", "e")
-        return decode(request.payload, Limits()), request
-
-    def give(self, message: Message) -> None:
-        """Answers the next request for a policy."""
-        asked, request = self.receive()
-        assert asked == EvaluationRequest(evaluator="e")
-        request.reply(encode(message))
-
-    def receive_report(self, verdict: Any = "accepted", reason: str = "") -> EvaluationReport:
-        report, request = self.receive()
-        assert isinstance(report, EvaluationReport)
-        request.reply(encode(Acknowledgement(verdict=verdict, reason=reason)))
-        return report
-
-
-class RunningEvaluator:
-    def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
-        self.stop = threading.Event()
-        self.error: Exception | None = None
-        config = ActorConfig(name="e", incarnation=7, timeout=timeout)
-        self._evaluator = Evaluator(config, MemoryTransport(network), self.stop)
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._evaluator.run()
-        except Exception as error:
-            self.error = error
-
-    def join(self) -> None:
-        """Waits for its end, while nobody is there who would have to answer it."""
-        self._thread.join(LIMIT)
-        assert not self._thread.is_alive()
-
-    def end(self, learner: ScriptedLearner) -> None:
-        """Stops it, whatever it may just have asked a learner."""
-        self.stop.set()
-        learner.transport.close()
-        while self._thread.is_alive():
-            with contextlib.suppress(queue.Empty):
-                learner.told.get(timeout=0.01).reply(encode(Refusal(code="finished", reason="")))
-
-
-@pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
+from daedalus.transport.memory import MemoryNetwork
 
 
 @pytest.fixture
@@ -150,17 +31,17 @@ def evaluator(network: MemoryNetwork, learner: ScriptedLearner) -> Iterator[Runn
     running.end(learner)
 
 
-def test_it_asks_plays_greedily_and_reports(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_evaluator_plays_greedily_and_reports(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(learner.snapshot(version=5, action=3))
     report = learner.receive_report()
     assert (report.evaluator, report.learner_epoch, report.policy_version) == ("e", 1, 5)
-    # Two environments play their first episode: rewards 0, 1 and 2, and 0.3 for the action at each step.
+    # Two environments play their first episode: rewards 0, 1 and 2, plus 0.3 for the action at each step.
     np.testing.assert_allclose(report.returns, [3.9, 3.9], rtol=1e-6)
     assert report.lengths.tolist() == [3, 3]
 
 
-def test_it_samples_where_the_run_says_so(network: MemoryNetwork) -> None:
-    """The policy nearly always plays 0; greedily it always would."""
+def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
+    """The greedy action is always 0; samples are nearly always 0."""
     spec = run_spec()
     sampling = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"actions": "sampled"})})
     learner = ScriptedLearner(network, sampling)
@@ -176,27 +57,25 @@ def test_it_samples_where_the_run_says_so(network: MemoryNetwork) -> None:
     assert seen - {0.0}
 
 
-def test_it_evaluates_again_with_the_policy_that_it_is_given_then(
-    learner: ScriptedLearner, evaluator: RunningEvaluator
-) -> None:
+def test_each_evaluation_uses_the_policy_given_then(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     for version, action in ((5, 3), (6, 1), (8, 0)):
         learner.give(learner.snapshot(version, action))
         report = learner.receive_report()
         assert report.policy_version == version
-        # The environments go on: a reset begins the episode after the last.
+        # The environments are reused: a reset begins the episode after the last.
         actions = (report.returns * 10).round() % 10
         assert actions.tolist() == [(action * report.lengths[0]) % 10] * 2
 
 
-def test_it_is_no_actor(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_evaluator_does_not_join_as_an_actor(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(learner.snapshot(0))
     learner.receive_report()
     assert learner.joins.get(timeout=LIMIT) == Join(actor="e", incarnation=7)
-    assert learner.joins.empty()  # once, and without spaces: it is not counted in
+    assert learner.joins.empty()  # once, and without spaces: it is no actor
     assert learner.present == []
 
 
-def test_it_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:
+def test_evaluator_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network, run_spec(episodes=150))  # more than there are environments
     evaluator = RunningEvaluator(network)
     learner.give(learner.snapshot(0))
@@ -204,29 +83,29 @@ def test_it_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> No
     evaluator.end(learner)
 
 
-def test_a_report_that_is_not_taken_is_told_and_the_next_is_played(
+def test_rejected_report_is_logged_and_the_next_evaluation_follows(
     learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
     learner.give(learner.snapshot(1))
     learner.receive_report("rejected", "no such version")
     learner.give(learner.snapshot(2))
     assert learner.receive_report().policy_version == 2
-    assert "the learner did not take the evaluation: no such version" in LINES
+    assert "the learner rejected the evaluation: no such version" in LINES
 
 
 # ----------------------------------------------------------------------------------------- losing the learner
 
 
-def test_a_learner_that_has_no_policy_yet_is_asked_again(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+def test_learner_without_a_policy_is_asked_again(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(Refusal(code="not_ready", reason="no policy yet"))
     learner.give(learner.snapshot(1))
     assert learner.receive_report().policy_version == 1
 
 
-def test_the_policy_of_another_life_is_not_played_before_it_has_joined_that(
+def test_policy_of_another_learner_epoch_is_not_evaluated_before_joining_it(
     learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
-    learner.epoch = 2  # it lives anew, and has the same keys
+    learner.epoch = 2  # the learner restarted, with the same keys
     learner.give(learner.snapshot(9))
     assert [learner.joins.get(timeout=LIMIT) for _ in range(2)] == [Join(actor="e", incarnation=7)] * 2
     learner.give(learner.snapshot(3))
@@ -234,14 +113,14 @@ def test_the_policy_of_another_life_is_not_played_before_it_has_joined_that(
     assert (report.learner_epoch, report.policy_version) == (2, 3)
 
 
-def test_it_looks_for_a_learner_that_went_away(
+def test_evaluator_looks_for_a_learner_that_went_away(
     network: MemoryNetwork, learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
     learner.give(learner.snapshot(9))
     asked = learner.receive()
     learner.transport.close()
-    asked[1].reply(b"what a learner that dies might send")
-    while not any(text.startswith("ignored a message") for text in LINES):
+    asked[1].reply(b"a dying learner's answer")
+    while not any(text.startswith("ignored a damaged message") for text in LINES):
         evaluator.stop.wait(0.001)
     second = ScriptedLearner(network, run_spec(), epoch=2)
     second.give(second.snapshot(0))
@@ -250,7 +129,7 @@ def test_it_looks_for_a_learner_that_went_away(
     evaluator.end(second)
 
 
-def test_it_may_be_there_before_the_learner(network: MemoryNetwork) -> None:
+def test_evaluator_may_start_before_the_learner(network: MemoryNetwork) -> None:
     evaluator = RunningEvaluator(network)
     learner = ScriptedLearner(network, run_spec())
     learner.give(learner.snapshot(4))
@@ -258,7 +137,7 @@ def test_it_may_be_there_before_the_learner(network: MemoryNetwork) -> None:
     evaluator.end(learner)
 
 
-def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
+def test_evaluator_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:
     evaluator = RunningEvaluator(network, timeout=0.05)
     evaluator.join()
     assert isinstance(evaluator.error, ActorError)
@@ -271,14 +150,16 @@ def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
 @pytest.mark.parametrize(
     "answer", [RunEnded(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
 )
-def test_it_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message) -> None:
+def test_evaluator_ends_when_the_run_is_over(
+    learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message
+) -> None:
     learner.give(answer)
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "the run is over"
 
 
-def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
+def test_evaluator_stops_between_evaluations(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network, run_spec(seconds=1e6))
     evaluator = RunningEvaluator(network)
     learner.joins.get(timeout=LIMIT)
@@ -286,11 +167,11 @@ def test_it_stops_between_evaluations(network: MemoryNetwork) -> None:
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "stopped"
-    assert learner.told.empty()
+    assert learner.received.empty()
 
 
 class Endless:
-    """Environments whose episodes do not end; they tell the test that one is being played."""
+    """Environments whose episodes do not end, and that report when they are stepped."""
 
     count, spaces = 2, SPACES
 
@@ -317,7 +198,7 @@ class Brief(Endless):
     over = True
 
 
-def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
+def test_evaluator_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     network: MemoryNetwork, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endless = Endless()
@@ -330,10 +211,10 @@ def test_it_stops_in_the_middle_of_an_episode_and_closes_its_environments(
     assert evaluator.error is None
     assert LINES[-1] == "stopped"
     assert endless.closed.is_set()
-    assert learner.told.empty()  # half an evaluation is none
+    assert learner.received.empty()  # an unfinished evaluation is not reported
 
 
-def test_every_evaluation_plays_other_episodes_and_the_same_ones_after_a_restart(
+def test_evaluations_have_different_seeds_and_the_same_ones_after_a_restart(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seeds = []

@@ -1,4 +1,4 @@
-"""gymnasium's environments: repeats, no_reward_limit, wrappers, cameras and processes."""
+"""The backend `gymnasium`: repeats, no_reward_limit, wrappers, cameras and processes."""
 
 import os
 import signal
@@ -39,15 +39,15 @@ def _rows(environments: VectorEnvironment, actions: list[int]) -> list[tuple]:
 
 
 @pytest.mark.parametrize("processes", [False, True])
-def test_repeats_sum_rewards_and_stop_at_an_episodes_end(processes: bool) -> None:
-    """Counting's episodes have 3 steps (terminated), 2 (truncated) and 1 (terminated), and rewards that tell them."""
+def test_repeats_sum_rewards_and_stop_at_the_end_of_an_episode(processes: bool) -> None:
+    """Counting's episodes have 3 steps (terminated), 2 (truncated) and 1 (terminated), and rewards identify them."""
     environments = make_environments(_counting(action_repeat=2, processes=processes), 2)
     try:
         assert environments.reset(1).tolist() == [[0.0, 0.0]] * 2
         assert _rows(environments, [1, 0, 3, 0, 0, 2, 0]) == [
-            ([0.0, 2.0], 1.2, False, False),  # 0 + 1, and twice a tenth of the action
+            ([0.0, 2.0], 1.2, False, False),  # 0 + 1, plus a tenth of the action twice
             ([0.0, 3.0], 2.0, True, False),  # one step was left
-            ([1.0, 0.0], 0.0, False, False),  # the reset row
+            ([1.0, 0.0], 0.0, False, False),  # the reset step
             ([1.0, 2.0], 21.0, False, True),
             ([2.0, 0.0], 0.0, False, False),
             ([2.0, 1.0], 20.2, True, False),
@@ -57,7 +57,7 @@ def test_repeats_sum_rewards_and_stop_at_an_episodes_end(processes: bool) -> Non
         environments.close()
 
 
-def test_the_limit_is_in_the_environments_own_steps() -> None:
+def test_episode_limit_counts_the_environments_own_steps() -> None:
     environments = make_environments(_counting(action_repeat=2, max_episode_steps=5, kwargs={"ends": [100]}), 1)
     environments.reset(1)
     assert _rows(environments, [0] * 4) == [
@@ -68,7 +68,7 @@ def test_the_limit_is_in_the_environments_own_steps() -> None:
     ]
 
 
-def test_patience_cuts_an_episode_after_steps_without_a_positive_reward() -> None:
+def test_no_reward_limit_truncates_after_steps_without_a_positive_reward() -> None:
     environments = make_environments(_picture(no_reward_limit=2, kwargs={"end": 100}), 1)
     environments.reset(1)
     bad, nothing, good = 0, 1, 2
@@ -79,7 +79,7 @@ def test_patience_cuts_an_episode_after_steps_without_a_positive_reward() -> Non
     assert not any(row[2] for row in rows)
 
 
-def test_patience_counts_rows_and_starts_anew_with_each_episode() -> None:
+def test_no_reward_limit_counts_rows_and_restarts_with_each_episode() -> None:
     """Episodes of 3 steps repeated twice are 2 rows: a no_reward_limit of 2 is reached just where they end."""
     for no_reward_limit, cut in ((3, False), (2, False), (1, True)):
         environments = make_environments(
@@ -88,10 +88,10 @@ def test_patience_counts_rows_and_starts_anew_with_each_episode() -> None:
         environments.reset(1)
         rows = _rows(environments, [0] * 9)
         assert any(row[3] for row in rows) == cut, no_reward_limit
-        assert any(row[2] for row in rows) != cut, "an end of the environment's own stays one"
+        assert any(row[2] for row in rows) != cut, "a termination takes precedence"
 
 
-def test_a_second_reset_starts_everything_anew() -> None:
+def test_second_reset_restarts_all_episodes() -> None:
     environments = make_environments(_picture(no_reward_limit=3, kwargs={"end": 4}), 2)
     first = [environments.reset(7)]
     first += [environments.step(np.array([0, 2]))[0] for _ in range(2)]
@@ -108,7 +108,7 @@ def test_a_second_reset_starts_everything_anew() -> None:
 # ---------------------------------------------------------------------------------------------- wrap, camera
 
 
-def test_a_wrapper_comes_before_the_repeats() -> None:
+def test_wrapper_is_applied_before_the_repeats() -> None:
     wrap = "picture_environment:with_doubled_rewards"
     environments = make_environments(_counting(action_repeat=2), 1, wrap=wrap)
     environments.reset(1)
@@ -121,15 +121,15 @@ def test_a_wrapper_comes_before_the_repeats() -> None:
         ("no_such_module:function", "cannot import no_such_module"),
         ("picture_environment:no_such_function", "no such function"),
         ("picture_environment", "name it as module:function"),
-        ("picture_environment:with_nothing_to_play", "made str of .*must be a gymnasium.Env"),
+        ("picture_environment:with_nothing_to_play", "returned str for .*must return a gymnasium.Env"),
     ],
 )
-def test_a_wrapper_that_is_none_is_told(wrap: str, reason: str) -> None:
+def test_invalid_wrapper_is_reported(wrap: str, reason: str) -> None:
     with pytest.raises(EnvironmentSetupError, match=f"wrap {wrap}.*{reason}"):
         make_environments(_picture(), 1, wrap=wrap)
 
 
-def test_a_camera_sees_every_step_of_the_environments_own() -> None:
+def test_camera_receives_every_step_of_the_environment() -> None:
     film: list[np.ndarray] = []
     spec = _picture(action_repeat=3, kwargs={"end": 4}, processes=True, crop=(1, 1, 1, 1))
     environments = make_environments(spec, 1, render_mode="rgb_array", camera=film.append)
@@ -139,24 +139,24 @@ def test_a_camera_sees_every_step_of_the_environments_own() -> None:
     assert film[0].shape == (2, 2, 3)
 
 
-def test_a_camera_wants_one_environment() -> None:
-    with pytest.raises(ValueError, match="a camera films one environment"):
+def test_camera_requires_one_environment() -> None:
+    with pytest.raises(ValueError, match="a camera needs one environment"):
         make_environments(_picture(), 2, render_mode="rgb_array", camera=lambda _: None)
 
 
-def test_what_shows_no_picture_cannot_be_filmed() -> None:
+def test_camera_requires_an_environment_that_renders_images() -> None:
     class Dark(Picture):
-        def render(self) -> None:  # type: ignore[override] - what is wrong with it
+        def render(self) -> None:  # type: ignore[override] - on purpose
             return None
 
-    with pytest.raises(EnvironmentSetupError, match="renders no picture, but NoneType"):
+    with pytest.raises(EnvironmentSetupError, match="renders NoneType instead of an image"):
         RepeatedSteps(Dark(), repeat=1, no_reward_limit=None, camera=lambda _: None).reset()
 
 
 # ------------------------------------------------------------------------------------------------- processes
 
 
-def test_processes_play_what_one_process_plays() -> None:
+def test_processes_give_the_same_steps_as_one_process() -> None:
     spec = _picture(action_repeat=2, no_reward_limit=2, grey=True, crop=(1, 0, 0, 1), kwargs={"end": 9})
     actions = np.random.default_rng(3).integers(0, 3, (25, 3))
     played = []
@@ -176,15 +176,15 @@ def _processes(**fields) -> EnvironmentProcesses:
     return EnvironmentProcesses([EnvironmentFactory(spec=_counting(**fields))] * 2)
 
 
-def test_closing_ends_the_processes() -> None:
+def test_close_ends_the_processes() -> None:
     environments = _processes()
     environments.reset(seed=1)
     environments.close()
     assert [process.exitcode for process in environments.processes] == [0, 0]
 
 
-def test_closing_after_an_interrupted_step_ends_the_processes() -> None:
-    """The answers of a step that was not finished lie in the pipes; asking in them would wait for ever."""
+def test_close_after_an_interrupted_step_ends_the_processes() -> None:
+    """The pipes hold answers of the unfinished step: a request to end would wait for ever."""
     environments = _processes()
     environments.reset(seed=1)
     pipe = environments.parent_pipes[1]
@@ -192,7 +192,7 @@ def test_closing_after_an_interrupted_step_ends_the_processes() -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    environments.parent_pipes[1] = SimpleNamespace(send=pipe.send, recv=interrupted)  # type: ignore[assignment] - a pipe's two methods
+    environments.parent_pipes[1] = SimpleNamespace(send=pipe.send, recv=interrupted)  # type: ignore[assignment] - the two methods in use
     with pytest.raises(KeyboardInterrupt):
         environments.step(np.zeros(2, np.int64))
     environments.parent_pipes[1] = pipe
@@ -200,19 +200,18 @@ def test_closing_after_an_interrupted_step_ends_the_processes() -> None:
     assert not any(process.is_alive() for process in environments.processes)
 
 
-def test_a_process_that_was_killed_is_told_and_the_others_end() -> None:
+def test_killed_process_is_reported_and_close_ends_the_others() -> None:
     environments = _processes()
     environments.reset(seed=1)
     environments.processes[0].kill()
     environments.processes[0].join()
-    with pytest.raises(EnvironmentSetupError, match="has ended by itself"):
+    with pytest.raises(EnvironmentSetupError, match="has died"):
         environments.step(np.zeros(2, np.int64))
     environments.close()
     assert not any(process.is_alive() for process in environments.processes)
 
 
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="an interrupt ends a process at once here")
-def test_an_interrupt_leaves_the_processes_to_their_parent() -> None:
+def test_processes_ignore_interrupts() -> None:
     environments = _processes()
     try:
         environments.reset(seed=1)
@@ -221,15 +220,17 @@ def test_an_interrupt_leaves_the_processes_to_their_parent() -> None:
             os.kill(process.pid, signal.SIGINT)
         environments.step(np.zeros(2, np.int64))
         assert all(process.is_alive() for process in environments.processes)
-        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []), "but this one sees it"
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []), (
+            "the parent does not ignore interrupts"
+        )
     finally:
         environments.close()
 
 
-# ----------------------------------------------------------------------------------------------- what is named
+# ----------------------------------------------------------------------------------------------- missing packages
 
 
-def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(**_kwargs) -> gymnasium.Env:
         raise gymnasium.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
 
@@ -241,7 +242,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch: p
         make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
 
 
-def test_gymnasiums_atari_games_show_their_own_screen() -> None:
+def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
     pytest.importorskip("ale_py")
     spec = EnvironmentSpec(id="ALE/Pong-v5", kwargs={"frameskip": 1}, action_repeat=4, grey=True, resize=(84, 84))
     environments = make_environments(spec, 2)

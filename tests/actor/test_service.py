@@ -1,155 +1,14 @@
-"""The actor against a learner that is played by the test, over the memory transport."""
-
-import queue
-import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
+"""ActorService against a scripted learner, over the memory transport: joining and uploading."""
 
 import numpy as np
-import pytest
-from log_lines import LINES
-from processes import LIMIT, until
+from processes import LIMIT
+from scripted_learner import SPACES, SPEC, Policy, RunningActor, ScriptedLearner, acknowledge
 
-from daedalus.actor.session import learner_queries, service
-from daedalus.actor.session import upload_session as conversation
-from daedalus.actor.session.learner_queries import ActorError
-from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
-from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
-from daedalus.policy.acting.program import export_program
-from daedalus.policy.acting.runtime import program_hash
-from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol import keys
-from daedalus.protocol.codec import decode, encode
-from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import (
-    Acknowledgement,
-    Join,
-    Message,
-    Program,
-    Refusal,
-    Rollout,
-    RunEnded,
-    Snapshot,
-    SnapshotRequest,
-    Welcome,
-)
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec, RunSpec
-from daedalus.transport.interface import Request, TransportError
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
-
-SPEC = RunSpec.model_validate(
-    {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
-)
-SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+from daedalus.protocol.spec import PolicySpec
+from daedalus.transport.memory import MemoryNetwork
 
 
-@dataclass(frozen=True)
-class Policy:
-    """What a learner of it would send."""
-
-    network: ActorCritic
-    model: bytes
-
-    @classmethod
-    def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
-        network = ActorCritic(spec, spaces)
-        return cls(network, export_program(network, spaces.observation))
-
-
-POLICY = Policy.of(PolicySpec(), SPACES)
-
-
-class ScriptedLearner:
-    """Answers joins and programs; hands every rollout to the test, which answers it."""
-
-    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY) -> None:
-        self.transport = MemoryTransport(network)
-        self.epoch, self.spec, self.policy = epoch, spec, policy
-        self.joins: queue.Queue[Join] = queue.Queue()
-        self.rollouts: queue.Queue[Request] = queue.Queue()
-        self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
-        self.refusal: Refusal | None = None
-        self.transport.declare_presence(keys.learner("r"))
-        self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
-        self.transport.serve(keys.snapshots("r"), self._newest)
-        self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.serve(keys.join("r"), self._join)
-
-    def _join(self, request: Request) -> None:
-        message = decode(request.payload, Limits())
-        assert isinstance(message, Join)
-        self.joins.put(message)
-        answer: Message = Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)
-        request.reply(encode(self.refusal or answer))
-
-    def _newest(self, request: Request) -> None:
-        if not request.size:
-            request.reply(self.snapshot)
-            return
-        message = decode(request.payload, Limits())
-        assert isinstance(message, SnapshotRequest)
-        request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
-
-    def _program(self, request: Request) -> None:
-        model = self.policy.model
-        request.reply(encode(Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))))
-
-    def publish(self, version: int, *, push: bool = True) -> None:
-        weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}
-        name = program_hash(self.policy.model)
-        self.snapshot = encode(
-            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights)
-        )
-        if push:
-            self.transport.publish(keys.snapshots("r"), self.snapshot)
-
-    def receive(self) -> tuple[Rollout, Request]:
-        request = self.rollouts.get(timeout=LIMIT)
-        rollout = decode(request.payload, Limits())
-        assert isinstance(rollout, Rollout)
-        return rollout, request
-
-
-def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
-    request.reply(encode(Acknowledgement(verdict=verdict, policy_version=version)))  # type: ignore[arg-type] - one of its literals
-
-
-class RunningActor:
-    def __init__(self, network: MemoryNetwork, timeout: float | None = None, link: LinkChoice = "auto") -> None:
-        self.stop = threading.Event()
-        self.error: Exception | None = None
-        self.transport = MemoryTransport(network)
-        config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
-        self._service = ActorService(config, self.transport, self.stop)
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._service.run()
-        except Exception as error:
-            self.error = error
-
-    def join(self) -> None:
-        self._thread.join(LIMIT)
-        assert not self._thread.is_alive()
-
-
-@pytest.fixture
-def network() -> MemoryNetwork:
-    return MemoryNetwork()
-
-
-@pytest.fixture
-def actor(network: MemoryNetwork) -> Iterator[RunningActor]:
-    running = RunningActor(network)
-    yield running
-    running.stop.set()
-    running.join()
-
-
-def test_it_joins_twice_first_to_ask_then_with_what_it_found(network: MemoryNetwork) -> None:
+def test_actor_joins_without_spaces_and_then_with_them(network: MemoryNetwork) -> None:
     learner = ScriptedLearner(network)
     actor = RunningActor(network)
     asked, counted_in = learner.joins.get(timeout=LIMIT), learner.joins.get(timeout=LIMIT)
@@ -160,54 +19,18 @@ def test_it_joins_twice_first_to_ask_then_with_what_it_found(network: MemoryNetw
     assert actor.error is None
 
 
-def test_it_keeps_a_window_in_flight_and_numbers_what_it_sends(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_actor_keeps_a_window_of_numbered_rollouts_in_flight(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(3)
     first, second = learner.receive(), learner.receive()
     assert [first[0].identity.sequence, second[0].identity.sequence] == [0, 1]
     assert first[0].policy_version == 3
-    assert learner.rollouts.empty()  # two are unanswered: no third, however long this test thinks
+    assert learner.rollouts.empty()  # two are not acknowledged: there is no third, however long this test takes
     acknowledge(first[1], "accepted")
     assert learner.receive()[0].identity.sequence == 2
 
 
-def test_over_a_slow_link_more_are_under_way_before_the_first_answer(network: MemoryNetwork) -> None:
-    actor = RunningActor(network, link="wan")
-    learner = ScriptedLearner(network)
-    learner.publish(3)
-    received = [learner.receive()[0] for _ in range(service._SLOW_LINK_WINDOW)]
-    assert [rollout.policy_version for rollout in received] == [3] * len(received)
-    assert learner.rollouts.empty()
-    actor.stop.set()
-    actor.join()
-
-
-def test_nothing_is_ever_pushed_over_a_link_that_is_found_slow(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    followed: list[object] = []
-    monkeypatch.setattr(MemoryTransport, "subscribe", lambda *arguments: followed.append(arguments))
-    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
-    learner = ScriptedLearner(network)
-    learner.publish(3)
-    actor = RunningActor(network)
-    assert learner.receive()[0].policy_version == 3
-    assert any("a slow link" in text for text in LINES)
-    assert followed == []
-    actor.stop.set()
-    actor.join()
-
-
-def test_what_is_played_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(3)
-    first, second = learner.receive(), learner.receive()
-    learner.publish(4)  # while the window is full
-    acknowledge(first[1], "accepted")
-    assert [second[0].policy_version, learner.receive()[0].policy_version] == [3, 4]
-
-
-def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
+def test_frame_stack_and_memory_follow_the_run(network: MemoryNetwork) -> None:
     policy = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
     environment = SPEC.environment.model_copy(update={"frame_stack": 3})
     spec = SPEC.model_copy(update={"environment": environment, "policy": policy})
@@ -232,7 +55,7 @@ def test_stacks_and_memory_are_those_of_the_run(network: MemoryNetwork) -> None:
     assert second.initial_state.any()
 
 
-def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_busy_rollout_is_sent_again(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     rollout, request = learner.receive()
@@ -243,32 +66,9 @@ def test_a_busy_answer_brings_the_same_rollout_again(network: MemoryNetwork, act
     np.testing.assert_array_equal(again.frames, rollout.frames)
 
 
-def test_it_plays_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    versions = []
-    for version in (5, 6, 7, 8):
-        rollout, request = learner.receive()
-        versions.append(rollout.policy_version)
-        learner.publish(version)
-        acknowledge(request, "accepted", version)
-    assert versions[0] == 0
-    assert versions == sorted(versions)
-    assert versions[-1] >= 5
-
-
-def test_it_asks_for_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    rollout, request = learner.receive()
-    learner.publish(1, push=False)
-    while rollout.policy_version == 0:
-        acknowledge(request, "accepted", 1)
-        rollout, request = learner.receive()
-    assert rollout.policy_version == 1
-
-
-def test_fenced_by_the_same_learner_it_joins_again_and_goes_on(network: MemoryNetwork, actor: RunningActor) -> None:
+def test_actor_fenced_by_the_same_learner_epoch_continues_its_sequence(
+    network: MemoryNetwork, actor: RunningActor
+) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
@@ -280,23 +80,10 @@ def test_fenced_by_the_same_learner_it_joins_again_and_goes_on(network: MemoryNe
         rollout, request = learner.receive()
         acknowledge(request, "accepted")
         sequences.append(rollout.identity.sequence)
-    assert sequences[-1] >= 3  # counted on: the learner knows the earlier ones
+    assert sequences[-1] >= 3  # the learner knows the earlier ones
 
 
-def test_synchronous_it_waits_for_the_next_version_and_asks_if_the_push_was_lost(network: MemoryNetwork) -> None:
-    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
-    learner = ScriptedLearner(network, spec)
-    actor = RunningActor(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    learner.publish(1, push=False)
-    acknowledge(request, "accepted", 1)
-    assert learner.receive()[0].policy_version == 1
-    actor.stop.set()
-    actor.join()
-
-
-def test_synchronous_a_rejected_rollout_is_replaced_under_the_same_version(network: MemoryNetwork) -> None:
+def test_synchronous_actor_replaces_a_rejected_rollout_under_the_same_version(network: MemoryNetwork) -> None:
     spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
     learner = ScriptedLearner(network, spec)
     actor = RunningActor(network)
@@ -307,144 +94,3 @@ def test_synchronous_a_rejected_rollout_is_replaced_under_the_same_version(netwo
     assert (again.identity.sequence, again.policy_version) == (1, 0)
     actor.stop.set()
     actor.join()
-
-
-@pytest.mark.parametrize("how", ["fenced", "left"])
-def test_it_joins_again_when_the_learner_lives_anew(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
-    first = ScriptedLearner(network)
-    first.publish(4)
-    _, request = first.receive()
-    if how == "fenced":
-        first.epoch = 2
-        first.publish(0, push=False)
-        acknowledge(request, "fenced")
-        second = first
-    else:
-        first.transport.close()
-        second = ScriptedLearner(network, epoch=2)
-        second.publish(0)
-    while (received := second.receive())[0].identity.learner_epoch == 1:
-        acknowledge(received[1], "fenced")
-    assert received[0].identity.sequence == 0
-    assert any("went away" in text for text in LINES)
-
-
-@pytest.mark.parametrize("how", ["run_ended", "finished"])
-def test_it_leaves_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    if how == "run_ended":
-        learner.transport.publish(keys.snapshots("r"), encode(RunEnded(learner_epoch=1, reason="solved")))
-        acknowledge(request, "accepted")
-    else:
-        acknowledge(request, "finished")
-    actor.join()
-    assert actor.error is None
-    assert LINES[-1].startswith("the run is over")
-
-
-def test_garbage_from_the_network_is_told_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    learner.transport.publish(keys.snapshots("r"), b"\xff" * 100)
-    acknowledge(request, "accepted")
-    _, request = learner.receive()
-    acknowledge(request, "accepted")
-    learner.receive()
-    assert any("ignored a message" in text for text in LINES)
-
-
-def test_a_refusal_ends_it_with_the_reason(network: MemoryNetwork) -> None:
-    learner = ScriptedLearner(network)
-    learner.refusal = Refusal(code="mismatch", reason="its environment has 3 choices")
-    actor = RunningActor(network)
-    actor.join()
-    assert isinstance(actor.error, ActorError)
-    assert "its environment has 3 choices" in str(actor.error)
-
-
-def test_two_learners_ask_for_a_choice(network: MemoryNetwork) -> None:
-    for run in ("one", "two"):
-        transport = MemoryTransport(network)
-        welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
-        transport.serve(keys.join(run), lambda request, welcome=welcome: request.reply(welcome))
-    actor = RunningActor(network)
-    actor.join()
-    assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
-
-
-def test_it_gives_up_after_its_timeout(network: MemoryNetwork) -> None:
-    actor = RunningActor(network, timeout=0.05)
-    actor.join()
-    assert "no learner answered within 0.05 s" in str(actor.error)
-
-
-def test_in_quarantine_it_ends_with_the_reason(network: MemoryNetwork) -> None:
-    learner = ScriptedLearner(network)
-    actor = RunningActor(network)
-    learner.publish(0)
-    _, request = learner.receive()
-    request.reply(encode(Acknowledgement(verdict="quarantined", reason="3 unfit rollouts in a row")))
-    actor.join()
-    assert isinstance(actor.error, ActorError)
-    assert "takes nothing more of this actor: 3 unfit rollouts in a row" in str(actor.error)
-
-
-def test_when_nothing_of_it_is_taken_it_says_so_once_with_the_reason(
-    network: MemoryNetwork, actor: RunningActor
-) -> None:
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    for count in range(60):
-        _, request = learner.receive()
-        if count < 15:
-            acknowledge(request, "rejected" if count else "accepted")
-        else:
-            request.reply(encode(Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")))
-        if count < 15:
-            assert not any("rejected" in line for line in LINES)
-    told = [line for line in LINES if "rejected the last" in line]
-    assert len(told) == 1
-    assert "policy lag 31, at most 30 is allowed" in told[0]
-    assert "max_policy_lag" in told[0]
-
-
-def test_after_a_long_silence_it_asks_and_looks_for_the_learner_if_nothing_is_to_be_heard(
-    network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(conversation, "_SILENCE_SECONDS", 0.1)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    held = [learner.receive(), learner.receive()]  # never answered
-    assert learner.joins.get(timeout=LIMIT).spaces is None
-    assert learner.joins.get(timeout=LIMIT).spaces == SPACES
-    for _ in range(3):
-        assert learner.joins.get(timeout=LIMIT).spaces is None  # it asks, and is answered: the learner takes its time
-    assert not any("went away" in text for text in LINES)
-    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # nothing that makes sense
-    until(lambda: any("went away" in text for text in LINES))
-    learner.transport.serve(keys.join("r"), learner._join)
-    again = learner.receive()
-    assert again[0].identity in [rollout.identity for rollout, _ in held]  # sent again, to be taken at most once
-
-
-def test_while_nobody_answers_it_tries_other_sessions(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
-    reopened = threading.Semaphore(0)
-
-    def reopen(transport: MemoryTransport) -> bool:
-        reopened.release()
-        raise TransportError("nothing answers there")
-
-    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
-    actor = RunningActor(network)
-    for _ in range(3):
-        assert reopened.acquire(timeout=LIMIT)
-    learner = ScriptedLearner(network)
-    learner.publish(0)
-    learner.receive()
-    actor.stop.set()
-    actor.join()
-    assert actor.error is None

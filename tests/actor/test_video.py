@@ -1,4 +1,4 @@
-"""actor/evaluation/video.py: what was shown is in the file, or there is no file."""
+"""Video: the file has the recorded frames, or there is no file."""
 
 import sys
 from pathlib import Path
@@ -14,7 +14,7 @@ FILES = ["film.mp4", "film.gif"]
 
 
 def frame(number: int, height: int = 40, width: int = 60) -> np.ndarray:
-    """A red square that moves to the right by four pixels a frame, on blue."""
+    """A red square on blue that moves to the right by four pixels a frame."""
     picture = np.zeros((height, width, 3), np.uint8)
     picture[..., 2] = 200
     picture[16:24, 4 * number % (width - 8) : 4 * number % (width - 8) + 8] = 250, 0, 0
@@ -40,7 +40,7 @@ def read_mp4(path: Path) -> tuple[list[np.ndarray], float]:
 
 
 def read_gif(path: Path) -> tuple[list[np.ndarray], list[int]]:
-    """The pictures as shown, and for how many milliseconds each."""
+    """The images of a gif, and their durations in milliseconds."""
     pictures, shown = [], []
     with Image.open(path) as image:
         assert image.info["loop"] == 0
@@ -51,16 +51,16 @@ def read_gif(path: Path) -> tuple[list[np.ndarray], list[int]]:
     return pictures, shown
 
 
-def test_every_frame_is_in_an_mp4_at_its_own_rate(tmp_path: Path) -> None:
+def test_mp4_has_every_frame_at_its_own_rate(tmp_path: Path) -> None:
     assert record(tmp_path / "film.mp4", 75, 50).frames == 75
     pictures, rate = read_mp4(tmp_path / "film.mp4")
     assert rate == 50
     assert len(pictures) == 75
     for number, picture in enumerate(pictures):
-        assert np.abs(picture.astype(int) - frame(number)).mean() < 12  # colours are kept at half the size
+        assert np.abs(picture.astype(int) - frame(number)).mean() < 12  # colours are stored at half the resolution
 
 
-def test_an_mp4_has_even_sizes(tmp_path: Path) -> None:
+def test_mp4_has_even_sizes(tmp_path: Path) -> None:
     with Video(tmp_path / "film.mp4") as video:
         video.add(frame(0, 41, 61))
     assert read_mp4(tmp_path / "film.mp4")[0][0].shape == (40, 60, 3)
@@ -72,7 +72,7 @@ def test_an_mp4_has_even_sizes(tmp_path: Path) -> None:
     ("rate", "frames", "kept", "milliseconds"),
     [(50, 100, range(0, 100, 4), 2000), (30, 60, range(0, 60, 2), 2000), (12, 24, range(24), 2000)],
 )
-def test_a_gif_keeps_every_nth_frame_and_the_pace(
+def test_gif_keeps_every_nth_frame_and_the_total_duration(
     tmp_path: Path, rate: int, frames: int, kept: range, milliseconds: int
 ) -> None:
     record(tmp_path / "film.gif", frames, rate)
@@ -83,7 +83,7 @@ def test_a_gif_keeps_every_nth_frame_and_the_pace(
         np.testing.assert_array_equal(picture, frame(number))
 
 
-def test_a_gif_is_small_and_its_width_can_be_chosen(tmp_path: Path) -> None:
+def test_gif_is_small_unless_a_width_is_given(tmp_path: Path) -> None:
     with Video(tmp_path / "film.gif") as video:
         video.add(np.zeros((400, 640, 3), np.uint8))
     assert read_gif(tmp_path / "film.gif")[0][0].shape == (200, 320, 3)
@@ -91,7 +91,7 @@ def test_a_gif_is_small_and_its_width_can_be_chosen(tmp_path: Path) -> None:
     assert read_gif(tmp_path / "small.gif")[0][0].shape == (20, 30, 3)
 
 
-def test_what_does_not_move_costs_a_gif_nothing(tmp_path: Path) -> None:
+def test_gif_stores_only_the_pixels_that_change(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8)
     with Video(tmp_path / "film.gif") as video:
         video.frames_per_second = 15
@@ -110,7 +110,7 @@ def test_what_does_not_move_costs_a_gif_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_recording_is_cut_after_so_many_seconds(tmp_path: Path, name: str) -> None:
+def test_recording_ends_after_max_seconds(tmp_path: Path, name: str) -> None:
     assert record(tmp_path / name, 60, 30, max_seconds=0.5).frames == 15
     if name.endswith("mp4"):
         assert len(read_mp4(tmp_path / name)[0]) == 15
@@ -119,7 +119,7 @@ def test_a_recording_is_cut_after_so_many_seconds(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_run_that_fails_leaves_nothing_and_keeps_what_was_there(tmp_path: Path, name: str) -> None:
+def test_exception_leaves_no_file_and_keeps_an_earlier_one(tmp_path: Path, name: str) -> None:
     def fail() -> None:
         with Video(tmp_path / name) as video:
             for number in range(40):
@@ -136,7 +136,7 @@ def test_a_run_that_fails_leaves_nothing_and_keeps_what_was_there(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_frames_reach_the_disk_as_they_come(tmp_path: Path, name: str) -> None:
+def test_frames_are_written_while_recording(tmp_path: Path, name: str) -> None:
     random = np.random.default_rng(1)
     with Video(tmp_path / name) as video:
         video.frames_per_second = 10
@@ -148,23 +148,23 @@ def test_frames_reach_the_disk_as_they_come(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_what_cannot_be_a_video_is_told(tmp_path: Path, name: str) -> None:
-    def film(*frames: np.ndarray) -> None:
+def test_invalid_frames_are_reported(tmp_path: Path, name: str) -> None:
+    def write(*frames: np.ndarray) -> None:
         with Video(tmp_path / name) as video:
             for picture in frames:
                 video.add(picture)
 
-    with pytest.raises(VideoError, match="the environment drew nothing"):
-        film()
+    with pytest.raises(VideoError, match="no frame was recorded"):
+        write()
     with pytest.raises(VideoError, match=r"from \(40, 60, 3\) to \(20, 60, 3\)"):
-        film(frame(0), frame(0, 20))
+        write(frame(0), frame(0, 20))
     with pytest.raises(VideoError, match=r"not float64 of \(4, 4\)"):
-        film(np.zeros((4, 4)))
+        write(np.zeros((4, 4)))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_where_nothing_can_be_written_is_known_before_anything_is_played(tmp_path: Path, name: str) -> None:
+def test_path_that_cannot_be_written_raises_when_the_block_begins(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     (tmp_path / name).mkdir()
     for place in (tmp_path / "nowhere" / name, tmp_path / "file" / name, tmp_path / name):
@@ -172,13 +172,13 @@ def test_where_nothing_can_be_written_is_known_before_anything_is_played(tmp_pat
             raise AssertionError("the block was entered")
 
 
-def test_an_unknown_suffix_is_told_with_those_that_are_known(tmp_path: Path) -> None:
-    with pytest.raises(VideoError, match=r"written as \.mp4 or \.gif, not as 'film.avi'"):
+def test_unknown_suffix_is_reported_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match=r"must end with \.mp4 or \.gif, unlike 'film.avi'"):
         Video(tmp_path / "film.avi")
 
 
 @pytest.mark.parametrize(("name", "package"), [("film.mp4", "av"), ("film.gif", "PIL")])
-def test_a_missing_package_is_told_with_what_brings_it(
+def test_missing_package_is_reported_with_the_extra_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)

@@ -52,7 +52,7 @@ def assert_holds(batch: Batch, rollouts: list[Rollout], depth: int) -> None:
     assert batch.actions.shape == (rollouts[0].rows, first)
 
 
-def test_rollouts_are_joined_on_the_environment_axis_in_the_order_given() -> None:
+def test_rollouts_are_joined_on_the_environment_axis_in_order() -> None:
     rollouts = [
         make_rollout(identity("b"), seed=1, state_size=5),
         make_rollout(identity("a"), environments=2, seed=2, state_size=5),
@@ -61,7 +61,7 @@ def test_rollouts_are_joined_on_the_environment_axis_in_the_order_given() -> Non
     assert_holds(join(rollouts), rollouts, depth=1)
 
 
-def test_stacks_are_made_of_the_frames_of_each_rollout() -> None:
+def test_observations_are_stacked_from_the_frames_of_each_rollout() -> None:
     rollouts = [pixels(1), pixels(2, environments=1), pixels(3, environments=2)]
     assert not all(rollout.valid.all() for rollout in rollouts)
     batch = join(rollouts, PIXELS)
@@ -70,7 +70,7 @@ def test_stacks_are_made_of_the_frames_of_each_rollout() -> None:
 
 
 @pytest.mark.parametrize("rows", [4, 5, 9])
-def test_an_episode_that_starts_at_any_row_shows_nothing_of_the_one_before(rows: int) -> None:
+def test_stack_contains_no_frame_of_the_previous_episode(rows: int) -> None:
     for start in range(rows):
         valid = np.ones((rows, 2), np.bool_)
         valid[start, 0] = False
@@ -82,7 +82,7 @@ def test_an_episode_that_starts_at_any_row_shows_nothing_of_the_one_before(rows:
 
 
 @pytest.mark.parametrize(("space", "make"), [(SPACES.observation, make_rollout), (PIXELS, pixels)])
-def test_memory_is_used_again_and_holds_nothing_of_the_batch_before(space: ArraySpace, make: Any) -> None:
+def test_memory_is_reused_and_completely_overwritten(space: ArraySpace, make: Any) -> None:
     assembler = BatchAssembler(space, CPU)
     places = set()
     for seed in range(6):
@@ -93,14 +93,14 @@ def test_memory_is_used_again_and_holds_nothing_of_the_batch_before(space: Array
     assert len(places) == 1
 
 
-def test_batches_of_other_sizes_get_memory_that_fits() -> None:
+def test_batches_of_different_sizes_are_assembled_correctly() -> None:
     assembler = BatchAssembler(PIXELS, CPU)
     for environments in (3, 5, 1, 3):
         rollouts = [pixels(environments, environments), pixels(7)]
         assert_holds(assembler.join(rollouts), rollouts, depth=4)
 
 
-def test_a_batch_has_the_dtypes_that_learning_wants() -> None:
+def test_batch_dtypes() -> None:
     batch = join([make_rollout()])
     assert batch.actions.dtype == torch.int64
     assert batch.valid.dtype == batch.initial_state.dtype == torch.float32
@@ -108,11 +108,11 @@ def test_a_batch_has_the_dtypes_that_learning_wants() -> None:
     assert batch.observations.dtype == batch.rewards.dtype == torch.float32
 
 
-def test_pixels_stay_bytes() -> None:
+def test_pixel_observations_stay_uint8() -> None:
     assert join([pixels(1)], PIXELS).observations.dtype == torch.uint8
 
 
-def test_a_batch_is_a_copy_of_its_rollouts() -> None:
+def test_batch_is_a_copy_of_its_rollouts() -> None:
     rollout = make_rollout()
     batch = join([rollout])
     before = batch.rewards.clone()

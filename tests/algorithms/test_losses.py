@@ -16,7 +16,8 @@ from daedalus.algorithms.losses import (
     policy_gradient_loss,
     value_loss,
 )
-from daedalus.policy.network.distributions import categorical_log_probs
+from daedalus.policy.network.distributions import Categorical
+from daedalus.protocol.spaces import DiscreteSpace
 
 ROWS, COLUMNS = 5, 3
 CELLS = [(t, b) for t in range(ROWS) for b in range(COLUMNS)]
@@ -49,7 +50,7 @@ def test_masked_mean_is_the_mean_over_the_valid_rows(random: torch.Generator, va
     assert masked_mean(values, valid).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_masked_mean_of_no_valid_row_is_0() -> None:
+def test_masked_mean_without_valid_rows_is_0() -> None:
     assert masked_mean(torch.ones(2, 2), torch.zeros(2, 2)).item() == 0.0
 
 
@@ -66,7 +67,7 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     logits = normal(random, ROWS, COLUMNS, 4).requires_grad_()
     actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
     advantages = normal(random)
-    log_probs, _ = categorical_log_probs(logits, actions)
+    log_probs, _ = Categorical(DiscreteSpace(count=4)).log_prob_and_entropy(logits, actions)
     policy_gradient_loss(log_probs, advantages, valid).backward()
     chosen = torch.nn.functional.one_hot(actions, 4)
     expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)
@@ -75,7 +76,9 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
 
 
 @pytest.mark.parametrize("clip_range", [0.1, 0.5, 2.0])
-def test_clipped_policy_loss_is_the_papers(random: torch.Generator, valid: Tensor, clip_range: float) -> None:
+def test_clipped_policy_loss_equals_the_equation_of_the_paper(
+    random: torch.Generator, valid: Tensor, clip_range: float
+) -> None:
     log_ratios, advantages = normal(random) / 2.0, normal(random)
 
     def gain(cell: tuple[int, int]) -> float:
@@ -88,7 +91,7 @@ def test_clipped_policy_loss_is_the_papers(random: torch.Generator, valid: Tenso
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_clipped_policy_loss_by_hand() -> None:
+def test_clipped_policy_loss_equals_a_hand_worked_example() -> None:
     # Ratios 1.5, 1.5, 0.5, 0.5, 1.1, 1 with a range of 0.2; the last row is not valid.
     log_ratios = torch.tensor([[1.5, 1.5, 0.5, 0.5, 1.1, 1.0]]).log().requires_grad_()
     advantages = torch.tensor([[2.0, -2.0, 2.0, -2.0, 3.0, 100.0]])
@@ -104,7 +107,7 @@ def test_clipped_policy_loss_by_hand() -> None:
     assert clipped_fraction(log_ratios.detach(), valid, 0.2).item() == pytest.approx(4 / 5)
 
 
-def test_at_a_ratio_of_1_the_clipped_gradient_is_the_policy_gradient(random: torch.Generator, valid: Tensor) -> None:
+def test_clipped_gradient_equals_the_policy_gradient_at_a_ratio_of_1(random: torch.Generator, valid: Tensor) -> None:
     advantages, before = normal(random), normal(random)
     gradients = []
     for clipped in (False, True):
@@ -117,7 +120,7 @@ def test_at_a_ratio_of_1_the_clipped_gradient_is_the_policy_gradient(random: tor
     assert_close(gradients[0], gradients[1])
 
 
-def test_clipped_fraction_is_of_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+def test_clipped_fraction_is_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
     log_ratios = normal(random) / 4.0
     left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}
     assert clipped_fraction(log_ratios, valid, 0.3).item() == pytest.approx(mean_of(left, valid))
@@ -173,7 +176,7 @@ def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_
     assert explained_variance(-targets, targets, valid).item() == pytest.approx(-3.0, rel=1e-4)
 
 
-def test_explained_variance_is_the_papers_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+def test_explained_variance_equals_its_definition_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
     values, targets = normal(random), normal(random)
     kept = valid == 1.0
     residual = (targets - values)[kept]
@@ -181,7 +184,7 @@ def test_explained_variance_is_the_papers_over_the_valid_rows(random: torch.Gene
     assert_close(explained_variance(values, targets, valid), expected)
 
 
-def test_what_invalid_rows_hold_changes_no_loss_and_no_gradient(random: torch.Generator, valid: Tensor) -> None:
+def test_content_of_invalid_rows_does_not_change_losses_or_gradients(random: torch.Generator, valid: Tensor) -> None:
     first, second = normal(random), normal(random)
     garbage = torch.where(valid == 1.0, 0.0, 1e6)
 

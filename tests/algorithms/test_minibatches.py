@@ -48,7 +48,7 @@ COUNTS = [1, 2, 3, 4, 7, ROWS * WIDTH, ROWS * WIDTH + 5]
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_without_memory_a_pass_takes_each_valid_row_once(count: int) -> None:
+def test_pass_without_memory_contains_each_valid_row_once(count: int) -> None:
     made = numbered(state_size=0)
     samples = made.pass_of(count)
     assert len(samples) == count
@@ -64,7 +64,7 @@ def test_without_memory_a_pass_takes_each_valid_row_once(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, WIDTH, WIDTH + 5])
-def test_with_memory_a_pass_takes_each_environment_once_and_whole(count: int) -> None:
+def test_pass_with_memory_contains_each_environment_once_with_all_rows(count: int) -> None:
     made = numbered(state_size=5)
     samples = made.pass_of(count)
     assert len(samples) == count
@@ -80,7 +80,7 @@ def test_with_memory_a_pass_takes_each_environment_once_and_whole(count: int) ->
 
 
 @pytest.mark.parametrize("state_size", [0, 5])
-def test_each_pass_is_shuffled_anew(state_size: int) -> None:
+def test_each_pass_has_a_new_order(state_size: int) -> None:
     made = numbered(state_size)
     orders = {tuple(made.pass_of(1)[0].log_probs.flatten().tolist()) for _ in range(5)}
     assert len(orders) > 1

@@ -79,7 +79,7 @@ def test_lambda_returns_are_the_weighted_mixture_of_n_step_returns(
 
 
 @given(ROLLOUTS, UNIT, UNIT)
-def test_actor_critic_advantages_are_returns_above_the_value(columns: list[Stream], gamma: float, lam: float) -> None:
+def test_actor_critic_advantages_are_returns_minus_values(columns: list[Stream], gamma: float, lam: float) -> None:
     data = Columns(columns, gamma)
     targets = actor_critic_targets(*data.of_targets, lam)
     assert_rows(targets.values, columns, lambda x, t: lambda_return(x, gamma, lam, t))
@@ -87,7 +87,7 @@ def test_actor_critic_advantages_are_returns_above_the_value(columns: list[Strea
 
 
 @given(ROLLOUTS, UNIT, UNIT, CLIP, CLIP)
-def test_vtrace_is_the_papers_sum_of_products(
+def test_vtrace_equals_the_sum_of_products_in_the_paper(
     columns: list[Stream], gamma: float, lam: float, rho_bar: float, c_bar: float
 ) -> None:
     data = Columns(columns, gamma)
@@ -125,7 +125,7 @@ def test_vtrace_on_policy_is_the_lambda_return_and_its_advantage(
 
 
 @given(ROLLOUTS, UNIT, UNIT, CLIP)
-def test_vtrace_with_a_vanishing_rho_clip_learns_nothing(
+def test_vtrace_with_rho_clip_near_0_returns_the_values(
     columns: list[Stream], gamma: float, lam: float, c_bar: float
 ) -> None:
     data = Columns(columns, gamma)
@@ -135,7 +135,7 @@ def test_vtrace_with_a_vanishing_rho_clip_learns_nothing(
 
 
 @given(ROLLOUTS, UNIT, CLIP)
-def test_vtrace_with_a_vanishing_trace_clip_looks_one_step_ahead(
+def test_vtrace_with_trace_clip_near_0_returns_one_step_targets(
     columns: list[Stream], gamma: float, rho_bar: float
 ) -> None:
     data = Columns(columns, gamma)
@@ -146,7 +146,7 @@ def test_vtrace_with_a_vanishing_trace_clip_looks_one_step_ahead(
 
 
 @given(ROLLOUTS, UNIT, UNIT)
-def test_ratios_above_both_clips_count_as_the_clips(columns: list[Stream], gamma: float, lam: float) -> None:
+def test_vtrace_clips_ratios_above_both_clips(columns: list[Stream], gamma: float, lam: float) -> None:
     data = Columns(columns, gamma)
     high, higher = torch.full_like(data.log_ratios, 2.0), torch.full_like(data.log_ratios, 60.0)
     first = vtrace_targets(high, *data.of_targets, lam, 1.5, 0.75)
@@ -156,7 +156,7 @@ def test_ratios_above_both_clips_count_as_the_clips(columns: list[Stream], gamma
 
 
 @given(ROLLOUTS, UNIT, UNIT, NUMBER)
-def test_nothing_flows_from_the_rows_that_only_reset(
+def test_content_of_reset_rows_does_not_change_other_rows(
     columns: list[Stream], gamma: float, lam: float, garbage: float
 ) -> None:
     data = Columns(columns, gamma)
@@ -180,7 +180,7 @@ def column(*numbers: float) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float32).unsqueeze(1)
 
 
-def test_n_step_returns_by_hand() -> None:
+def test_n_step_returns_equal_a_hand_worked_example() -> None:
     # gamma = 1/2; no episode ends.
     #   G_2 = 4 + 1/2 * 30   = 19
     #   G_1 = 2 + 1/2 * 19   = 11.5
@@ -190,7 +190,7 @@ def test_n_step_returns_by_hand() -> None:
     assert torch.equal(result, column(6.75, 11.5, 19))
 
 
-def test_lambda_returns_by_hand() -> None:
+def test_lambda_returns_equal_a_hand_worked_example() -> None:
     # gamma = lambda = 1/2; no episode ends.
     #   G_2 = 4 + 1/2 * 30                         = 19
     #   G_1 = 2 + 1/2 * (1/2 * 20 + 1/2 * 19)      = 11.75
@@ -200,7 +200,7 @@ def test_lambda_returns_by_hand() -> None:
     assert torch.equal(result, column(6.4375, 11.75, 19))
 
 
-def test_vtrace_by_hand() -> None:
+def test_vtrace_equals_a_hand_worked_example() -> None:
     # gamma = 1/2, lambda = 1, rho-bar = 3/2, c-bar = 1; ratios 2 and 1/2; V = 4, 8, 16; r = 1, 2.
     #   rho = 3/2, 1/2      c_0 = 1
     #   delta_0 = 3/2 * (1 + 1/2 * 8  - 4) = 1.5     delta_1 = 1/2 * (2 + 1/2 * 16 - 8) = 1

@@ -1,4 +1,4 @@
-"""The bridge over MemoryTransport: what a client asks for it gets, and what it leaves behind is nothing."""
+"""The bridge over MemoryTransport: answers, news, presence, limits and cleanup of its clients."""
 
 import contextlib
 import socket
@@ -12,16 +12,16 @@ from processes import LIMIT, until
 
 from daedalus.bridge import connection as client_module
 from daedalus.bridge import service as service_module
-from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUESTION_BYTES, Kind, Packet, encode_packet
+from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
 from daedalus.bridge.service import Bridge
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
-HEADER = struct.Struct("<IBBHI")  # once more, by hand
+HEADER = struct.Struct("<IBBHI")  # written out again, independent of the code
 
 
 class Caller:
-    """A client, as another language would write it."""
+    """A client, as it would be written in another language."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), LIMIT)
@@ -40,13 +40,13 @@ class Caller:
         return data
 
     def next(self) -> tuple[int, int, str, bytes]:
-        """Kind, number, key and payload of what comes next."""
+        """Return kind, number, key and payload of the next packet."""
         payload, kind, key, milliseconds, number = HEADER.unpack(self.read(HEADER_BYTES))
         assert milliseconds == 0
         return kind, number, self.read(key).decode(), self.read(payload)
 
     def ended(self) -> bool:
-        """Whether the bridge closes the connection, once what it said before is read."""
+        """Return whether the bridge closed the connection, after reading the packets before."""
         try:
             return self.socket.recv(1) == b""
         except ConnectionError:
@@ -54,7 +54,7 @@ class Caller:
 
 
 class Scene:
-    """A bridge that runs, and an end of the network that it carries to."""
+    """A running bridge, and another transport on its network."""
 
     def __init__(self) -> None:
         self.network = MemoryNetwork()
@@ -87,7 +87,7 @@ def scene() -> Iterator[Scene]:
     one.close()
 
 
-def test_a_query_gets_every_answer_and_an_end(scene: Scene) -> None:
+def test_query_receives_every_answer_and_an_end(scene: Scene) -> None:
     other = MemoryTransport(scene.network)
     scene.end.serve("daedalus/a/join", lambda request: request.reply(b"a:" + request.payload))
     other.serve("daedalus/b/join", lambda request: request.reply(b"b:" + request.payload))
@@ -98,13 +98,13 @@ def test_a_query_gets_every_answer_and_an_end(scene: Scene) -> None:
     assert caller.next() == (Kind.END, 7, "", b"")
 
 
-def test_a_query_that_nobody_serves_just_ends(scene: Scene) -> None:
+def test_query_without_servers_ends_without_answers(scene: Scene) -> None:
     caller = scene.call()
     caller.send(Kind.QUERY, 3, "daedalus/r/status")
     assert caller.next() == (Kind.END, 3, "", b"")
 
 
-def test_queries_do_not_wait_for_one_another(scene: Scene) -> None:
+def test_queries_run_concurrently(scene: Scene) -> None:
     held = []
     scene.end.serve("daedalus/r/rollouts/*", held.append)
     scene.end.serve("daedalus/r/status", lambda request: request.reply(b"well"))
@@ -118,16 +118,16 @@ def test_queries_do_not_wait_for_one_another(scene: Scene) -> None:
     assert caller.next() == (Kind.ANSWER, 1, "", b"accepted")
 
 
-def test_what_is_published_under_a_followed_key_comes_as_news(scene: Scene) -> None:
+def test_value_of_a_followed_key_arrives_as_news(scene: Scene) -> None:
     caller = scene.call()
     caller.send(Kind.FOLLOW, 4, "daedalus/r/snapshots")
     caller.send(Kind.QUERY, 5, "daedalus/r/status")
-    assert caller.next()[0] == Kind.END  # so the one before is done
+    assert caller.next()[0] == Kind.END  # so the packet before was performed
     scene.end.publish("daedalus/r/snapshots", b"weights")
     assert caller.next() == (Kind.NEWS, 4, "daedalus/r/snapshots", b"weights")
 
 
-def test_a_client_that_reads_late_gets_the_newest_news_and_no_pile(scene: Scene) -> None:
+def test_slow_client_receives_only_the_newest_value(scene: Scene) -> None:
     caller = scene.call()
     caller.send(Kind.FOLLOW, 4, "daedalus/r/snapshots")
     caller.send(Kind.QUERY, 5, "daedalus/r/status")
@@ -142,7 +142,7 @@ def test_a_client_that_reads_late_gets_the_newest_news_and_no_pile(scene: Scene)
     assert came < 30
 
 
-def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> None:
+def test_presence_is_reported_and_ends_with_the_client(scene: Scene) -> None:
     present: dict[str, bool] = {}
     scene.end.watch_presence("daedalus/r/actors/*", present.__setitem__)
     scene.end.declare_presence("daedalus/r/learner")
@@ -160,21 +160,29 @@ def test_presence_is_told_of_and_lasts_as_long_as_the_client(scene: Scene) -> No
     until(lambda: len(scene.network.ends) == 1)
 
 
+def test_presence_keys_that_no_packet_can_hold_are_ignored(scene: Scene) -> None:
+    caller = scene.call()
+    caller.send(Kind.WATCH, 1, "daedalus/r/actors/*")
+    for name in ("\N{LATIN SMALL LETTER E WITH ACUTE}", "x" * 300, "wing"):
+        scene.end.declare_presence(f"daedalus/r/actors/{name}")
+    assert caller.next() == (Kind.PRESENT, 1, "daedalus/r/actors/wing", b"")
+
+
 @pytest.mark.parametrize(
     ("packet", "complaint"),
     [
         (HEADER.pack(0, 9, 0, 0, 1), "kind 9"),
-        (HEADER.pack(MAX_QUESTION_BYTES + 1, Kind.QUERY, 16, 0, 1), "the limit is"),
+        (HEADER.pack(MAX_QUERY_BYTES + 1, Kind.QUERY, 16, 0, 1), "the limit is"),
         (HEADER.pack(1, Kind.FOLLOW, 16, 0, 1), "the limit is 0"),
-        (HEADER.pack(0, Kind.QUERY, 4, 0, 1) + b"@/**", "no proper key"),
-        (HEADER.pack(0, Kind.QUERY, 0, 0, 1), "no proper key"),
-        (HEADER.pack(0, Kind.QUERY, 11, 0, 1) + b"daedalus/**", "no proper key"),
-        (HEADER.pack(0, Kind.QUERY, 10, 0, 1) + b"daedalus/\xff", "no proper key"),
-        (HEADER.pack(0, Kind.FOLLOW, 10, 0, 1) + b"daedalus/*", "no proper key"),
+        (HEADER.pack(0, Kind.QUERY, 4, 0, 1) + b"@/**", "is not valid"),
+        (HEADER.pack(0, Kind.QUERY, 0, 0, 1), "is not valid"),
+        (HEADER.pack(0, Kind.QUERY, 11, 0, 1) + b"daedalus/**", "is not valid"),
+        (HEADER.pack(0, Kind.QUERY, 10, 0, 1) + b"daedalus/\xff", "is not valid"),
+        (HEADER.pack(0, Kind.FOLLOW, 10, 0, 1) + b"daedalus/*", "is not valid"),
     ],
     ids=str,
 )
-def test_what_is_no_parcel_is_named_and_ends_the_connection(scene: Scene, packet: bytes, complaint: str) -> None:
+def test_invalid_packet_ends_the_connection_with_an_error(scene: Scene, packet: bytes, complaint: str) -> None:
     caller = scene.call()
     caller.socket.sendall(packet)
     kind, _, _, reason = caller.next()
@@ -184,30 +192,30 @@ def test_what_is_no_parcel_is_named_and_ends_the_connection(scene: Scene, packet
     until(lambda: len(scene.network.ends) == 1)
 
 
-def test_who_does_not_greet_is_closed(scene: Scene) -> None:
+def test_client_without_greeting_is_disconnected(scene: Scene) -> None:
     with socket.create_connection(("127.0.0.1", scene.port), LIMIT) as stranger:
         stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert stranger.recv(4) == GREETING
         with contextlib.suppress(ConnectionError):  # it is closed with bytes unread
             assert stranger.recv(1) == b""
-    until(lambda: any("speaks another protocol" in line for line in LINES))
+    until(lambda: any("uses another protocol" in line for line in LINES))
 
 
-def test_who_stops_within_a_parcel_is_given_up(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_client_that_stalls_within_a_packet_is_disconnected(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client_module, "STALL_SECONDS", 0.1)
     caller = scene.call()
     caller.send(Kind.QUERY, 1, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
-    threading.Event().wait(0.3)  # silence between two packets is no fault
+    threading.Event().wait(0.3)  # silence between two packets is allowed
     caller.send(Kind.QUERY, 2, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
     caller.socket.sendall(HEADER.pack(1000, Kind.QUERY, 17, 0, 1))
     kind, _, _, reason = caller.next()
-    assert (kind, b"no more came" in reason) == (Kind.ERROR, True)
+    assert (kind, b"sent nothing" in reason) == (Kind.ERROR, True)
     assert caller.ended()
 
 
-def test_questions_beyond_the_budget_wait_in_the_connection(scene: Scene) -> None:
+def test_queries_beyond_the_budget_wait_in_the_connection(scene: Scene) -> None:
     held = []
     scene.end.serve("daedalus/r/rollouts/*", held.append)
     caller = scene.call()
@@ -223,7 +231,7 @@ def test_questions_beyond_the_budget_wait_in_the_connection(scene: Scene) -> Non
         assert caller.next()[0] == Kind.END
 
 
-def test_a_client_that_goes_with_its_budget_full_is_missed_at_once(scene: Scene) -> None:
+def test_disconnection_is_noticed_while_the_budget_is_full(scene: Scene) -> None:
     held = []
     scene.end.serve("daedalus/r/rollouts/*", held.append)
     caller = scene.call()
@@ -235,7 +243,7 @@ def test_a_client_that_goes_with_its_budget_full_is_missed_at_once(scene: Scene)
     held.clear()
 
 
-def test_a_client_may_not_declare_without_end(scene: Scene) -> None:
+def test_number_of_declarations_is_limited(scene: Scene) -> None:
     caller = scene.call()
     for number in range(65):
         caller.send(Kind.ANNOUNCE, number, f"daedalus/r/actors/wing-{number}")
@@ -243,7 +251,7 @@ def test_a_client_may_not_declare_without_end(scene: Scene) -> None:
     assert (kind, b"more than 64 keys" in reason) == (Kind.ERROR, True)
 
 
-def test_a_network_out_of_reach_is_said(scene: Scene) -> None:
+def test_unreachable_network_is_reported_to_the_client(scene: Scene) -> None:
     def unreachable() -> Transport:
         raise TransportError("nothing answers at tcp/127.0.0.1:1")
 
@@ -253,14 +261,14 @@ def test_a_network_out_of_reach_is_said(scene: Scene) -> None:
     assert caller.ended()
 
 
-def test_clients_beyond_the_most_are_turned_away(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service_module, "_MOST_CLIENTS", 1)
+def test_clients_beyond_the_limit_are_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_module, "_MAX_CLIENTS", 1)
     scene.call()
     with socket.create_connection(("127.0.0.1", scene.port), LIMIT) as late:
         assert late.recv(1) == b""
 
 
-def test_told_to_stop_it_ends_its_clients_and_their_presence(scene: Scene) -> None:
+def test_stop_disconnects_clients_and_ends_their_presence(scene: Scene) -> None:
     caller = scene.call()
     caller.send(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing")
     until(lambda: len(scene.network.ends) == 2)
@@ -269,6 +277,6 @@ def test_told_to_stop_it_ends_its_clients_and_their_presence(scene: Scene) -> No
     until(lambda: len(scene.network.ends) == 1)
 
 
-def test_a_parcel_is_its_header_key_and_payload() -> None:
+def test_bytes_of_a_packet() -> None:
     packet = Packet(Kind.QUERY, 258, "daedalus/r/join", timeout=5.0, payload=b"abc")
     assert encode_packet(packet) == bytes.fromhex("03000000 01 0f 8813 02010000") + b"daedalus/r/joinabc"

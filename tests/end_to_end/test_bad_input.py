@@ -60,7 +60,7 @@ def test_a_missing_cuda_device_is_reported_in_one_line(start: Start, monkeypatch
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # also on a machine with a GPU
     running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
     assert running.wait() == 1
-    running.expect("daedalus learner: training.device is cuda, but torch sees none here: install")
+    running.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
     assert "Traceback" not in running.output
 
 
@@ -69,7 +69,7 @@ def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_
     (tmp_path / "run" / "precious").write_text("kept")
     running = start("train", "cartpole", "--run-dir", "run")
     assert running.wait() == 2
-    running.expect("run directory run exists: continue it with `daedalus resume run`")
+    running.expect("run directory run exists: continue the run with `daedalus resume run`")
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
 
 

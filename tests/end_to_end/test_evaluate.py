@@ -125,7 +125,7 @@ def test_a_damaged_best_checkpoint_is_reported_and_the_newest_is_used(
     (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
     assert main([str(run), "--episodes", "1"]) == 0
     captured = capsys.readouterr()
-    assert "passed over" in captured.err
+    assert "skipped a damaged checkpoint" in captured.err
     assert "best_3.0_0000000001" in captured.err
     assert "gymnasium's counting_environment:Counting-v0, policy version 2: return 3." in captured.out
 
@@ -246,7 +246,7 @@ def test_a_shipped_policy_gets_the_returns_of_its_run(
     for name in ("returns", "policy_version", "seed"):
         assert of_the_run[name] == of_the_shipped[name]
     line = refused(1, "--pretrained", "cartpole")
-    assert "no pretrained policy 'cartpole': did you mean cartpole-1? there are cartpole-1" in line
+    assert "no pretrained policy 'cartpole': did you mean cartpole-1? choose from cartpole-1" in line
     assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
 
 
@@ -357,7 +357,7 @@ def test_a_signal_ends_an_evaluation(start: Start, tmp_path: Path) -> None:
         (["RUN", "--episodes", 0], 2, "--episodes is 0: choose at least 1"),
         (["RUN", "--envs", 0], 2, "--envs is 0: choose a number from 1 to 4096"),
         (["RUN", "--seed", -1], 2, "--seed is -1: choose 0 or more"),
-        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, not as 'x.avi'"),
+        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, unlike 'x.avi'"),
         (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
         (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot be used together"),
         (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),

@@ -1,4 +1,4 @@
-"""Test of examples/own_loop.py: a program with its own loop, and a real learner."""
+"""examples/own_loop.py against a real learner."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ def example(tmp_path: Path, address: str) -> Iterator[Callable[..., Running]]:
         one.end()
 
 
-def test_a_learner_trains_on_a_program_with_its_own_loop(
+def test_a_learner_trains_from_a_loop_that_the_caller_owns(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
     slow = ("--set", "collection.rollout_length=64", "--set", "training.batch_rollouts=4")
@@ -35,10 +35,10 @@ def test_a_learner_trains_on_a_program_with_its_own_loop(
     loop.expect("the run is over")
 
 
-def test_a_synchronous_algorithm_is_refused_when_the_client_joins(
+def test_a_client_in_a_synchronous_run_fails_at_once(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
     start("learner", "cartpole", "--algorithm", "a2c", "--listen", address, "--run-dir", "run")
     loop = example()
     assert loop.wait() == 1
-    loop.expect("ActorError: a run with a2c has its actors wait for each update, a client cannot")
+    loop.expect("ActorError: a run with a2c makes its actors wait for each update, but a client cannot wait")

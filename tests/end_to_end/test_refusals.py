@@ -90,7 +90,7 @@ def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(s
     second = start("actor", "--connect", address, "--name", "arm")
     second.expect("waiting for the other actor of this name to leave")
     assert second.wait() == 1
-    second.expect("an actor named 'arm' takes part already: give this one another --name")
+    second.expect("actor name 'arm' is already in use: choose another --name")
     third = start("actor", "--connect", address, "--name", "arm")
     third.expect("waiting for the other actor of this name to leave")
     first.end()
@@ -105,7 +105,7 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
         until(lambda: router.query(keys.join("run"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
         assert second.wait() == 1
-        second.expect("another learner serves run 'run' there already: stop it, or name this one otherwise")
+        second.expect("another learner already serves run 'run': stop that learner, or rename this run")
         assert first.process.poll() is None
     finally:
         router.close()

@@ -30,7 +30,7 @@ def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
     proxy = SlowProxy(address, up=125e3, down=500e3, delay=0.1)
     try:
         actor = start("actor", "--connect", proxy.address, "--name", "far")
-        actor.expect("a slow link .* weights come small, and less often")
+        actor.expect("slow link: .* fetching compact snapshots")
         until(lambda: far().get("rollouts_accepted", 0) > 20)
         report = far()
         assert report["compact_snapshots"]

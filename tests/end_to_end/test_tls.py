@@ -51,7 +51,7 @@ def test_an_unauthorised_actor_gets_a_hint_about_the_list_of_names(start: Start,
     assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
     late = start("actor", "--connect", tls, "--tls", certificates / "actor-late", "--timeout", 3)
     assert late.wait() == 1
-    late.expect("no learner answered .* does it .or its router. know the actor 'late'.* when it starts")
+    late.expect("no learner answered .* actor 'late' authorised by it .or by its router..* is read at start")
 
 
 def test_mistakes_with_certificates_are_reported_in_one_line(
@@ -62,19 +62,19 @@ def test_mistakes_with_certificates_are_reported_in_one_line(
     learner.expect("actors join with")
     to = ("actor", "--connect", tls)
     for arguments, status, message in (
-        ((*to, "--tls", strange / "actor-arm"), 1, "the two are of different CAs"),
-        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner: actor was expected"),
+        ((*to, "--tls", strange / "actor-arm"), 1, "the two ends use different CAs"),
+        ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner, but actor is required"),
         ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': use --name arm or arm.ANY"),
         (to, 2, "needs certificates: --tls DIR"),
-        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "wants --tls"),
+        (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "requires --tls"),
         (
             ("actor", "--connect", "tls/nowhere.invalid:1", "--tls", certificates / "actor-arm", "--timeout", 0.1),
             1,
-            "resolves to no address",
+            "cannot be resolved to an address",
         ),
-        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
-        (("train", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "could take part, unseen and unchecked"),
-        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner was expected"),
+        (("learner", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "is unencrypted and open to every host"),
+        (("train", "cartpole", "--listen", "tcp/0.0.0.0:0"), 2, "is unencrypted and open to every host"),
+        (("learner", "cartpole", "--listen", tls, "--tls", certificates / "actor-arm"), 2, "learner is required"),
     ):
         failed = start(*arguments)
         assert failed.wait() == status, failed.output

@@ -64,7 +64,7 @@ def server(network: MemoryNetwork) -> Iterator[ActorServer]:
 
 
 @pytest.mark.parametrize(("algorithm", "updates"), [("impala", 1), ("appo", 6)])
-def test_rollouts_of_the_version_that_a_batch_makes_are_welcome_as_soon_as_it_is_taken(
+def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken(
     network: MemoryNetwork, algorithm: str, updates: int
 ) -> None:
     """The snapshot of that version may be played before the next batch is complete."""
@@ -123,7 +123,7 @@ def codes(asker: Asker) -> list[str]:
     return [answer.code for answer in asker.answers if isinstance(answer, Refusal)]
 
 
-def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(server: ActorServer, asker: Asker) -> None:
+def test_evaluator_messages_are_queued_until_the_learner_takes_them(server: ActorServer, asker: Asker) -> None:
     offer_policy(server)
     asker.send(encode(EvaluationRequest(evaluator="e")))
     asker.send(encode(REPORT))
@@ -138,13 +138,13 @@ def test_what_evaluators_ask_and_tell_is_held_until_the_learner_has_time(server:
     assert answer.policy_version == 3
 
 
-def test_before_there_is_a_policy_nothing_can_be_evaluated(server: ActorServer, asker: Asker) -> None:
+def test_evaluation_request_before_the_first_policy_is_refused_as_not_ready(server: ActorServer, asker: Asker) -> None:
     asker.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(asker) == ["not_ready"]
     assert server.evaluations.take() == []
 
 
-def test_evaluators_beyond_measure_are_told_to_ask_later(server: ActorServer, asker: Asker) -> None:
+def test_evaluation_requests_above_the_queue_limit_are_refused_as_not_ready(server: ActorServer, asker: Asker) -> None:
     offer_policy(server)
     for _ in range(64):
         asker.send(encode(EvaluationRequest(evaluator="e")))
@@ -165,14 +165,14 @@ def test_evaluators_beyond_measure_are_told_to_ask_later(server: ActorServer, as
     ],
     ids=["empty", "noise", "another message", "another's name", "no name"],
 )
-def test_what_is_no_question_of_an_evaluators_own_is_refused(server: ActorServer, asker: Asker, payload: bytes) -> None:
+def test_invalid_evaluator_message_is_refused_as_malformed(server: ActorServer, asker: Asker, payload: bytes) -> None:
     offer_policy(server)
     asker.send(payload)
     assert codes(asker) == ["malformed"]
     assert server.evaluations.take() == []
 
 
-def test_a_report_beyond_measure_is_refused(server: ActorServer, asker: Asker) -> None:
+def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer, asker: Asker) -> None:
     offer_policy(server)
     many = 200_000
     asker.send(
@@ -189,7 +189,9 @@ def test_a_report_beyond_measure_is_refused(server: ActorServer, asker: Asker) -
     assert codes(asker) == ["malformed"]
 
 
-def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(server: ActorServer, asker: Asker) -> None:
+def test_waiting_and_later_evaluator_messages_are_refused_as_finished_after_close(
+    server: ActorServer, asker: Asker
+) -> None:
     offer_policy(server)
     asker.send(encode(EvaluationRequest(evaluator="e")))
     server.close("solved")
@@ -197,7 +199,7 @@ def test_who_waits_when_the_run_ends_is_told_so_and_so_is_who_comes_later(server
     assert codes(asker) == ["finished", "finished"]
 
 
-def test_many_at_once_are_all_held(server: ActorServer, network: MemoryNetwork) -> None:
+def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, network: MemoryNetwork) -> None:
     offer_policy(server)
     askers = [Asker(network) for _ in range(16)]
     threads = [
@@ -224,9 +226,7 @@ class Silent(MemoryTransport):
         raise TransportError("nothing answers there")
 
 
-def test_a_reception_that_hears_nobody_has_its_session_reopened(
-    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 0.02)
     transport, counters = Silent(network), RunCounters(10)
     server = ActorServer(
@@ -240,7 +240,7 @@ def test_a_reception_that_hears_nobody_has_its_session_reopened(
         server.close("the test is over")
 
 
-def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_request_resets_the_session_watchdog(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 1000.0)
     server = made(network, run_spec(), RunCounters(10))
     try:
@@ -251,7 +251,7 @@ def test_a_reception_that_hears_somebody_is_left_alone(network: MemoryNetwork, m
         server.close("the test is over")
 
 
-def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(network: MemoryNetwork) -> None:
+def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(network: MemoryNetwork) -> None:
     counters = RunCounters(10)
     server = made(network, run_spec(actors=2, max_policy_lag=0), counters)
     actor = MemoryTransport(network)
@@ -278,7 +278,7 @@ def test_stale_rollouts_of_an_actor_that_was_forgotten_are_counted_for_the_run(n
         ({"algorithm": "impala", "max_policy_lag": 0}, 4),  # two for each actor in any case
     ],
 )
-def test_what_would_be_stale_when_its_turn_comes_is_not_queued(
+def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
     network: MemoryNetwork, training: dict[str, Any], most: int
 ) -> None:
     """The buffer holds a batch, one is being judged, and the queue what can still be learned from after them."""
@@ -324,7 +324,7 @@ def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> Memor
     ("count", "published"),
     [(1, [1, 2, 3, 4, 5, 6]), (4, [1, 2, 3, 4, 5, 6]), (8, [2, 4, 6]), (12, [3, 6]), (40, [])],
 )
-def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
+def test_publication_interval_grows_with_the_fleet(
     network: MemoryNetwork, server: ActorServer, count: int, published: list[int]
 ) -> None:
     actors = with_fleet(network, server, count)
@@ -336,7 +336,7 @@ def test_a_large_fleet_is_not_sent_what_hardly_anyone_would_play(
     assert server.publisher.version == (published or [0])[-1]
 
 
-def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
+def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(
     network: MemoryNetwork, server: ActorServer
 ) -> None:
     with_fleet(network, server, 400)
@@ -347,7 +347,7 @@ def test_a_large_fleet_is_sent_versions_before_they_are_too_old_to_learn_from(
     assert published == {0, 8, 16, 24, 32, 40}
 
 
-def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> None:
+def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -> None:
     server = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
     try:
         with_fleet(network, server, 40)
@@ -358,7 +358,7 @@ def test_a_synchronous_fleet_is_sent_every_version(network: MemoryNetwork) -> No
         server.close("the test is over")
 
 
-def test_answers_tell_of_versions_that_can_be_had(network: MemoryNetwork, server: ActorServer) -> None:
+def test_acknowledgement_contains_the_newest_published_version(network: MemoryNetwork, server: ActorServer) -> None:
     """Of one that is not published an actor would ask for in vain."""
     offer_policy(server)
     actors = with_fleet(network, server, 40)

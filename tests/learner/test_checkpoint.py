@@ -49,7 +49,7 @@ def flip(path: Path, place: int) -> None:
     path.write_bytes(data)
 
 
-def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+def test_loaded_checkpoint_equals_the_saved_one(tmp_path: Path) -> None:
     save(tmp_path, 7)
     loaded = load_newest(tmp_path)
     assert loaded.policy.policy_version == 7
@@ -66,13 +66,13 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
         assert loaded.state[name].dtype == value.dtype
 
 
-def test_the_newest_is_loaded(tmp_path: Path) -> None:
+def test_load_newest_returns_the_highest_version(tmp_path: Path) -> None:
     for version in (9, 10, 2):
         save(tmp_path, version)
     assert load_newest(tmp_path).policy.policy_version == 10
 
 
-def test_a_damaged_newest_is_named_and_the_one_before_it_is_used(tmp_path: Path) -> None:
+def test_load_newest_names_a_damaged_checkpoint_and_returns_the_previous_one(tmp_path: Path) -> None:
     save(tmp_path, 1)
     flip(save(tmp_path, 2) / "parameters.safetensors", -1)
     assert load_newest(tmp_path).policy.policy_version == 1
@@ -81,12 +81,12 @@ def test_a_damaged_newest_is_named_and_the_one_before_it_is_used(tmp_path: Path)
     assert "parameters.safetensors" in LINES[0]
 
 
-def test_without_a_whole_one_there_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DamagedError, match="no checkpoint"):
+def test_load_newest_raises_when_no_checkpoint_is_undamaged(tmp_path: Path) -> None:
+    with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
     for version in (1, 2):
         flip(save(tmp_path, version) / "seal", 0)
-    with pytest.raises(DamagedError, match="no checkpoint"):
+    with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
     assert len(LINES) == 2
 
@@ -94,12 +94,12 @@ def test_without_a_whole_one_there_is_an_error(tmp_path: Path) -> None:
 FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]
 
 
-def test_these_are_the_files_of_a_checkpoint(tmp_path: Path) -> None:
+def test_files_of_a_checkpoint(tmp_path: Path) -> None:
     assert sorted(entry.name for entry in save(tmp_path, 1).iterdir()) == FILES
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_no_damage_to_any_file_goes_unnoticed(name: str, tmp_path: Path) -> None:
+def test_damage_to_any_file_is_detected(name: str, tmp_path: Path) -> None:
     path = save(tmp_path, 1) / name
     whole = path.read_bytes()
     places = {0, 8, len(whole) // 3, len(whole) // 2, len(whole) - 1}
@@ -116,19 +116,19 @@ def test_no_damage_to_any_file_goes_unnoticed(name: str, tmp_path: Path) -> None
     load_checkpoint(path.parent)
 
 
-def test_an_evaluator_reads_the_policy_though_the_optimisers_state_is_damaged(tmp_path: Path) -> None:
+def test_policy_is_readable_when_the_optimiser_state_is_damaged(tmp_path: Path) -> None:
     directory = save(tmp_path, 1)
     flip(directory / "learner.safetensors", 20)
     assert read_policy(directory).policy_version == 1
 
 
-def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+def test_older_checkpoints_are_pruned(tmp_path: Path) -> None:
     for version in range(1, 6):
         save(tmp_path, version, keep=2)
     assert names(tmp_path) == ["0000000004", "0000000005"]
 
 
-def test_what_was_just_saved_is_kept_though_a_damaged_one_has_a_higher_version(tmp_path: Path) -> None:
+def test_saved_checkpoint_is_kept_when_a_damaged_one_has_a_higher_version(tmp_path: Path) -> None:
     save(tmp_path, 10)
     flip(save(tmp_path, 20) / "seal", 0)
     saved = save(tmp_path, 11, keep=1)  # a learner that went on from 10
@@ -136,14 +136,14 @@ def test_what_was_just_saved_is_kept_though_a_damaged_one_has_a_higher_version(t
     assert load_newest(tmp_path).policy.policy_version == 11
 
 
-def test_the_same_version_may_be_saved_again(tmp_path: Path) -> None:
+def test_same_version_can_be_saved_again(tmp_path: Path) -> None:
     save(tmp_path, 1)
     save(tmp_path, 1, counters={"env_steps": 99})
     assert names(tmp_path) == ["0000000001"]
     assert load_newest(tmp_path).counters == {"env_steps": 99}
 
 
-def test_what_a_crash_left_half_written_is_no_checkpoint(tmp_path: Path) -> None:
+def test_unfinished_directory_is_not_listed_as_a_checkpoint(tmp_path: Path) -> None:
     save(tmp_path, 1)
     (tmp_path / "checkpoints" / ".0000000002.123.partial").mkdir()
     assert [directory.name for directory in checkpoints(tmp_path)] == ["0000000001"]
@@ -151,7 +151,7 @@ def test_what_a_crash_left_half_written_is_no_checkpoint(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("written", range(6))  # three files, manifest, seal, and the directory itself
-def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
+def test_full_disk_leaves_only_the_previous_checkpoint(
     version: int, written: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save(tmp_path, 1)
@@ -172,7 +172,7 @@ def test_a_full_disk_leaves_the_last_good_one_and_nothing_else(
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("aside", [False, True])
-def test_a_rename_that_fails_leaves_the_last_good_one_and_nothing_else(
+def test_failed_rename_leaves_only_the_previous_checkpoint(
     version: int, aside: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save(tmp_path, 1)

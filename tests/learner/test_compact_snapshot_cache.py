@@ -55,14 +55,14 @@ def fetch(cache: CompactSnapshotCache, newest: bytes, held: int | None = None, a
     return whole
 
 
-def test_who_holds_nothing_gets_the_whole_in_bfloat16() -> None:
+def test_actor_without_weights_gets_the_whole_snapshot_in_bfloat16() -> None:
     compact = fetch(CompactSnapshotCache(5), snapshot(3))
     assert (compact.learner_epoch, compact.policy_version, compact.program, compact.base_version) == (5, 3, "p", None)
     for name, array in float32(bits_of(compact.weights, None)).items():
         np.testing.assert_allclose(array, weights_of(snapshot(3))[name], rtol=2**-8)
 
 
-def test_who_holds_a_version_gets_the_difference_to_it_and_that_is_small() -> None:
+def test_actor_with_a_known_version_gets_a_small_difference() -> None:
     cache = CompactSnapshotCache(5)
     whole = fetch(cache, snapshot(3))
     held = bits_of(whole.weights, None)
@@ -75,13 +75,13 @@ def test_who_holds_a_version_gets_the_difference_to_it_and_that_is_small() -> No
 
 
 @pytest.mark.parametrize("held", [2, 99])
-def test_a_version_that_nobody_was_given_here_is_no_base(held: int) -> None:
+def test_version_that_was_never_served_is_not_used_as_base(held: int) -> None:
     cache = CompactSnapshotCache(5)
     fetch(cache, snapshot(3))
     assert fetch(cache, snapshot(4), held=held).base_version is None
 
 
-def test_a_difference_larger_than_the_whole_is_not_sent() -> None:
+def test_whole_snapshot_is_sent_when_it_is_smaller_than_the_difference() -> None:
     cache = CompactSnapshotCache(5)
     fetch(cache, snapshot(3))
     noise = {name: RANDOM.normal(size=array.shape).astype(np.float32) for name, array in FIRST.items()}
@@ -91,7 +91,7 @@ def test_a_difference_larger_than_the_whole_is_not_sent() -> None:
     np.testing.assert_array_equal(bits_of(compact.weights, None)["w"], bfloat16(noise)["w"])
 
 
-def test_two_who_hold_the_same_have_it_encoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snapshot_is_encoded_once_for_actors_with_the_same_version(monkeypatch: pytest.MonkeyPatch) -> None:
     cache, made = CompactSnapshotCache(5), []
     encoded = compact_cache._encoded
     monkeypatch.setattr(compact_cache, "_encoded", lambda *arguments: made.append(1) or encoded(*arguments))
@@ -102,7 +102,7 @@ def test_two_who_hold_the_same_have_it_encoded_once(monkeypatch: pytest.MonkeyPa
     assert len(made) == 2
 
 
-def test_parts_stay_those_of_one_version_while_newer_ones_come() -> None:
+def test_parts_belong_to_one_version_when_newer_versions_arrive() -> None:
     cache = CompactSnapshotCache(5)
     first = ask(cache, snapshot(3))
     assert isinstance(first, SnapshotPart)
@@ -114,7 +114,7 @@ def test_parts_stay_those_of_one_version_while_newer_ones_come() -> None:
 
 
 @pytest.mark.parametrize(("version", "part"), [(4, 1), (3, 10**6)])
-def test_what_is_not_there_any_more_is_refused(version: int, part: int) -> None:
+def test_unknown_version_or_part_is_refused(version: int, part: int) -> None:
     cache = CompactSnapshotCache(5)
     ask(cache, snapshot(3))
     answer = ask(cache, snapshot(3), policy_version=version, part=part)
@@ -125,13 +125,13 @@ def test_what_is_not_there_any_more_is_refused(version: int, part: int) -> None:
 @pytest.mark.parametrize(
     "instead", [Refusal(code="not_ready", reason="no policy yet"), RunEnded(learner_epoch=5, reason="over")]
 )
-def test_what_is_said_instead_of_a_snapshot_is_passed_on(instead: Message) -> None:
+def test_message_in_place_of_a_snapshot_is_passed_on(instead: Message) -> None:
     assert ask(CompactSnapshotCache(5), encode(instead)) == instead
 
 
-def test_what_it_keeps_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_size_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compact_cache, "_HELD_BYTES", 4 * 2 * (60_000 + 7))
-    monkeypatch.setattr(compact_cache, "_MOST_READERS", 3)
+    monkeypatch.setattr(compact_cache, "_MAX_READERS", 3)
     cache = CompactSnapshotCache(5)
     for version in range(10):
         fetch(cache, snapshot(version), actor=f"a{version}")

@@ -17,7 +17,7 @@ def rollout(version: int = 0, returns: tuple[float, ...] = (), seed: int = 0) ->
     return make_rollout(version=version, seed=seed, **episodes)
 
 
-def test_only_valid_rows_are_env_steps() -> None:
+def test_only_valid_rows_are_counted_as_env_steps() -> None:
     counters, first, second = RunCounters(10), rollout(seed=1), rollout(seed=2)
     steps = int(first.valid.sum()) + int(second.valid.sum())
     assert steps < first.valid.size + second.valid.size
@@ -30,7 +30,7 @@ def test_only_valid_rows_are_env_steps() -> None:
     assert counters.rollout_bytes == 1000
 
 
-def test_policy_lag_is_the_learners_version_minus_the_rollouts() -> None:
+def test_policy_lag_is_the_learner_version_minus_the_rollout_version() -> None:
     counters = RunCounters(10)
     assert counters.policy_lag_mean == 0.0
     counters.trained([rollout(7), rollout(4)], 8, 1)
@@ -39,7 +39,7 @@ def test_policy_lag_is_the_learners_version_minus_the_rollouts() -> None:
     assert counters.policy_lag_max == 4
 
 
-def test_the_mean_return_is_over_the_newest_episodes() -> None:
+def test_mean_return_is_over_the_newest_episodes() -> None:
     counters = RunCounters(3)
     assert counters.episode_return_mean is None
     counters.trained([rollout(returns=(1.0, 2.0)), rollout(returns=(3.0, 7.0))], 0, 1)
@@ -48,7 +48,7 @@ def test_the_mean_return_is_over_the_newest_episodes() -> None:
     assert list(counters.lengths) == [3, 4, 8]
 
 
-def test_a_target_is_reached_by_enough_episodes_only() -> None:
+def test_target_is_reached_only_with_enough_episodes() -> None:
     counters = RunCounters(2)
     assert not counters.reached(0.0)
     counters.trained([rollout(returns=(9.0,))], 0, 1)
@@ -59,7 +59,7 @@ def test_a_target_is_reached_by_enough_episodes_only() -> None:
     assert not counters.reached(None)
 
 
-def test_counters_come_back_from_json_and_go_on_alike() -> None:
+def test_counters_restored_from_json_continue_equally() -> None:
     through, first = RunCounters(3), RunCounters(3)
     for number in range(3):
         through.trained([rollout(0, (0.1 * number, -2.5), number)], number, 2)
@@ -76,6 +76,6 @@ def test_counters_come_back_from_json_and_go_on_alike() -> None:
     assert first == through
 
 
-def test_a_state_holds_every_counter() -> None:
+def test_state_contains_every_counter() -> None:
     state = RunCounters(3).state(1.0)
     assert state.keys() == set(RunCounters.__slots__) - {"target_episodes"}

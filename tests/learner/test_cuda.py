@@ -51,7 +51,7 @@ def taught(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
-def test_updates_are_those_of_the_processor(algorithm: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_updates_on_cuda_equal_updates_on_cpu(algorithm: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     policy, spaces = KINDS[kind]
     start = {name: array.copy() for name, array in learner("cpu", policy, spaces).weights().items()}
@@ -63,7 +63,7 @@ def test_updates_are_those_of_the_processor(algorithm: str, kind: str, monkeypat
     assert there.metrics.take_action_counts() == here.metrics.take_action_counts()
 
 
-def test_its_program_and_its_checkpoints_go_anywhere(tmp_path: Path) -> None:
+def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
     policy, spaces = KINDS["small"]
     there = learner("cuda", policy, spaces)
     there.step(rollouts(1, spaces, 0), progress=0.0)
@@ -90,7 +90,7 @@ def test_its_program_and_its_checkpoints_go_anywhere(tmp_path: Path) -> None:
         np.testing.assert_array_equal(here.weights()[name], expected)
 
 
-def test_mixed_precision_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mixed_precision_changes_all_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, spaces = KINDS["small"]
     there = learner("cuda", policy, spaces, algorithm="appo", precision="bfloat16")
     start = {name: array.copy() for name, array in there.weights().items()}

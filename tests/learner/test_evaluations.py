@@ -35,7 +35,7 @@ class Run:
             state={},
             counters={},
             keep=keep,
-            also_keep=self.evaluations.kept,
+            also_keep=self.evaluations.checkpoints_in_use,
         )
 
     def begin(self, version: int, evaluator: str = "e") -> Path:
@@ -76,7 +76,7 @@ def run(tmp_path: Path) -> Run:
 # ------------------------------------------------------------------------------------------------- the best
 
 
-def test_the_first_is_the_best_and_kept_under_its_score(run: Run) -> None:
+def test_first_evaluated_checkpoint_is_kept_as_best_under_its_score(run: Run) -> None:
     assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.3 +- 1.2 over 3 episodes, the best so far"
     assert run.names == ["0000000007", "best_2.3_0000000007"]
     best = best_checkpoints(run.directory)[0]
@@ -84,20 +84,20 @@ def test_the_first_is_the_best_and_kept_under_its_score(run: Run) -> None:
     assert load_checkpoint(best).policy.weights["w"].tolist() == [7.0] * 3
 
 
-def test_a_better_one_takes_its_place_and_a_worse_one_does_not(run: Run) -> None:
+def test_best_checkpoint_changes_only_with_a_higher_score(run: Run) -> None:
     texts = [run.play(version, score) for version, score in ((1, 5.0), (2, 4.0), (3, 9.0), (4, -1.0))]
     assert [text.endswith("the best so far") for text in texts] == [True, False, True, False]
     assert [best_score(each) for each in best_checkpoints(run.directory)] == [9.0, 5.0, 4.0]
     assert best_checkpoints(run.directory)[0].name == "best_9.0_0000000003"
 
 
-def test_scores_below_0_are_compared_as_numbers(run: Run) -> None:
+def test_negative_scores_are_compared_as_numbers(run: Run) -> None:
     for version, score in ((1, -20.5), (2, -3.0), (3, -10.0)):
         run.play(version, score)
     assert run.names[-1] == "best_-3.0_0000000002"
 
 
-def test_the_best_outlives_the_checkpoint_that_it_was(run: Run) -> None:
+def test_best_checkpoint_is_kept_after_its_numbered_checkpoint_is_pruned(run: Run) -> None:
     run.play(1, 5.0)
     for version in (2, 3, 4):
         run.save(version)
@@ -106,14 +106,14 @@ def test_the_best_outlives_the_checkpoint_that_it_was(run: Run) -> None:
     assert load_checkpoint(best).policy.weights["w"].tolist() == [1.0] * 3
 
 
-def test_the_best_is_no_checkpoint_to_go_on_from(run: Run) -> None:
+def test_load_newest_ignores_best_checkpoints(run: Run) -> None:
     run.play(1, 5.0)
     run.save(2)
     assert [path.name for path in checkpoints(run.directory)] == ["0000000002", "0000000001"]
     assert load_newest(run.directory).policy.policy_version == 2
 
 
-def test_a_resumed_run_knows_its_best(run: Run) -> None:
+def test_resumed_run_compares_with_the_best_of_the_previous_process(run: Run) -> None:
     run.play(1, 5.0)
     resumed = Run(run.directory, EPOCH + 1)
     resumed.begin(2)
@@ -124,7 +124,7 @@ def test_a_resumed_run_knows_its_best(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), [(5.01, 5.04), (5.04, 5.01), (5.0, 5.0)])
-def test_a_score_that_rounds_to_the_best_is_no_better(run: Run, first: float, second: float) -> None:
+def test_score_equal_to_the_best_after_rounding_is_not_kept(run: Run, first: float, second: float) -> None:
     """Two evaluators of one version among them: the name is taken, and what is kept is the same."""
     for evaluator in ("e", "f"):
         run.begin(1, evaluator)
@@ -135,7 +135,7 @@ def test_a_score_that_rounds_to_the_best_is_no_better(run: Run, first: float, se
     assert run.names == ["0000000001", "best_5.0_0000000001"]
 
 
-def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_previous_best_is_kept_when_the_disk_is_full(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run.play(1, 5.0)
     run.begin(2)
 
@@ -146,7 +146,7 @@ def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, m
     answer, text = run.report(2, 9.0)
     monkeypatch.undo()
     assert answer.verdict == "accepted"
-    assert text.endswith("the best so far, but it could not be kept (No space left on device)")
+    assert text.endswith("the best so far, but its checkpoint was not kept: No space left on device")
     best = best_checkpoints(run.directory)[0]
     assert best.name == "best_5.0_0000000001"
     run.save(3)
@@ -158,7 +158,7 @@ def test_a_disk_that_refuses_costs_a_warning_and_not_the_former_best(run: Run, m
 # ---------------------------------------------------------------------------------------------- what is kept
 
 
-def test_what_is_being_played_is_not_pruned(run: Run) -> None:
+def test_checkpoint_under_evaluation_is_not_pruned(run: Run) -> None:
     played = run.begin(1)
     for version in range(2, 7):
         run.save(version)
@@ -169,7 +169,7 @@ def test_what_is_being_played_is_not_pruned(run: Run) -> None:
     assert run.names == ["0000000006", "0000000007", "best_3.0_0000000001"]
 
 
-def test_each_evaluator_plays_its_own(run: Run) -> None:
+def test_each_evaluator_reports_only_its_own_evaluation(run: Run) -> None:
     run.begin(1, "e")
     run.begin(2, "f")
     for version in range(3, 6):
@@ -180,7 +180,7 @@ def test_each_evaluator_plays_its_own(run: Run) -> None:
     assert run.report(1, 1.0, evaluator="e")[0].verdict == "accepted"
 
 
-def test_an_evaluator_that_asks_again_gives_up_what_it_played(run: Run) -> None:
+def test_new_request_of_an_evaluator_replaces_its_previous_evaluation(run: Run) -> None:
     run.begin(1)
     run.begin(2)
     run.save(3)
@@ -200,32 +200,32 @@ def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str,
     assert run.evaluations.take_newest() == {}
 
 
-def test_an_evaluator_that_was_given_nothing_is_rejected(run: Run) -> None:
+def test_report_without_an_evaluation_in_progress_is_rejected(run: Run) -> None:
     run.save(1)
-    assert_not_taken(run, *run.report(1, 9.0), "rejected", "'e' was not given version 1 to play")
+    assert_not_taken(run, *run.report(1, 9.0), "rejected", "evaluator 'e' has no evaluation of policy version 1")
 
 
-def test_another_version_is_rejected_and_the_right_one_still_awaited(run: Run) -> None:
+def test_report_of_a_wrong_version_is_rejected_and_the_evaluation_stays_open(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(2, 9.0), "rejected", "was not given version 2")
+    assert_not_taken(run, *run.report(2, 9.0), "rejected", "no evaluation of policy version 2")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 
-def test_a_report_counts_once(run: Run) -> None:
+def test_second_report_of_an_evaluation_is_rejected(run: Run) -> None:
     run.begin(1)
     assert run.report(1, 3.0)[0].verdict == "accepted"
     assert run.report(1, 9.0)[0].verdict == "rejected"
     assert run.names[-1] == "best_3.0_0000000001"
 
 
-def test_another_life_of_the_learner_is_fenced(run: Run) -> None:
+def test_report_for_another_learner_epoch_is_fenced(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another life")
+    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another learner epoch")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_returns_that_are_not_finite_are_rejected(run: Run, value: float) -> None:
+def test_report_with_returns_that_are_not_finite_is_rejected(run: Run, value: float) -> None:
     run.begin(1)
     assert_not_taken(run, *run.report(1, 3.0, value), "rejected", "not finite")
     assert run.report(1, 3.0)[0].verdict == "accepted"
@@ -234,7 +234,7 @@ def test_returns_that_are_not_finite_are_rejected(run: Run, value: float) -> Non
 # -------------------------------------------------------------------------------------------------- metrics
 
 
-def test_the_newest_is_told_once_in_columns_of_the_metrics(run: Run) -> None:
+def test_newest_evaluation_is_returned_once_as_metrics_columns(run: Run) -> None:
     assert run.evaluations.take_newest() == {}
     run.play(1, 1.0)
     run.play(2, 3.0, 5.0)
@@ -249,13 +249,13 @@ def test_the_newest_is_told_once_in_columns_of_the_metrics(run: Run) -> None:
     assert run.evaluations.take_newest() == {}
 
 
-def test_returns_too_large_to_add_up_as_float32_are_averaged(run: Run) -> None:
+def test_mean_of_returns_does_not_overflow_float32(run: Run) -> None:
     run.play(1, 3e38, 3e38)
     assert run.evaluations.take_newest()["evaluation_return_mean"] == pytest.approx(3e38)
 
 
-def test_evaluators_that_never_report_hold_a_bounded_number_of_checkpoints(tmp_path: Path) -> None:
+def test_number_of_checkpoints_in_use_is_bounded_when_evaluators_never_report(tmp_path: Path) -> None:
     evaluations = Evaluations(learner_epoch=1)
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
-    assert evaluations.kept == {tmp_path / str(number) for number in range(84, 100)}
+    assert evaluations.checkpoints_in_use == {tmp_path / str(number) for number in range(84, 100)}

@@ -37,7 +37,7 @@ ANYWHERE = st.one_of(NEAR, NEAR, st.integers(0, 3000), st.sampled_from([HUGE, HU
 
 
 @given(st.lists(st.tuples(ANYWHERE, st.booleans()), max_size=60))
-def test_the_window_takes_what_a_set_of_all_numbers_would(steps: list[tuple[int, bool]]) -> None:
+def test_sequence_window_equals_a_set_of_all_numbers(steps: list[tuple[int, bool]]) -> None:
     window, naive, last = SequenceWindow(), NaiveWindow(), 0
     for number, from_here in steps:
         sequence = min(last + number if from_here else number, 2**63 - 1)
@@ -52,7 +52,7 @@ def test_the_window_takes_what_a_set_of_all_numbers_would(steps: list[tuple[int,
         assert (probe in window) == (probe in naive)
 
 
-def test_the_window_remembers_no_more_than_it_may_reorder() -> None:
+def test_sequence_window_is_bounded_by_the_reordering_distance() -> None:
     window = SequenceWindow()
     for sequence in range(0, 20 * WINDOW, 2):  # every second one is lost
         window.add(sequence)
@@ -63,7 +63,7 @@ def test_the_window_remembers_no_more_than_it_may_reorder() -> None:
     assert (in_order.low, in_order.gaps, len(in_order._above)) == (20 * WINDOW, 0, 0)
 
 
-def test_a_huge_jump_gives_up_all_that_was_passed() -> None:
+def test_large_jump_counts_all_skipped_numbers_as_gaps() -> None:
     window = SequenceWindow()
     window.add(3)
     window.add(HUGE)
@@ -77,23 +77,23 @@ def test_a_huge_jump_gives_up_all_that_was_passed() -> None:
 OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=DiscreteSpace(count=2))
 
 
-def test_who_comes_without_spaces_only_asks_what_is_played() -> None:
+def test_join_without_spaces_changes_nothing() -> None:
     fleet = Fleet(1, None)
     assert fleet.join(Join(actor="a", incarnation=1), 0.0) is None
     assert (fleet.spaces, fleet.actors) == (None, {})
     fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 3.0)
     assert fleet.join(Join(actor="a", incarnation=2), 9.0) is None
     actor = fleet.actors["a"]
-    assert (actor.incarnation, actor.lives, actor.last_seen, actor.environments) == (1, 1, 3.0, 2)
+    assert (actor.incarnation, actor.incarnations, actor.last_seen, actor.environments) == (1, 1, 3.0, 2)
 
 
-def test_the_first_actor_with_spaces_decides_them() -> None:
+def test_first_join_with_spaces_sets_the_spaces_of_the_run() -> None:
     fleet = Fleet(1, None)
     assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=2), 0.0) is None
     assert fleet.spaces == SPACES
 
 
-def test_other_spaces_are_refused_and_both_are_named() -> None:
+def test_join_with_other_spaces_is_refused_with_both_spaces_named() -> None:
     fleet = joined_fleet("a")
     refusal = fleet.join(Join(actor="b", incarnation=1, spaces=OTHER, environments=1), 0.0)
     assert refusal is not None
@@ -104,13 +104,13 @@ def test_other_spaces_are_refused_and_both_are_named() -> None:
     assert "b" not in fleet.actors
 
 
-def test_the_spaces_of_a_checkpoint_hold() -> None:
+def test_join_with_other_spaces_than_the_checkpoint_is_refused() -> None:
     refusal = Fleet(1, SPACES).join(Join(actor="a", incarnation=1, spaces=OTHER, environments=1), 0.0)
     assert refusal is not None
     assert refusal.code == "mismatch"
 
 
-def test_a_number_of_environments_out_of_range_is_refused() -> None:
+def test_join_with_number_of_environments_out_of_range_is_refused() -> None:
     for environments in (0, 4097, 2**62):
         fleet = Fleet(1, None)
         refusal = fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=environments), 0.0)
@@ -119,32 +119,32 @@ def test_a_number_of_environments_out_of_range_is_refused() -> None:
         assert (fleet.spaces, fleet.actors) == (None, {})
 
 
-def test_a_new_incarnation_starts_afresh_and_the_old_one_is_no_longer_expected() -> None:
+def test_new_incarnation_replaces_an_absent_one_and_starts_without_sequence_numbers() -> None:
     fleet = joined_fleet("a")
     actor = fleet.actors["a"]
-    assert fleet.expected(identity("a")) is actor
+    assert fleet.find(identity("a")) is actor
     actor.sequences.add(0)
     fleet.set_present("a", 1, False)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
-    assert fleet.expected(identity("a")) is actor  # who only asks what is played replaces nobody
-    assert fleet.expected(identity("a", incarnation=2)) is None
+    assert fleet.find(identity("a")) is actor  # who only asks what is played replaces nobody
+    assert fleet.find(identity("a", incarnation=2)) is None
     assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=3), 0.0) is None
-    assert fleet.expected(identity("a")) is None
-    assert fleet.expected(identity("a", incarnation=2)) is actor
+    assert fleet.find(identity("a")) is None
+    assert fleet.find(identity("a", incarnation=2)) is actor
     assert 0 not in actor.sequences
-    assert actor.lives == 2
+    assert actor.incarnations == 2
 
 
-def test_joining_again_in_the_same_life_forgets_nothing() -> None:
+def test_second_join_of_an_incarnation_keeps_its_sequence_numbers() -> None:
     fleet = joined_fleet("a")
     fleet.actors["a"].sequences.add(0)
     assert fleet.join(Join(actor="a", incarnation=1), 1.0) is None
     assert 0 in fleet.actors["a"].sequences
-    assert fleet.actors["a"].lives == 1
-    assert fleet.expected(identity("a")) is not None
+    assert fleet.actors["a"].incarnations == 1
+    assert fleet.find(identity("a")) is not None
 
 
-def test_lives_without_end_are_not_all_remembered() -> None:
+def test_number_of_remembered_incarnations_is_bounded() -> None:
     fleet = joined_fleet("a")
     for incarnation in range(1000):
         fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=3), 0.0)
@@ -152,11 +152,11 @@ def test_lives_without_end_are_not_all_remembered() -> None:
     assert len(fleet.actors["a"].windows) <= 8
 
 
-def test_an_actor_never_heard_of_is_not_expected() -> None:
-    assert joined_fleet("a").expected(identity("b")) is None
+def test_find_returns_none_for_an_unknown_actor() -> None:
+    assert joined_fleet("a").find(identity("b")) is None
 
 
-def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
+def test_live_actors_are_present_and_have_joined_with_spaces() -> None:
     fleet = joined_fleet("a", "b")
     fleet.join(Join(actor="c", incarnation=1), 0.0)
     fleet.set_present("c", 1, True)
@@ -168,7 +168,7 @@ def test_live_are_those_that_are_present_and_have_joined_with_spaces() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "*", "x" * 65, "-a", "é"])
-def test_a_name_that_is_no_part_of_a_key_is_refused(name: str) -> None:
+def test_join_with_an_invalid_name_is_refused(name: str) -> None:
     fleet = Fleet(1, None)
     refusal = fleet.join(Join(actor=name, incarnation=1, spaces=SPACES, environments=1), 0.0)
     assert refusal is not None
@@ -177,7 +177,7 @@ def test_a_name_that_is_no_part_of_a_key_is_refused(name: str) -> None:
     assert not fleet.actors
 
 
-def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_are_forgotten() -> None:
+def test_actor_absent_longest_is_evicted_at_capacity() -> None:
     fleet = Fleet(1, None)
 
     def join(number: int) -> Refusal | None:
@@ -189,7 +189,7 @@ def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_a
         fleet.set_present(f"a{number}", 1, True)
     refusal = join(most)
     assert refusal is not None
-    assert (refusal.code, refusal.reason) == ("full", f"{most} actors take part already")
+    assert (refusal.code, refusal.reason) == ("full", f"{most} actors have already joined")
     for away in (7, 5, 9):
         fleet.set_present(f"a{away}", 1, False)
     assert join(most) is None
@@ -198,7 +198,7 @@ def test_of_more_actors_than_can_be_remembered_those_that_are_away_for_longest_a
     assert {"a7", "a9"} < fleet.actors.keys()
 
 
-def test_a_name_is_taken_for_as_long_as_the_life_that_bears_it_is_there() -> None:
+def test_name_is_refused_while_its_incarnation_is_live() -> None:
     fleet = joined_fleet("a")
     other = Join(actor="a", incarnation=2, spaces=SPACES, environments=1)
     for asking in (other, Join(actor="a", incarnation=2)):
@@ -211,16 +211,16 @@ def test_a_name_is_taken_for_as_long_as_the_life_that_bears_it_is_there() -> Non
     fleet.set_present("a", 1, False)
     assert fleet.join(other, 4.0) is None
     assert fleet.live == {"a"}
-    assert fleet.actors["a"].lives == 2
+    assert fleet.actors["a"].incarnations == 2
 
 
-def test_the_name_of_one_that_is_shut_out_is_free() -> None:
+def test_name_of_a_quarantined_actor_can_be_reused() -> None:
     fleet = joined_fleet("a")
     fleet.actors["a"].quarantined = "nonsense"
     assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=1), 0.0) is None
 
 
-def test_presence_of_another_life_makes_nobody_live() -> None:
+def test_presence_of_another_incarnation_does_not_make_an_actor_live() -> None:
     fleet = joined_fleet("a")
     fleet.set_present("a", 2, True)
     fleet.set_present("a", 1, False)
@@ -228,7 +228,7 @@ def test_presence_of_another_life_makes_nobody_live() -> None:
     assert [status.alive for status in fleet.statuses(0.0)] == [False]
 
 
-def test_presence_alone_makes_nobody_an_actor() -> None:
+def test_presence_without_join_does_not_create_an_actor() -> None:
     fleet = Fleet(1, None)
     fleet.set_present("a", 1, True)
     assert not fleet.actors
@@ -236,7 +236,7 @@ def test_presence_alone_makes_nobody_an_actor() -> None:
     assert fleet.live == {"a"}
 
 
-def test_what_never_came_is_counted_and_fits_a_message() -> None:
+def test_missed_rollouts_are_counted_and_fit_the_wire_integer() -> None:
     fleet = joined_fleet("a")
     fleet.actors["a"].sequences.add(WINDOW + 4)
     assert fleet.statuses(0.0)[0].rollouts_missed == 5
@@ -246,7 +246,7 @@ def test_what_never_came_is_counted_and_fits_a_message() -> None:
     assert fleet.statuses(0.0)[0].rollouts_missed < 2**63
 
 
-def test_seeds_differ_by_actor_life_start_and_run_and_are_otherwise_the_same() -> None:
+def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
     def seeds(run_seed: int) -> dict[tuple[str, int, int], int]:
         fleet = Fleet(run_seed, None)
         found = {}
@@ -261,7 +261,7 @@ def test_seeds_differ_by_actor_life_start_and_run_and_are_otherwise_the_same() -
     assert len({*seeds(1).values(), *seeds(2).values()}) == 16
 
 
-def test_statuses_tell_of_each_actor_by_name() -> None:
+def test_statuses_are_sorted_by_actor_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
     fleet.actors["b"].accepted = 5

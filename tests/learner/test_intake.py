@@ -32,7 +32,10 @@ class Harness:
     def memory(self) -> list[Any]:
         """All that the fleet knows, but for what a rejection is to leave: when it was, and the count of it."""
         told = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
-        return [self.fleet.spaces, [{**each, "last_seen": None, "rejected": None, "unfit": None} for each in told]]
+        return [
+            self.fleet.spaces,
+            [{**each, "last_seen": None, "rejected": None, "consecutive_unfit": None} for each in told],
+        ]
 
 
 @pytest.fixture
@@ -68,7 +71,7 @@ def with_value(name: str, value: float) -> Rollout:
 # ------------------------------------------------------------------------------------------- acceptance
 
 
-def test_a_good_rollout_is_accepted_as_it_was_sent(harness: Harness) -> None:
+def test_valid_rollout_is_accepted_unchanged(harness: Harness) -> None:
     rollout = good(version=VERSION - 2)
     verdict = harness.receive(encode(rollout), now=5.0)
     assert isinstance(verdict, Rollout)
@@ -81,16 +84,16 @@ def test_a_good_rollout_is_accepted_as_it_was_sent(harness: Harness) -> None:
     assert acknowledgement(verdict, VERSION).policy_version == VERSION
 
 
-def test_actors_count_their_sequences_apart(harness: Harness) -> None:
+def test_same_sequence_number_from_two_actors_is_accepted_from_both(harness: Harness) -> None:
     for actor in ("a", "b"):
         assert isinstance(harness.receive(encode(good(who=identity(actor))), actor), Rollout)
 
 
-def test_a_lag_up_to_the_bound_is_accepted(harness: Harness) -> None:
+def test_rollout_with_policy_lag_at_the_bound_is_accepted(harness: Harness) -> None:
     assert isinstance(harness.receive(encode(good(version=VERSION - MAX_LAG))), Rollout)
 
 
-def test_the_sender_is_told_the_reason_and_not_a_novel(harness: Harness) -> None:
+def test_acknowledgement_cuts_a_long_reason_to_500_characters(harness: Harness) -> None:
     verdict = Rejected(verdict="fenced", cause="epoch", reason="x" * 9000)
     answer = acknowledgement(verdict, VERSION)
     assert (answer.verdict, answer.reason, answer.policy_version) == ("fenced", "x" * 500, VERSION)
@@ -104,12 +107,14 @@ def test_the_sender_is_told_the_reason_and_not_a_novel(harness: Harness) -> None
     [b"", b"DAED", b"nonsense of some length, no message", encode(good())[:-1], encode(good()) + b"\0"],
     ids=["empty", "too short", "nonsense", "cut", "too long"],
 )
-def test_what_is_no_message_is_malformed(harness: Harness, data: bytes) -> None:
+def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, data: bytes) -> None:
     assert assert_rejected(harness, data, "malformed").verdict == "rejected"
 
 
-def test_another_message_is_no_rollout(harness: Harness) -> None:
-    assert_rejected(harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "not a rollout")
+def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
+    assert_rejected(
+        harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "the message is not a rollout"
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,8 +128,10 @@ def test_another_message_is_no_rollout(harness: Harness) -> None:
     ],
     ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
-def test_other_numbers_of_rows_and_environments_are_malformed(harness: Harness, rollout: Rollout) -> None:
-    reason = f"it has {rollout.rows} rows of {rollout.environments} environments, this run has {ROWS} of"
+def test_rollout_with_wrong_number_of_rows_or_environments_is_rejected_as_unfit(
+    harness: Harness, rollout: Rollout
+) -> None:
+    reason = f"the rollout has {rollout.rows} rows of {rollout.environments} environments, expected {ROWS} rows of"
     assert_rejected(harness, encode(rollout), "unfit", reason)
 
 
@@ -139,19 +146,21 @@ def test_other_numbers_of_rows_and_environments_are_malformed(harness: Harness, 
     ],
     ids=["larger", "smaller", "more dimensions", "a stack", "dtype"],
 )
-def test_other_frames_are_malformed_and_both_are_named(harness: Harness, rollout: Rollout) -> None:
+def test_frames_with_wrong_shape_or_dtype_are_rejected_with_both_shapes_named(
+    harness: Harness, rollout: Rollout
+) -> None:
     theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
     verdict = assert_rejected(harness, encode(rollout), "unfit", theirs)
-    assert f"this run has float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
+    assert f"expected float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
 
-def test_far_more_than_the_run_allows_is_refused_before_it_is_unpacked(harness: Harness) -> None:
+def test_oversized_rollout_is_rejected_before_it_is_unpacked(harness: Harness) -> None:
     bomb = good(rows=4000, environments=500, frames=np.zeros((4001, 500, 3), np.float32))
     assert_rejected(harness, encode(bomb), "malformed", "the limit is")
 
 
 @pytest.mark.parametrize("action", [-1, SPACES.action.count, 2**31 - 1])
-def test_an_action_out_of_range_is_malformed(harness: Harness, action: int) -> None:
+def test_action_out_of_range_is_rejected_as_unfit(harness: Harness, action: int) -> None:
     actions = good().actions.astype(np.int32)
     actions[-1, -1] = action
     assert_rejected(harness, encode(good(actions=actions)), "unfit", "action")
@@ -159,41 +168,39 @@ def test_an_action_out_of_range_is_malformed(harness: Harness, action: int) -> N
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["frames", "behaviour_log_probs", "rewards", "episode_returns"])
-def test_a_number_that_is_not_finite_is_malformed_and_its_array_named(
-    harness: Harness, name: str, value: float
-) -> None:
+def test_value_that_is_not_finite_is_rejected_with_its_array_named(harness: Harness, name: str, value: float) -> None:
     assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
 
 
-def test_a_log_probability_above_0_is_malformed(harness: Harness) -> None:
+def test_log_probability_above_0_is_rejected_as_unfit(harness: Harness) -> None:
     assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 
 
-def test_a_log_probability_that_rounding_put_above_0_is_accepted(harness: Harness) -> None:
+def test_log_probability_above_0_by_rounding_is_accepted(harness: Harness) -> None:
     assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
 
 
-def test_a_policy_version_yet_to_come_is_malformed(harness: Harness) -> None:
-    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "yet to come")
+def test_rollout_with_a_future_policy_version_is_rejected_as_unfit(harness: Harness) -> None:
+    assert_rejected(harness, encode(good(version=VERSION + 1)), "unfit", "is newer than the learner's version")
 
 
 @pytest.mark.parametrize("size", [1, 7])
-def test_a_memory_where_the_policy_has_none_is_malformed(harness: Harness, size: int) -> None:
-    reason = f"its policy remembers {size} numbers, this run's 0"
+def test_recurrent_state_is_rejected_when_the_policy_has_no_memory(harness: Harness, size: int) -> None:
+    reason = f"initial_state has size {size}, expected 0"
     assert_rejected(harness, encode(good(state_size=size)), "unfit", reason)
 
 
 @pytest.mark.parametrize("size", [0, 4, 6])
-def test_a_memory_of_another_size_is_malformed(harness: Harness, size: int) -> None:
+def test_recurrent_state_of_wrong_size_is_rejected(harness: Harness, size: int) -> None:
     harness.intake.state_size = 5
     verdict = harness.receive(encode(good(state_size=size)))
     assert isinstance(verdict, Rejected)
-    assert verdict.reason == f"its policy remembers {size} numbers, this run's 5"
+    assert verdict.reason == f"initial_state has size {size}, expected 5"
     assert isinstance(harness.receive(encode(good(state_size=5))), Rollout)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_memory_that_is_not_finite_is_malformed(harness: Harness, value: float) -> None:
+def test_recurrent_state_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
     harness.intake.state_size = 5
     state = np.zeros((ENVIRONMENTS, 5), np.float32)
     state[-1, -1] = value
@@ -220,14 +227,14 @@ def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np
     return np.random.default_rng(0).integers(0, 256, (length, ENVIRONMENTS, *shape), np.uint8)
 
 
-def test_of_a_stack_each_frame_comes_once() -> None:
+def test_stacked_observations_are_sent_as_single_frames() -> None:
     rollout = good(frames=pixels())
     verdict = stacked_harness().receive(encode(rollout))
     assert isinstance(verdict, Rollout)
     np.testing.assert_array_equal(verdict.frames, rollout.frames)
 
 
-def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
+def test_frames_with_environment_first_memory_layout_are_decoded_equally() -> None:
     swapped = np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)
     verdict = stacked_harness().receive(encode(good(frames=swapped)))
     assert isinstance(verdict, Rollout)
@@ -247,13 +254,13 @@ def test_frames_that_lie_environment_by_environment_are_the_same() -> None:
     ],
     ids=["no stack", "a smaller stack", "a larger stack", "turned", "grey", "stacked already", "a line less"],
 )
-def test_frames_of_another_stack_or_size_are_malformed(frames: np.ndarray) -> None:
+def test_frames_with_wrong_stack_or_size_are_rejected(frames: np.ndarray) -> None:
     verdict = stacked_harness().receive(encode(good(frames=frames)))
     assert isinstance(verdict, Rejected)
     assert ("the limit is" if verdict.cause == "malformed" else "frames are uint8") in verdict.reason
 
 
-def test_the_limit_lets_the_largest_rollout_of_the_run_through_and_not_much_more() -> None:
+def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_frames() -> None:
     largest = good(frames=pixels(), initial_state=np.zeros((ENVIRONMENTS, 40_000), np.float32))
     largest = dataclasses.replace(
         largest,
@@ -269,7 +276,7 @@ def test_the_limit_lets_the_largest_rollout_of_the_run_through_and_not_much_more
 
 
 @given(st.data())
-def test_whatever_is_done_to_its_bytes_there_is_a_verdict(data: st.DataObject) -> None:
+def test_corrupted_bytes_always_get_a_verdict(data: st.DataObject) -> None:
     message = bytearray(encode(good()))
     for place in data.draw(st.lists(st.integers(0, len(message) - 1), min_size=1, max_size=4)):
         message[place] = data.draw(st.integers(0, 255))
@@ -280,17 +287,17 @@ def test_whatever_is_done_to_its_bytes_there_is_a_verdict(data: st.DataObject) -
 # ------------------------------------------------------------------------- whose it is, and when it was made
 
 
-def test_another_epoch_is_fenced(harness: Harness) -> None:
+def test_rollout_for_another_learner_epoch_is_fenced(harness: Harness) -> None:
     verdict = assert_rejected(harness, encode(good(who=identity(epoch=EPOCH - 1))), "epoch")
     assert acknowledgement(verdict, VERSION).verdict == "fenced"
 
 
-def test_a_sender_that_never_joined_is_fenced(harness: Harness) -> None:
+def test_rollout_of_an_actor_that_never_joined_is_fenced(harness: Harness) -> None:
     assert assert_rejected(harness, encode(good(who=identity("z"))), "unknown_actor", sender="z").verdict == "fenced"
     assert "z" not in harness.fleet.actors
 
 
-def test_nobody_is_known_before_there_are_spaces() -> None:
+def test_rollout_is_fenced_before_the_first_actor_has_joined() -> None:
     intake = Intake(run_spec(), EPOCH, Fleet(1, None))
     verdict = intake.read("a", encode(good()))
     assert isinstance(verdict, Rejected)
@@ -298,12 +305,12 @@ def test_nobody_is_known_before_there_are_spaces() -> None:
 
 
 @pytest.mark.parametrize("incarnation", [0, 2])
-def test_an_incarnation_that_never_joined_is_fenced(harness: Harness, incarnation: int) -> None:
+def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness, incarnation: int) -> None:
     verdict = assert_rejected(harness, encode(good(who=identity(incarnation=incarnation))), "unknown_actor")
     assert verdict.verdict == "fenced"
 
 
-def test_a_superseded_incarnation_is_fenced(harness: Harness) -> None:
+def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
     harness.fleet.set_present("a", 1, False)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = harness.receive(encode(good()))
@@ -312,7 +319,7 @@ def test_a_superseded_incarnation_is_fenced(harness: Harness) -> None:
     assert isinstance(harness.receive(encode(good(who=identity(incarnation=2)))), Rollout)
 
 
-def test_a_life_that_joins_again_after_another_has_nothing_taken_twice(harness: Harness) -> None:
+def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_again(harness: Harness) -> None:
     data = encode(good())
     assert isinstance(harness.receive(data), Rollout)
     for incarnation in (2, 1):
@@ -320,26 +327,26 @@ def test_a_life_that_joins_again_after_another_has_nothing_taken_twice(harness: 
     assert isinstance(harness.receive(data), Rejected)
 
 
-def test_nobody_can_send_in_anothers_name(harness: Harness) -> None:
+def test_rollout_with_the_identity_of_another_actor_is_fenced(harness: Harness) -> None:
     verdict = assert_rejected(harness, encode(good(who=identity("b"))), "unknown_actor", sender="a")
     assert verdict.verdict == "fenced"
     assert not harness.fleet.actors["b"].rejected
     assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
 
 
-def test_a_duplicate_is_rejected(harness: Harness) -> None:
+def test_duplicate_rollout_is_rejected(harness: Harness) -> None:
     assert isinstance(harness.receive(encode(good())), Rollout)
     assert assert_rejected(harness, encode(good()), "duplicate").verdict == "rejected"
 
 
-def test_a_stale_rollout_is_rejected_once_and_a_duplicate_from_then_on(harness: Harness) -> None:
+def test_stale_rollout_is_rejected_as_stale_first_and_as_duplicate_afterwards(harness: Harness) -> None:
     data = encode(good(version=VERSION - MAX_LAG - 1))
     verdicts = [harness.receive(data), harness.receive(data)]
     assert [verdict.cause for verdict in verdicts if isinstance(verdict, Rejected)] == ["stale", "duplicate"]
     assert harness.fleet.actors["a"].accepted == 0
 
 
-def test_a2c_takes_the_newest_version_only_whatever_lag_is_allowed() -> None:
+def test_a2c_rejects_older_versions_regardless_of_max_policy_lag() -> None:
     harness = Harness(algorithm="a2c")
     late = harness.receive(encode(good(version=VERSION - 1)))
     assert isinstance(late, Rejected)
@@ -358,7 +365,7 @@ def verdicts(harness: Harness, *messages: bytes) -> list[str]:
     return [acknowledgement(harness.receive(data), VERSION).verdict for data in messages]
 
 
-def test_after_three_unfit_rollouts_in_a_row_nothing_is_taken_any_more(harness: Harness) -> None:
+def test_actor_is_quarantined_after_three_unfit_rollouts_in_a_row(harness: Harness) -> None:
     fit = encode(good(who=identity(sequence=9)))
     assert verdicts(harness, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
     actor = harness.fleet.actors["a"]
@@ -368,12 +375,12 @@ def test_after_three_unfit_rollouts_in_a_row_nothing_is_taken_any_more(harness: 
     assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
 
 
-def test_a_fit_rollout_between_them_keeps_an_actor_out_of_quarantine(harness: Harness) -> None:
+def test_valid_rollout_in_between_resets_the_count_of_unfit_rollouts(harness: Harness) -> None:
     fit = [encode(good(who=identity(sequence=sequence))) for sequence in (10, 11)]
     assert "quarantined" not in verdicts(harness, broken(0), broken(1), fit[0], broken(2), broken(3), fit[1])
 
 
-def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(harness: Harness) -> None:
+def test_quarantine_ends_with_a_new_incarnation_but_not_with_a_second_join(harness: Harness) -> None:
     verdicts(harness, broken(0), broken(1), broken(2))
     harness.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     assert verdicts(harness, encode(good(who=identity(sequence=5)))) == ["quarantined"]
@@ -383,7 +390,7 @@ def test_a_new_life_leaves_the_quarantine_and_the_old_one_does_not(harness: Harn
     assert verdicts(harness, encode(good(who=identity(incarnation=2)))) == ["accepted"]
 
 
-def test_bytes_that_anybody_could_have_sent_quarantine_nobody(harness: Harness) -> None:
+def test_malformed_or_foreign_rollouts_do_not_quarantine_an_actor(harness: Harness) -> None:
     """Who does not know an actor's incarnation and the learner's epoch cannot have it shut out."""
     strangers = [identity(incarnation=8), identity(epoch=EPOCH + 1)]
     noise = [b"noise", encode(good())[:-1], *(encode(good(who=who, rows=ROWS - 1)) for who in strangers)]
@@ -391,7 +398,7 @@ def test_bytes_that_anybody_could_have_sent_quarantine_nobody(harness: Harness) 
     assert verdicts(harness, encode(good())) == ["accepted"]
 
 
-def test_rewards_beyond_what_they_are_clipped_to_are_unfit(harness: Harness) -> None:
+def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) -> None:
     spec = run_spec(max_policy_lag=MAX_LAG)
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
     harness.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
@@ -400,10 +407,10 @@ def test_rewards_beyond_what_they_are_clipped_to_are_unfit(harness: Harness) -> 
     assert isinstance(harness.receive(encode(within)), Rollout)
     verdict = harness.receive(encode(beyond))
     assert isinstance(verdict, Rejected)
-    assert verdict.reason == "rewards has a value beyond the 0.5 that they are clipped to"
+    assert verdict.reason == "rewards has a value outside the clip range of +-0.5"
 
 
-def test_an_episode_without_a_step_is_unfit(harness: Harness) -> None:
+def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
     assert_rejected(harness, encode(good(episode_lengths=np.array([0], np.int32))), "unfit", "episode_lengths")
 
 

@@ -73,7 +73,7 @@ KINDS = {
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_updates_are_those_of_the_plain_implementation(
+def test_updates_equal_those_of_the_reference_implementation(
     kind: str, policy: PolicySpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "randperm", torch.arange)
@@ -108,7 +108,7 @@ def first_gradient(learner: Learner, rollouts: list[Rollout]) -> Tensor:
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala"])
-def test_what_a_memory_learns_from_all_rows_at_once_is_what_it_would_learn_row_by_row(algorithm: str) -> None:
+def test_recurrent_gradient_over_all_rows_equals_the_gradient_row_by_row(algorithm: str) -> None:
     learner = make_learner(RECURRENT, algorithm=algorithm, max_gradient_norm=1e9)
     plain = PlainLearner(learner_spec(algorithm=algorithm, max_gradient_norm=1e9), RECURRENT, weights(learner))
     rollouts = make_rollouts(3, state_size=learner.state_size)
@@ -135,7 +135,7 @@ def on_policy(policy: PolicySpec, start: dict[str, np.ndarray], rollouts: list[R
 
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
-def test_on_policy_the_first_gradient_is_the_same_for_all_algorithms(policy: PolicySpec) -> None:
+def test_first_gradient_is_equal_for_all_algorithms_on_policy(policy: PolicySpec) -> None:
     common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1, "trace_lambda": 0.9}
     learners = {name: make_learner(policy, algorithm=name, **common) for name in ("a2c", "impala", "appo")}
     rollouts = make_rollouts(1, state_size=learners["appo"].state_size)
@@ -148,7 +148,7 @@ def test_on_policy_the_first_gradient_is_the_same_for_all_algorithms(policy: Pol
 
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
-def test_off_policy_appos_first_gradient_is_impalas(policy: PolicySpec) -> None:
+def test_first_gradient_of_appo_equals_impala_off_policy(policy: PolicySpec) -> None:
     """Its ratios compare with the policy that the batch found; how far that was from the actors' is V-trace's."""
     common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1}
     impala, appo = (make_learner(policy, algorithm=name, **common) for name in ("impala", "appo"))
@@ -158,9 +158,7 @@ def test_off_policy_appos_first_gradient_is_impalas(policy: PolicySpec) -> None:
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize(("passes", "count"), [(1, 1), (3, 4), (2, 50)])
-def test_a_batch_makes_as_many_versions_as_there_are_passes_and_minibatches(
-    policy: PolicySpec, passes: int, count: int
-) -> None:
+def test_batch_makes_one_version_for_each_minibatch_of_each_pass(policy: PolicySpec, passes: int, count: int) -> None:
     learner = make_learner(policy, algorithm="appo", passes=passes, minibatches=count)
     for step in range(1, 4):  # of 50 minibatches most are empty: 6 environments, 36 rows
         learner.step(make_rollouts(step, state_size=learner.state_size), 0.0)
@@ -169,7 +167,7 @@ def test_a_batch_makes_as_many_versions_as_there_are_passes_and_minibatches(
     assert all(np.isfinite(value) for value in learner.metrics.take_means().values())
 
 
-def test_the_smallest_batch_makes_as_many_versions_as_any() -> None:
+def test_batch_of_one_row_makes_one_version_for_each_minibatch() -> None:
     learner = make_learner(algorithm="appo", passes=2, minibatches=4)
     before = weights(learner)
     learner.step([make_rollout(rows=1, environments=1, valid=np.ones((1, 1), np.bool_))], 0.0)
@@ -184,7 +182,7 @@ def test_the_smallest_batch_makes_as_many_versions_as_any() -> None:
 # --------------------------------------------------------------------------------------------- the rest
 
 
-def test_rates_are_annealed_over_the_budget_and_no_further() -> None:
+def test_rates_are_annealed_over_the_budget_and_constant_outside() -> None:
     learner = make_learner(
         learning_rate=0.4, learning_rate_final=0.2, entropy_bonus=0.0, entropy_bonus_final=1.0, algorithm="a2c"
     )
@@ -193,19 +191,19 @@ def test_rates_are_annealed_over_the_budget_and_no_further() -> None:
     assert [learner.entropy_bonus(share) for share in shares] == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0, 1.0])
 
 
-def test_rates_without_a_final_one_stay() -> None:
+def test_rates_without_final_value_are_constant() -> None:
     learner = make_learner(learning_rate=0.4, entropy_bonus=0.3)
     assert [learner.learning_rate(share) for share in (0.0, 0.7, 1.0)] == [0.4] * 3
     assert [learner.entropy_bonus(share) for share in (0.0, 0.7, 1.0)] == [0.3] * 3
 
 
-def test_a_final_rate_of_0_is_not_taken_for_none() -> None:
+def test_final_rate_of_0_is_used() -> None:
     learner = make_learner(learning_rate_final=0.0, entropy_bonus_final=0.0)
     assert (learner.learning_rate(1.0), learner.entropy_bonus(1.0)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
-def test_the_same_seed_gives_the_same_weights_to_the_bit(algorithm: str) -> None:
+def test_same_seed_gives_identical_weights(algorithm: str) -> None:
     def trained(seed: int) -> dict[str, np.ndarray]:
         learner = make_learner(algorithm=algorithm, seed=seed)
         for step in range(STEPS):
@@ -219,7 +217,7 @@ def test_the_same_seed_gives_the_same_weights_to_the_bit(algorithm: str) -> None
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 @pytest.mark.parametrize("normalize", [False, True])
-def test_what_a_reset_row_holds_changes_no_weight(algorithm: str, normalize: bool, policy: PolicySpec) -> None:
+def test_content_of_reset_rows_does_not_change_the_weights(algorithm: str, normalize: bool, policy: PolicySpec) -> None:
     clean = make_rollouts(1, state_size=make_learner(policy).state_size)
     assert not all(rollout.valid.all() for rollout in clean)
     garbage = [
@@ -240,7 +238,7 @@ def test_what_a_reset_row_holds_changes_no_weight(algorithm: str, normalize: boo
     assert results[0][1] == results[1][1]
 
 
-def test_metrics_are_means_since_they_were_last_taken() -> None:
+def test_metrics_are_means_since_the_last_call() -> None:
     apart, together = make_learner(), make_learner()
     taken = []
     for step in range(3):
@@ -268,7 +266,7 @@ def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
     assert learner.metrics.take_means()["advantage_std"] == pytest.approx(rewards.std(), rel=1e-4)
 
 
-def test_action_counts_are_of_the_batches_since_they_were_last_taken() -> None:
+def test_action_counts_are_over_batches_since_the_last_call() -> None:
     learner = make_learner()
     assert learner.metrics.take_action_counts() == [0] * 4
     rollouts = make_rollouts(1) + make_rollouts(2)
@@ -282,7 +280,7 @@ def test_action_counts_are_of_the_batches_since_they_were_last_taken() -> None:
 @pytest.mark.parametrize(
     ("shape", "size"), [((2, 5), (2, 15)), ((2, 5, 1), (2, 15)), ((2, 5, 3), (2, 15, 3)), ((5,), None)]
 )
-def test_the_picture_is_the_stack_side_by_side_where_there_are_images(
+def test_observation_image_shows_the_stacked_frames_side_by_side(
     shape: tuple[int, ...], size: tuple[int, ...] | None
 ) -> None:
     space = ArraySpace(shape=shape, dtype="uint8", frames=3)
@@ -325,7 +323,7 @@ def restored(learner: Learner, directory: Path) -> Learner:
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize("algorithm", ["impala", "appo"])
 @pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
-def test_a_restored_learner_goes_on_to_the_bit(
+def test_restored_learner_continues_identically(
     optimizer: str, algorithm: str, policy: PolicySpec, tmp_path: Path
 ) -> None:
     settings = {"optimizer": optimizer, "algorithm": algorithm}
@@ -354,7 +352,7 @@ def test_a_restored_learner_goes_on_to_the_bit(
         assert torch.equal(value, state[name])
 
 
-def test_the_random_state_is_restored(tmp_path: Path) -> None:
+def test_random_state_is_restored(tmp_path: Path) -> None:
     learner = make_learner()
     checkpoint = saved(learner, tmp_path)
     expected = torch.rand(4)
@@ -362,7 +360,7 @@ def test_the_random_state_is_restored(tmp_path: Path) -> None:
     assert torch.equal(torch.rand(4), expected)
 
 
-def test_parameters_of_another_network_are_refused(tmp_path: Path) -> None:
+def test_restore_refuses_parameters_of_another_network(tmp_path: Path) -> None:
     checkpoint = saved(make_learner(), tmp_path)
     for other in (PolicySpec(hidden=(9,)), PolicySpec(hidden=(8, 8)), RECURRENT):
         with pytest.raises(CheckpointMismatchError, match="another network"):
@@ -370,7 +368,7 @@ def test_parameters_of_another_network_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("wrote", "reads"), [("rmsprop", "adam"), ("adam", "rmsprop")])
-def test_statistics_of_another_optimiser_are_refused(wrote: str, reads: str, tmp_path: Path) -> None:
+def test_restore_refuses_statistics_of_another_optimiser(wrote: str, reads: str, tmp_path: Path) -> None:
     checkpoint = saved(make_learner(optimizer=wrote), tmp_path)
     with pytest.raises(CheckpointMismatchError, match="another optimiser"):
         restored(make_learner(optimizer=reads), checkpoint)
@@ -381,7 +379,7 @@ def test_statistics_of_another_optimiser_are_refused(wrote: str, reads: str, tmp
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 @pytest.mark.parametrize("reward", [3e38, np.nan])
-def test_an_update_whose_gradient_is_not_finite_is_skipped_and_counted(algorithm: str, reward: float) -> None:
+def test_update_is_skipped_and_counted_when_its_gradient_is_not_finite(algorithm: str, reward: float) -> None:
     """Intake lets no nan in; what is finite may still be too large to learn from."""
     learner = make_learner(algorithm=algorithm, passes=2, minibatches=1)
     learner.step(make_rollouts(1), 0.0)

@@ -94,7 +94,7 @@ class House:
 FEW_UPDATES = {"passes": 2, "minibatches": 2}
 
 
-def test_evaluations_end_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Path) -> None:
+def test_evaluations_are_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Path) -> None:
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
         until(lambda: sum("evaluation at" in line for line in LINES) >= 3)
@@ -111,7 +111,7 @@ def test_evaluations_end_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Pa
     assert len(checkpoints(house.directory)) <= 2
 
 
-def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> None:
+def test_checkpoint_under_evaluation_is_not_pruned_by_later_checkpoints(tmp_path: Path) -> None:
     """A checkpoint after every update, of which one is kept, while the evaluator plays an older one."""
     often = {**FAST, "checkpoint_seconds": 1e-6}
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 400}, service=often)
@@ -120,10 +120,10 @@ def test_the_policy_that_is_played_is_not_pruned_meanwhile(tmp_path: Path) -> No
     finally:
         house.end()
     assert "the best so far" in "\n".join(LINES)
-    assert "could not be kept" not in "\n".join(LINES)
+    assert "was not kept" not in "\n".join(LINES)
 
 
-def test_the_evaluator_is_no_part_of_the_training(tmp_path: Path) -> None:
+def test_evaluator_is_not_counted_as_an_actor(tmp_path: Path) -> None:
     house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
         until(lambda: "evaluation at" in "\n".join(LINES))
@@ -135,7 +135,7 @@ def test_the_evaluator_is_no_part_of_the_training(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala", "appo"])
-def test_every_algorithm_learns_from_stacks_with_a_memory(tmp_path: Path, algorithm: str) -> None:
+def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path: Path, algorithm: str) -> None:
     training = {"env_steps": 10**9, "stop_when_solved": False, "algorithm": algorithm, **FEW_UPDATES}
     house = House(tmp_path, training=training)
     try:

@@ -20,7 +20,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_csv_has_a_header_and_a_line_for_each_row_with_blanks_for_the_unknown(tmp_path: Path) -> None:
+def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_path: Path) -> None:
     writer = CsvWriter(tmp_path / "metrics.csv")
     writer.write({"env_steps": 12_345_678, "wall_seconds": 1.23456789, "policy_loss": -1e-9}, NONE)
     (row,) = read(tmp_path / "metrics.csv")  # there before the writer is closed
@@ -30,7 +30,7 @@ def test_csv_has_a_header_and_a_line_for_each_row_with_blanks_for_the_unknown(tm
     assert known == {"env_steps": "12345678", "wall_seconds": "1.23457", "policy_loss": "-1e-09"}
 
 
-def test_csv_goes_on_after_a_resume_without_a_second_header(tmp_path: Path) -> None:
+def test_csv_continues_after_a_resume_without_a_second_header(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     for env_steps in (1, 2):
         writer = CsvWriter(path)
@@ -39,7 +39,7 @@ def test_csv_goes_on_after_a_resume_without_a_second_header(tmp_path: Path) -> N
     assert [row["env_steps"] for row in read(path)] == ["1", "2"]
 
 
-def test_csv_goes_on_in_the_columns_that_another_release_began_with(tmp_path: Path) -> None:
+def test_csv_continues_with_the_columns_of_an_existing_header(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.write_text("wall_seconds,policy_loss,env_steps,no_longer_measured\r\n0.5,0.25,10,7\r\n")
     writer = CsvWriter(path)
@@ -52,14 +52,14 @@ def test_csv_goes_on_in_the_columns_that_another_release_began_with(tmp_path: Pa
     ]
 
 
-def test_csv_gives_a_file_that_is_empty_its_header(tmp_path: Path) -> None:
+def test_csv_writes_a_header_to_an_empty_file(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.touch()
     CsvWriter(path).close()
     assert path.read_text().strip() == ",".join(COLUMNS)
 
 
-def test_tensorboard_reads_the_rows_against_env_steps(tmp_path: Path) -> None:
+def test_tensorboard_scalars_are_against_env_steps(tmp_path: Path) -> None:
     writer = TensorBoardWriter(tmp_path)
     writer.write({"env_steps": 100, "policy_loss": 0.5, "updates": 3}, NONE)
     writer.write({"env_steps": 250, "policy_loss": -1.5}, NONE)
@@ -71,7 +71,7 @@ def test_tensorboard_reads_the_rows_against_env_steps(tmp_path: Path) -> None:
     assert [(scalar.step, scalar.value) for scalar in events.Scalars("updates")] == [(100, 3.0)]
 
 
-def test_tensorboard_shows_distributions_and_what_the_network_sees(tmp_path: Path) -> None:
+def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Path) -> None:
     picture = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
     details = Details(returns=[1.0, 1.0, 5.0], lengths=[3, 4, 4], action_counts=[2, 0, 5], picture=picture)
     writer = TensorBoardWriter(tmp_path)
@@ -89,11 +89,11 @@ def test_tensorboard_shows_distributions_and_what_the_network_sees(tmp_path: Pat
     assert (image.step, image.width, image.height) == (100, 8, 6)
 
 
-def test_what_the_learner_measures_has_its_columns() -> None:
+def test_update_metrics_are_metrics_columns() -> None:
     assert set(METRICS) <= set(COLUMNS)
     assert len(set(COLUMNS)) == len(COLUMNS)
 
 
-def test_a_file_that_cannot_be_opened_is_an_os_error(tmp_path: Path) -> None:
+def test_csv_raises_os_error_when_the_file_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="Is a directory"):
         CsvWriter(tmp_path)

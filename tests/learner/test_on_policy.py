@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import torch
 from building import join
+from collectors import started_collector
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.distributions import categorical_log_probs
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Rollout, RolloutIdentity
@@ -37,7 +36,7 @@ def make_runtime(kind: str, policy: PolicySpec, spaces: Spaces, network: ActorCr
 @pytest.mark.parametrize("runtime", ["onnx", "torch"])
 @pytest.mark.parametrize("stack", [1, 3])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had(
+def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
     policy: str, stack: int, runtime: str
 ) -> None:
     # Episodes of 3, 2 and 1 steps: some begin, end and go on in every rollout of 5 rows.
@@ -49,17 +48,21 @@ def test_under_the_weights_that_chose_them_actions_have_the_probability_they_had
     with torch.no_grad():
         network.policy_head.weight.mul_(100.0)  # far from uniform, so that what was seen shows
     weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
-    collector = Collector(
-        environments, make_runtime(runtime, POLICIES[policy], spaces, network), spec, rollout_length=5, seed=2
+    collector = started_collector(
+        spec,
+        make_runtime(runtime, POLICIES[policy], spaces, network),
+        rollout_length=5,
+        seed=2,
+        weights=weights,
+        environments=environments,
     )
-    collector.load(weights)
     for _ in range(6):
-        rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY, 0)), Limits()))
+        rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY)), Limits()))
         assert isinstance(rollout, Rollout)
         batch = join([rollout], spaces.observation)
         with torch.no_grad():
-            logits, _ = network(batch.observations, batch.initial_state, batch.starts)
-            log_probs, _ = categorical_log_probs(logits[:-1], batch.actions)
+            parameters, _ = network(batch.observations, batch.initial_state, batch.starts)
+            log_probs, _ = network.distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
         valid = rollout.valid
         assert np.ptp(log_probs.numpy()[valid]) > 0.1
         np.testing.assert_allclose(log_probs.numpy()[valid], rollout.behaviour_log_probs[valid], atol=1e-4)

@@ -27,7 +27,7 @@ def gradients(steps: int, size: int) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("epsilon", [1e-8, 1e-5, 1e-2])
-def test_adam_is_torchs_adam(epsilon: float) -> None:
+def test_adam_equals_torch_adam(epsilon: float) -> None:
     size = 40
     ours = torch.linspace(-1.0, 1.0, size)
     theirs = nn.Parameter(ours.clone())
@@ -41,7 +41,7 @@ def test_adam_is_torchs_adam(epsilon: float) -> None:
         assert_close(ours, theirs.detach(), rtol=1e-5, atol=1e-6)
 
 
-def test_rmsprop_has_its_epsilon_inside_the_root() -> None:
+def test_rmsprop_adds_epsilon_inside_the_root() -> None:
     size, epsilon, decay, rate = 6, 1e-1, 0.9, 0.01
     ours = torch.linspace(-1.0, 1.0, size)
     theta, g = ours.tolist(), [0.0] * size
@@ -54,14 +54,14 @@ def test_rmsprop_has_its_epsilon_inside_the_root() -> None:
         assert ours.tolist() == pytest.approx(theta, rel=1e-5, abs=1e-6)
 
 
-def test_flat_parameters_keep_the_values() -> None:
+def test_flat_parameters_keep_the_initial_values() -> None:
     module, same = network(), network()
     FlatParameters(module.parameters())
     for ours, theirs in zip(module.parameters(), same.parameters(), strict=True):
         assert torch.equal(ours, theirs)
 
 
-def test_the_module_sees_a_step_in_the_flat_vector() -> None:
+def test_change_of_the_flat_vector_changes_the_module() -> None:
     module, observations = network(), torch.ones(3, 4)
     flat = FlatParameters(module.parameters())
     before = module(observations)
@@ -71,7 +71,7 @@ def test_the_module_sees_a_step_in_the_flat_vector() -> None:
     assert torch.equal(module(observations), torch.tensor([7.0, 8.0]).expand(3, 2))
 
 
-def test_backward_fills_the_flat_gradients_again_and_again() -> None:
+def test_backward_fills_the_flat_gradients_repeatedly() -> None:
     module = network()
     reference = copy.deepcopy(module)
     flat = FlatParameters(module.parameters())
@@ -85,7 +85,7 @@ def test_backward_fills_the_flat_gradients_again_and_again() -> None:
 
 
 @pytest.mark.parametrize("max_norm", [0.5, 1e6])
-def test_clipping_is_torchs(max_norm: float) -> None:
+def test_gradient_clipping_equals_torch_clipping(max_norm: float) -> None:
     module = network()
     reference = copy.deepcopy(module)
     flat = FlatParameters(module.parameters())

@@ -42,7 +42,7 @@ def row(env_steps: int, **known: float) -> dict[str, float]:
     }
 
 
-def test_a_terminal_has_one_line_that_is_rewritten() -> None:
+def test_line_is_rewritten_on_a_terminal() -> None:
     screen = Screen()
     progress = Progress(screen, 1000)
     progress.show(row(100))
@@ -53,7 +53,7 @@ def test_a_terminal_has_one_line_that_is_rewritten() -> None:
     assert "\n" not in screen.getvalue()
 
 
-def test_what_is_said_stays_and_begins_a_line_of_its_own() -> None:
+def test_said_text_is_a_permanent_line_of_its_own() -> None:
     screen = Screen()
     progress = Progress(screen, 1000)
     progress.say("one")
@@ -66,7 +66,7 @@ def test_what_is_said_stays_and_begins_a_line_of_its_own() -> None:
     assert lines[2:] == ["two", "three", ""]
 
 
-def test_the_end_leaves_the_line_as_it_is_once() -> None:
+def test_end_terminates_the_rewritten_line_once() -> None:
     screen = Screen()
     progress = Progress(screen, 1000)
     progress.show(row(100))
@@ -76,7 +76,7 @@ def test_the_end_leaves_the_line_as_it_is_once() -> None:
     assert screen.getvalue().endswith("\n")
 
 
-def test_elsewhere_a_line_comes_after_1_second_and_then_every_5(clock: Clock) -> None:
+def test_file_gets_a_line_after_1_second_and_then_every_5_seconds(clock: Clock) -> None:
     stream = io.StringIO()
     progress = Progress(stream, 1000)
     shown = []
@@ -92,7 +92,7 @@ def test_elsewhere_a_line_comes_after_1_second_and_then_every_5(clock: Clock) ->
     assert "\x1b" not in stream.getvalue()
 
 
-def test_elsewhere_the_end_adds_no_empty_line(clock: Clock) -> None:
+def test_end_adds_no_empty_line_to_a_file(clock: Clock) -> None:
     stream = io.StringIO()
     progress = Progress(stream, 1000)
     clock.now += 2.0
@@ -104,7 +104,7 @@ def test_elsewhere_the_end_adds_no_empty_line(clock: Clock) -> None:
     assert lines[1] == "done"
 
 
-def test_the_line_tells_the_return_once_there_is_one() -> None:
+def test_line_shows_the_return_after_the_first_episode() -> None:
     screen = Screen()
     progress = Progress(screen, 2_000_000)
     progress.show(row(1_500_000))

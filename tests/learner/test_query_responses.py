@@ -23,7 +23,7 @@ def read(data: bytes) -> Message:
     return decode(data, Limits())
 
 
-def test_an_actor_is_welcomed_with_all_it_needs() -> None:
+def test_welcome_contains_run_epoch_specification_and_seed() -> None:
     responses, fleet = make_responses()
     answer = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(answer, Welcome)
@@ -31,7 +31,7 @@ def test_an_actor_is_welcomed_with_all_it_needs() -> None:
     assert answer.seed == fleet.seed_for("a", 0)
 
 
-def test_what_is_not_a_join_is_refused_and_no_actor() -> None:
+def test_message_that_is_not_a_join_is_refused() -> None:
     responses, fleet = make_responses()
     for data, code in ((b"\xff", "mismatch"), (encode(RunEnded(learner_epoch=1, reason="")), "malformed")):
         answer = read(responses.join(data, 0.0))
@@ -40,7 +40,7 @@ def test_what_is_not_a_join_is_refused_and_no_actor() -> None:
     assert not fleet.actors
 
 
-def test_programs_are_known_by_their_hash() -> None:
+def test_program_is_found_by_its_hash() -> None:
     responses, _ = make_responses()
     program = Program(hash="abc", model=np.zeros(3, np.uint8))
     responses.offer_program(program)
@@ -51,7 +51,7 @@ def test_programs_are_known_by_their_hash() -> None:
     assert unknown.code == "unknown"
 
 
-def test_the_program_is_given_also_to_those_who_do_not_know_its_hash_yet() -> None:
+def test_wildcard_returns_the_current_program() -> None:
     responses, _ = make_responses()
     early = read(responses.program("*"))
     assert isinstance(early, Refusal)
@@ -62,7 +62,7 @@ def test_the_program_is_given_also_to_those_who_do_not_know_its_hash_yet() -> No
     assert answer.hash == "abc"
 
 
-def test_there_is_no_snapshot_then_the_newest_then_a_farewell() -> None:
+def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     responses, _ = make_responses()
     first = read(responses.snapshot())
     assert isinstance(first, Refusal)

@@ -54,7 +54,7 @@ def test_every_writer_gets_every_row_and_is_closed() -> None:
     assert tape == [("one", 7), ("two", 7), ("one", "closed"), ("two", "closed")]
 
 
-def test_rows_are_written_in_their_order(tmp_path: Path) -> None:
+def test_rows_are_written_in_order(tmp_path: Path) -> None:
     recording = Recorder([lambda: CsvWriter(tmp_path / "metrics.csv")], Progress(io.StringIO(), 100))
     for number in range(5):
         recording.record(row(number), Details())
@@ -62,7 +62,7 @@ def test_rows_are_written_in_their_order(tmp_path: Path) -> None:
     assert env_steps(tmp_path) == ["0", "1", "2", "3", "4"]
 
 
-def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_room(
+def test_full_disk_logs_one_warning_and_writing_resumes_when_there_is_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = threading.Event()
@@ -79,7 +79,7 @@ def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_ro
     recording.record(row(1), Details())
     recording.record(row(2), Details())
     recording.record(row(3), Details())
-    until(lambda: any("cannot be written" in line for line in LINES))
+    until(lambda: any("metrics not written" in line for line in LINES))
     until(lambda: recording._rows.empty())
     full.clear()
     recording.record(row(4), Details())
@@ -87,13 +87,13 @@ def test_a_full_disk_costs_one_warning_and_rows_are_written_again_when_it_has_ro
     recording.close()
     told = [line for line in LINES if "metrics" in line]
     assert told == [
-        "metrics cannot be written (No space left on device); training goes on",
+        "metrics not written: No space left on device; training continues, and writing is retried every 0 s",
         "metrics are written again",
     ]
     assert env_steps(tmp_path)[-2:] == ["4", "5"]
 
 
-def test_a_disk_that_takes_half_a_line_keeps_none_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partly_written_line_is_removed_when_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = CsvWriter(tmp_path / "metrics.csv")
     writer.write(row(1), Details())
     whole = (tmp_path / "metrics.csv").read_bytes()

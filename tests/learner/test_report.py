@@ -29,23 +29,23 @@ def trained_counters(*returns: float) -> RunCounters:
     return counters
 
 
-def test_rates_are_since_the_last_look() -> None:
+def test_rates_are_since_the_last_measurement() -> None:
     counters = trained_counters()
     meter = RateMeter(counters, 10.0)
     assert meter.rates == {}
     counters.trained([make_rollout(version=1, valid=EVERYTHING), make_rollout(version=4, valid=EVERYTHING)], 4, 1)
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
-    assert meter.look(counters, joined_fleet(), 12.0) == expected
+    assert meter.measure(counters, joined_fleet(), 12.0) == expected
     assert meter.rates == expected
-    assert set(meter.look(counters, joined_fleet(), 13.0).values()) == {0.0}
+    assert set(meter.measure(counters, joined_fleet(), 13.0).values()) == {0.0}
 
 
-def test_two_looks_at_once_divide_by_no_0() -> None:
+def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
     meter = RateMeter(trained_counters(), 10.0)
-    assert meter.look(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
+    assert meter.measure(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
 
 
-def test_episode_statistics_are_those_of_the_newest_episodes() -> None:
+def test_episode_statistics_are_over_the_newest_episodes() -> None:
     assert episode_statistics(RunCounters(3)) == {}
     assert episode_statistics(trained_counters(1.0, 2.0, 6.0)) == pytest.approx(
         {
@@ -58,11 +58,11 @@ def test_episode_statistics_are_those_of_the_newest_episodes() -> None:
     )
 
 
-def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
+def test_row_has_every_column_when_all_values_are_known() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False)
-    rates = RateMeter(counters, 0.0).look(counters, fleet, 1.0)
+    rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
     learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
@@ -71,16 +71,16 @@ def test_a_row_has_every_column_once_there_is_something_to_say() -> None:
     assert (row["actors"], row["rollouts_rejected"], row["policy_lag_max"]) == (1, 3, 2)
 
 
-def test_a_row_at_the_start_leaves_out_what_is_unknown() -> None:
+def test_first_row_omits_unknown_values() -> None:
     row = metrics_row(RunCounters(3), joined_fleet(), {}, {}, 0.0)
     assert set(row) < set(COLUMNS)
     assert "episode_return_mean" not in row
 
 
-def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
+def test_status_contains_the_run_and_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    health = Health(started=10.0, updated=24.0, attended=24.0, saved=20.0)
+    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0)
     status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
@@ -90,40 +90,38 @@ def test_the_status_tells_of_the_run_and_of_each_actor() -> None:
     assert [actor.actor for actor in status.actors] == ["a", "b"]
 
 
-HEALTHY = Health(started=0.0, updated=100.0, attended=100.0)
+HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
 
 
 @pytest.mark.parametrize(
     ("changed", "live", "problems"),
     [
         ({}, 2, ()),
-        ({"attended": 97.0}, 0, ()),
-        ({"attended": 90.0}, 0, ("no actor has taken part for 15 s",)),
-        ({"attended": 90.0}, 1, ()),
+        ({"actor_seen": 97.0}, 0, ()),
+        ({"actor_seen": 90.0}, 0, ("no live actor for 15 s",)),
+        ({"actor_seen": 90.0}, 1, ()),
         ({"updated": 44.0}, 1, ("no update for 61 s",)),
-        ({"updated": 44.0, "attended": 44.0}, 0, ("no actor has taken part for 61 s",)),
+        ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
         ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
         ({"save_fault": "No space left"}, 1, ("checkpoints cannot be saved: No space left",)),
     ],
 )
-def test_problems_are_what_keeps_the_service_from_its_work(
-    changed: dict[str, Any], live: int, problems: tuple[str, ...]
-) -> None:
+def test_problems_describe_an_unhealthy_service(changed: dict[str, Any], live: int, problems: tuple[str, ...]) -> None:
     assert dataclasses.replace(HEALTHY, **changed).problems(105.0, live) == problems
 
 
-def test_the_meter_tells_each_actor_its_own_rate() -> None:
+def test_measure_sets_the_rate_of_each_actor() -> None:
     counters, fleet = trained_counters(), joined_fleet("a", "b")
     meter = RateMeter(counters, 10.0)
     fleet.actors["a"].env_steps = 40
-    meter.look(counters, fleet, 12.0)
+    meter.measure(counters, fleet, 12.0)
     assert [fleet.actors[name].env_steps_per_second for name in ("a", "b")] == [20.0, 0.0]
     fleet.actors["a"].env_steps = 50
-    meter.look(counters, fleet, 13.0)
+    meter.measure(counters, fleet, 13.0)
     assert fleet.actors["a"].env_steps_per_second == 10.0
 
 
-def test_the_summary_is_json_and_counts_bytes_by_the_step() -> None:
+def test_summary_is_json_and_contains_bytes_per_env_step() -> None:
     made = summary(
         "run",
         run_spec(algorithm="a3c", seed=4),
@@ -140,7 +138,7 @@ def test_the_summary_is_json_and_counts_bytes_by_the_step() -> None:
     assert (made["policy_lag_mean"], made["policy_lag_max"], made["episode_return_mean"]) == (2.0, 2, 4.0)
 
 
-def test_the_summary_of_a_run_that_did_nothing_divides_by_no_0() -> None:
+def test_summary_of_an_empty_run_does_not_divide_by_0() -> None:
     made = summary(
         "run",
         run_spec(),

@@ -20,13 +20,13 @@ class Asked:
         raise AssertionError("a queue answers nothing")
 
 
-def test_requests_come_out_in_the_order_they_went_in() -> None:
+def test_requests_are_taken_in_order_of_arrival() -> None:
     queue, requests = RequestQueue(100, 100), [Asked(size) for size in (3, 0, 9)]
     assert all(queue.offer(request) for request in requests)
     assert [queue.take() for _ in requests] == requests
 
 
-def test_a_request_beyond_the_bound_is_refused_until_there_is_room() -> None:
+def test_request_above_the_byte_limit_is_refused_until_there_is_room() -> None:
     queue = RequestQueue(10, 100)
     assert queue.offer(Asked(6))
     assert queue.offer(Asked(4))
@@ -36,7 +36,7 @@ def test_a_request_beyond_the_bound_is_refused_until_there_is_room() -> None:
     assert queue.offer(Asked(6))
 
 
-def test_a_request_beyond_the_number_is_refused_until_one_was_taken() -> None:
+def test_request_above_the_number_limit_is_refused_until_one_is_taken() -> None:
     queue = RequestQueue(100, 2)
     assert queue.offer(Asked(0))
     assert queue.offer(Asked(1))
@@ -45,7 +45,7 @@ def test_a_request_beyond_the_number_is_refused_until_one_was_taken() -> None:
     assert queue.offer(Asked(1))
 
 
-def test_an_empty_queue_takes_a_request_of_any_size() -> None:
+def test_empty_queue_accepts_a_request_of_any_size() -> None:
     queue = RequestQueue(10, 100)
     assert queue.offer(Asked(1000))
     assert not queue.offer(Asked(1))
@@ -54,7 +54,7 @@ def test_an_empty_queue_takes_a_request_of_any_size() -> None:
 
 
 @given(st.lists(st.integers(0, 12) | st.none(), max_size=40))
-def test_what_is_held_is_what_was_offered_and_not_taken(steps: list[int | None]) -> None:
+def test_queue_equals_a_bounded_list_model(steps: list[int | None]) -> None:
     queue, held = RequestQueue(20, 5), list[Asked]()
     for size in steps:
         if size is not None:
@@ -66,7 +66,7 @@ def test_what_is_held_is_what_was_offered_and_not_taken(steps: list[int | None])
             assert queue.take() is held.pop(0)
 
 
-def test_after_the_close_what_is_queued_comes_out_and_then_none() -> None:
+def test_take_returns_queued_requests_and_then_none_after_close() -> None:
     queue, request = RequestQueue(10, 100), Asked(1)
     queue.offer(request)
     queue.close()
@@ -74,7 +74,7 @@ def test_after_the_close_what_is_queued_comes_out_and_then_none() -> None:
     assert queue.take() is None
 
 
-def test_take_waits_for_a_request_and_is_woken_by_the_close() -> None:
+def test_take_blocks_until_a_request_or_close() -> None:
     queue, request, taken = RequestQueue(10, 100), Asked(1), []
 
     def work() -> None:

@@ -22,7 +22,7 @@ def sequences(rollouts: list[Rollout]) -> list[int]:
 # -------------------------------------------------------------------------------------------- the barrier
 
 
-def test_the_barrier_waits_for_every_live_actor_and_orders_them_by_name() -> None:
+def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name() -> None:
     buffer, live = BarrierBuffer(1), {"a", "b", "c"}
     for actor in ("c", "a"):
         buffer.add(rollout(actor))
@@ -32,7 +32,7 @@ def test_the_barrier_waits_for_every_live_actor_and_orders_them_by_name() -> Non
     assert actors(buffer.take(live, 1)) == []
 
 
-def test_the_first_batch_waits_for_as_many_actors_as_were_asked_for() -> None:
+def test_first_batch_of_the_barrier_waits_for_the_configured_number_of_actors() -> None:
     buffer = BarrierBuffer(3)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
@@ -42,7 +42,7 @@ def test_the_first_batch_waits_for_as_many_actors_as_were_asked_for() -> None:
     assert actors(buffer.take({"a", "b", "c"}, 0)) == ["a", "b", "c"]
 
 
-def test_later_batches_do_not_wait_for_the_first_number() -> None:
+def test_later_batches_of_the_barrier_wait_only_for_live_actors() -> None:
     buffer = BarrierBuffer(2)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
@@ -51,21 +51,21 @@ def test_later_batches_do_not_wait_for_the_first_number() -> None:
     assert actors(buffer.take({"a"}, 1)) == ["a"]
 
 
-def test_an_actor_that_leaves_is_no_longer_waited_for() -> None:
+def test_barrier_does_not_wait_for_an_actor_that_has_left() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a", "b"}, 0)) == []
     assert actors(buffer.take({"a"}, 0)) == ["a"]
 
 
-def test_what_an_actor_sent_before_it_left_counts() -> None:
+def test_barrier_uses_the_rollout_of_an_actor_that_has_left() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("b"))
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a"}, 0)) == ["a", "b"]
 
 
-def test_an_actor_that_comes_later_is_waited_for() -> None:
+def test_barrier_waits_for_an_actor_that_joins_later() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a", "b"}, 0)) == []
@@ -73,7 +73,7 @@ def test_an_actor_that_comes_later_is_waited_for() -> None:
     assert actors(buffer.take({"a", "b"}, 0)) == ["a", "b"]
 
 
-def test_the_barrier_has_room_for_one_rollout_of_each_actor() -> None:
+def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("a"))
     assert not buffer.has_room_for(rollout("a", 1))
@@ -82,14 +82,14 @@ def test_the_barrier_has_room_for_one_rollout_of_each_actor() -> None:
     assert buffer.has_room_for(rollout("a", 1))
 
 
-def test_a_barrier_without_rollouts_gives_no_batch() -> None:
+def test_empty_barrier_returns_no_batch() -> None:
     assert actors(BarrierBuffer(0).take(set(), 0)) == []
 
 
 # --------------------------------------------------------------------------------------------- the stream
 
 
-def test_the_stream_gives_rollouts_in_the_order_they_came_whoever_sent_them() -> None:
+def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
     buffer = StreamBuffer(2, 0)
     for sequence in range(3):
         buffer.add(rollout("a" if sequence % 2 else "b", sequence))
@@ -99,7 +99,7 @@ def test_the_stream_gives_rollouts_in_the_order_they_came_whoever_sent_them() ->
     assert sequences(buffer.take(set(), 0).rollouts) == [2, 3]
 
 
-def test_the_stream_gives_back_what_grew_too_old() -> None:
+def test_stream_returns_stale_rollouts_separately() -> None:
     buffer = StreamBuffer(2, 3)
     for sequence, version in enumerate((0, 1, 5, 1, 4)):
         buffer.add(rollout("a", sequence, version))
@@ -109,13 +109,13 @@ def test_the_stream_gives_back_what_grew_too_old() -> None:
     assert buffer.take({"a"}, 5).stale == []
 
 
-def test_a_rollout_exactly_as_old_as_allowed_is_taken() -> None:
+def test_stream_returns_a_rollout_with_policy_lag_at_the_bound() -> None:
     buffer = StreamBuffer(1, 3)
     buffer.add(rollout("a", version=2))
     assert sequences(buffer.take(set(), 5).rollouts) == [0]
 
 
-def test_stale_rollouts_are_given_back_though_no_batch_is_complete() -> None:
+def test_stream_returns_stale_rollouts_when_no_batch_is_complete() -> None:
     buffer = StreamBuffer(2, 0)
     buffer.add(rollout("a", 0, version=0))
     buffer.add(rollout("a", 1, version=1))
@@ -126,7 +126,7 @@ def test_stale_rollouts_are_given_back_though_no_batch_is_complete() -> None:
 
 
 @pytest.mark.parametrize(("batch", "room"), [(1, 2), (2, 2), (3, 3)])
-def test_the_stream_has_room_for_a_batch_and_for_two_rollouts(batch: int, room: int) -> None:
+def test_stream_has_room_for_a_batch_and_at_least_two_rollouts(batch: int, room: int) -> None:
     buffer = StreamBuffer(batch, 0)
     for sequence in range(room):
         assert buffer.has_room_for(rollout("a", sequence))

@@ -63,35 +63,35 @@ def test_config_toml_reads_back_as_the_same_run(tmp_path_factory: pytest.TempPat
     assert run_directory.read_config(directory) == spec
 
 
-def test_config_toml_is_complete(tmp_path: Path) -> None:
+def test_config_toml_contains_defaults(tmp_path: Path) -> None:
     run_directory.write_config(tmp_path, run_spec())
     text = (tmp_path / run_directory.CONFIG).read_text()
     assert "discount_factor = 0.99" in text
     assert "checkpoint_seconds = 60.0" in text
 
 
-def test_config_toml_is_a_preset_too(tmp_path: Path) -> None:
+def test_config_toml_can_be_used_as_a_preset(tmp_path: Path) -> None:
     run_directory.create(tmp_path, run_spec(algorithm="a3c", seed=9))
     again = run_spec_of(read_preset(str(tmp_path / run_directory.CONFIG)))
     assert again == run_spec(algorithm="a3c", seed=9)
 
 
-def test_a_new_run_directory_says_what_the_run_is_and_what_it_ran_on(tmp_path: Path) -> None:
+def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
     run_directory.create(tmp_path / "runs" / "new", run_spec())
     assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == ["config.toml", "versions.json"]
     versions = run_directory.read_json(tmp_path / "runs" / "new" / run_directory.VERSIONS)
     assert {"python", "torch", "numpy", "eclipse-zenoh"} <= versions.keys()
 
 
-def test_an_existing_run_directory_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_existing_run_directory_is_refused_and_unchanged(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     run_directory.create(directory, run_spec(seed=1))
-    with pytest.raises(SettingsError, match=r"exists: continue it with `daedalus resume .*run`"):
+    with pytest.raises(SettingsError, match=r"exists: continue the run with `daedalus resume .*run`"):
         run_directory.create(directory, run_spec(seed=2))
     assert run_directory.read_config(directory).training.seed == 1
 
 
-def test_an_empty_directory_will_do_and_a_file_will_not(tmp_path: Path) -> None:
+def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run_directory.create(tmp_path / "empty", run_spec())
     (tmp_path / "file").touch()
@@ -101,12 +101,12 @@ def test_an_empty_directory_will_do_and_a_file_will_not(tmp_path: Path) -> None:
         run_directory.create(tmp_path / "file" / "run", run_spec())
 
 
-def test_what_is_no_run_directory_is_said_to_be_none(tmp_path: Path) -> None:
+def test_read_config_refuses_a_directory_without_config_toml(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"is not a run directory: it has no config\.toml"):
         run_directory.read_config(tmp_path)
 
 
-def test_json_reads_back_and_damage_is_an_error(tmp_path: Path) -> None:
+def test_json_reads_back_and_damage_raises(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     run_directory.write_json(path, {"solved": True, "seconds": 1.5})
     assert run_directory.read_json(path) == {"solved": True, "seconds": 1.5}
@@ -117,7 +117,7 @@ def test_json_reads_back_and_damage_is_an_error(tmp_path: Path) -> None:
         run_directory.read_json(tmp_path / "none.json")
 
 
-def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_file_is_unchanged_when_its_replacement_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "summary.json"
     run_directory.write_json(path, {"run": 1})
 
@@ -130,13 +130,13 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path, monkeypatch
     assert json.loads(path.read_text()) == {"run": 1}
 
 
-def test_a_default_directory_is_named_after_the_run() -> None:
+def test_default_directory_is_named_after_the_run() -> None:
     directory = run_directory.default_directory("ALE/Pong-v5", run_spec(algorithm="a3c", seed=4))
     assert directory.parent == Path("runs")
     assert directory.name.startswith("ALE-Pong-v5-a3c-s4-")
 
 
-def test_another_budget_changes_nothing_else() -> None:
+def test_with_budget_changes_only_the_budget() -> None:
     spec = run_spec(algorithm="a3c", target_return=2.0)
     longer = run_directory.with_budget(spec, 5_000_000)
     assert longer.training.env_steps == 5_000_000

@@ -38,28 +38,28 @@ def test_cartpole_is_a_preset() -> None:
     assert read_preset("cartpole")["environment"]["id"] == "CartPole-v1"
 
 
-def test_an_unknown_preset_is_answered_with_the_nearest() -> None:
+def test_unknown_preset_error_suggests_similar_names() -> None:
     with pytest.raises(SettingsError, match=r"unknown preset 'cartpoel': did you mean .*cartpole.*--env"):
         read_preset("cartpoel")
 
 
-def test_a_preset_like_no_other_is_answered_with_all_of_them() -> None:
-    with pytest.raises(SettingsError, match=rf"there are {', '.join(preset_names())}"):
+def test_unknown_preset_error_lists_all_presets_when_none_is_similar() -> None:
+    with pytest.raises(SettingsError, match=rf"the presets are {', '.join(preset_names())}"):
         read_preset("zzz")
 
 
-def test_a_file_is_as_good_as_a_preset(tmp_path: Path) -> None:
+def test_toml_file_can_be_used_as_a_preset(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text('[environment]\nid = "Own-v0"\n')
     assert read_preset(str(path)) == {"environment": {"id": "Own-v0"}}
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_unreadable_file_is_named_in_the_error(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"missing\.toml: No such file"):
         read_preset(str(tmp_path / "missing.toml"))
     for content in (b"= nonsense", b"a = '\xff'"):
         (tmp_path / "bad.toml").write_bytes(content)
-        with pytest.raises(SettingsError, match=r"bad\.toml is not TOML"):
+        with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
             read_file(tmp_path / "bad.toml")
 
 
@@ -82,29 +82,29 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         (" training.x =3", 3),
     ],
 )
-def test_a_value_is_toml_or_else_plain_text(assignment: str, value: object) -> None:
+def test_value_is_parsed_as_toml_or_else_used_as_text(assignment: str, value: object) -> None:
     assert settings(assignment)["training"] == {"x": value}
 
 
-def test_none_takes_a_setting_away() -> None:
+def test_value_none_unsets_a_setting() -> None:
     assert settings("training.x=none", training={"x": 1, "y": 2})["training"] == {"y": 2}
     assert run_spec(settings("training.target_return=none", training={"target_return": 4.0})).training == (
         run_spec(settings()).training
     )
 
 
-def test_assignments_reach_into_nested_tables_and_the_last_one_holds() -> None:
+def test_assignment_to_nested_tables_and_last_assignment_wins() -> None:
     made = settings("environment.kwargs.map.size=3", "environment.kwargs.map.size=4", "environment.kwargs.fast=true")
     assert made["environment"]["kwargs"] == {"map": {"size": 4}, "fast": True}
 
 
 @pytest.mark.parametrize("assignment", ["training.x", "x=3", "=3", "", "training"])
-def test_an_assignment_without_section_key_and_value_is_refused(assignment: str) -> None:
+def test_assignment_without_section_key_and_value_is_refused(assignment: str) -> None:
     with pytest.raises(SettingsError, match=r"write section\.key=value"):
         settings(assignment)
 
 
-def test_an_assignment_below_a_value_is_refused() -> None:
+def test_assignment_below_a_value_is_refused() -> None:
     with pytest.raises(SettingsError, match="id is a value, not a section"):
         settings("environment.id.x=1")
 
@@ -112,14 +112,14 @@ def test_an_assignment_below_a_value_is_refused() -> None:
 # ------------------------------------------------------------------------------------------- complaints
 
 
-def test_an_unknown_setting_is_answered_with_the_nearest() -> None:
+def test_unknown_setting_error_suggests_similar_names() -> None:
     said = complaint("training.learning_rte=0.1")
     assert said.startswith("unknown setting training.learning_rte: did you mean learning_rate")
     assert complaint("trainin.seed=1") == "unknown setting trainin: did you mean training?"
 
 
-def test_an_unknown_setting_like_no_other_is_answered_with_all_of_its_section() -> None:
-    assert "there are activation, encoder, hidden" in complaint("policy.zzz=1")
+def test_unknown_setting_error_lists_the_section_when_none_is_similar() -> None:
+    assert "the settings are activation, encoder, hidden" in complaint("policy.zzz=1")
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_an_unknown_setting_like_no_other_is_answered_with_all_of_its_section() 
         ("training.env_steps=0", "at least 1"),
     ],
 )
-def test_a_value_out_of_range_is_named_with_the_range(assignment: str, range_: str) -> None:
+def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) -> None:
     said, (name, _, value) = complaint(assignment), assignment.partition("=")
     assert said.startswith(f"setting {name} ")
     assert f"not {value}" in said
@@ -149,28 +149,28 @@ def test_a_value_out_of_range_is_named_with_the_range(assignment: str, range_: s
         "service.queue_megabytes=inf",
     ],
 )
-def test_a_value_that_is_not_finite_is_refused(assignment: str) -> None:
+def test_value_that_is_not_finite_is_refused(assignment: str) -> None:
     assert complaint(assignment).startswith(f"setting {assignment.partition('=')[0]} ")
 
 
-def test_a_value_of_another_kind_is_refused() -> None:
+def test_value_of_wrong_type_is_refused() -> None:
     assert complaint("training.learning_rate=fast").startswith("setting training.learning_rate should be")
     assert "one of a2c, a3c, impala, appo, not 'ppo'" in complaint("training.algorithm=ppo")
     assert complaint("policy.hidden=[64, 0]").startswith("setting policy.hidden.1 should be")
     assert complaint(training=3).startswith("setting training should be")
 
 
-def test_a_run_without_an_environment_is_refused() -> None:
+def test_settings_without_an_environment_are_refused() -> None:
     with pytest.raises(SettingsError, match="setting environment is missing"):
         run_spec({})
 
 
-def test_a_batch_size_for_a2c_is_refused_with_the_reason() -> None:
+def test_batch_rollouts_for_a2c_is_refused_with_the_reason() -> None:
     said = complaint("training.algorithm=a2c", "training.batch_rollouts=2")
     assert said == "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
 
 
-def test_a_preset_keeps_settings_for_one_algorithm() -> None:
+def test_for_algorithm_settings_apply_only_to_the_chosen_algorithm() -> None:
     def preset() -> dict:
         return {
             "environment": {"id": "CartPole-v1"},
@@ -187,14 +187,14 @@ def test_a_preset_keeps_settings_for_one_algorithm() -> None:
 
 
 @pytest.mark.parametrize("table", [3, {"impala": 3}, {"impala": {"training": 3}}])
-def test_a_table_for_an_algorithm_that_is_none_is_told(table: object) -> None:
+def test_for_algorithm_that_is_not_a_table_of_sections_is_refused(table: object) -> None:
     with pytest.raises(SettingsError, match="for_algorithm"):
         choose_algorithm({"training": {"algorithm": "impala"}, "for_algorithm": table}, None)
 
 
 @pytest.mark.parametrize("name", preset_names())
 @pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala"])
-def test_every_preset_makes_a_run_with_every_algorithm(name: str, algorithm: str) -> None:
+def test_every_preset_is_valid_with_every_algorithm(name: str, algorithm: str) -> None:
     settings = read_preset(name)
     choose_algorithm(settings, algorithm)
     assert run_spec(settings).training.algorithm == algorithm

@@ -1,4 +1,4 @@
-"""Networks in all their forms, for tests."""
+"""Networks of every kind, for tests."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ Weights = dict[str, np.ndarray]
 
 
 class Policy(NamedTuple):
-    """A network, what it was made from, and its program."""
+    """A network with its specification and program."""
 
     network: ActorCritic
     spec: PolicySpec
@@ -24,7 +24,7 @@ class Policy(NamedTuple):
     program: bytes
 
     def weights(self, seed: int = 0) -> Weights:
-        """Weights that make for decided policies, the value head's among them."""
+        """Return weights with which the policies are far from uniform, including the value head's."""
         random = np.random.default_rng(seed)
         return {
             name: random.normal(0, 1.5 / np.sqrt(max(4, parameter[0].numel())), tuple(parameter.shape)).astype(
@@ -34,7 +34,7 @@ class Policy(NamedTuple):
         }
 
     def load(self, weights: Weights) -> None:
-        """Gives the network itself these weights."""
+        """Copy these weights into the network."""
         self.network.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
 
     def acting_names(self) -> set[str]:
@@ -51,7 +51,7 @@ class Policy(NamedTuple):
 
 
 def observations(space: ArraySpace, leading: tuple[int, ...], seed: int = 1) -> np.ndarray:
-    """[*leading, *stacked_shape] of what fits the space."""
+    """Return random observations [*leading, *stacked_shape] of the space."""
     random, shape = np.random.default_rng(seed), (*leading, *space.stacked_shape)
     if space.dtype == "uint8":
         return random.integers(0, 256, shape, np.uint8)

@@ -1,4 +1,4 @@
-"""policy/saving/best_checkpoints.py: which are kept, under which names."""
+"""policy/saving/best_checkpoints.py: which checkpoints are kept, and their names."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def scored(run: Path) -> list[tuple[float, str]]:
     return [(best_score(each), (each / "content").read_text()) for each in best_checkpoints(run)]
 
 
-def test_names_can_be_read_back(tmp_path: Path) -> None:
+def test_scores_are_read_back_from_names(tmp_path: Path) -> None:
     assert best_name(812.34, 12345) == "best_812.3_0000012345"
     assert best_name(-20.5, 7) == "best_-20.5_0000000007"
     with pytest.raises(ValueError, match="finite"):
@@ -30,7 +30,7 @@ def test_names_can_be_read_back(tmp_path: Path) -> None:
     assert found == ["best_9.0_0000000004", "best_9.0_0000000003", "best_-20.5_0000000007"]
 
 
-def test_the_three_that_scored_highest_are_kept(tmp_path: Path) -> None:
+def test_three_highest_scores_are_kept(tmp_path: Path) -> None:
     best = [
         keep_if_best(checkpoint(tmp_path, version), score, version)
         for version, score in ((1, 5.0), (2, 9.0), (3, 1.0), (4, 7.0), (5, 0.5), (6, 10.0), (7, 9.0))
@@ -39,14 +39,14 @@ def test_the_three_that_scored_highest_are_kept(tmp_path: Path) -> None:
     assert scored(tmp_path) == [(10.0, "6"), (9.0, "7"), (9.0, "2")]
 
 
-def test_one_version_is_kept_once(tmp_path: Path) -> None:
+def test_version_is_kept_only_once(tmp_path: Path) -> None:
     directory = checkpoint(tmp_path, 1)
     assert keep_if_best(directory, 5.0, 1)
     assert not keep_if_best(directory, 6.0, 1)
     assert scored(tmp_path) == [(5.0, "1")]
 
 
-def test_another_score_is_another_name(tmp_path: Path) -> None:
+def test_rescoring_renames_the_checkpoint(tmp_path: Path) -> None:
     first, second = checkpoint(tmp_path, 1), checkpoint(tmp_path, 2)
     keep_if_best(first, 90.0, 1)
     (kept,) = best_checkpoints(tmp_path)
@@ -59,7 +59,7 @@ def test_another_score_is_another_name(tmp_path: Path) -> None:
     assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
 
 
-def test_what_a_crash_left_half_done_is_in_nobodys_way(tmp_path: Path) -> None:
+def test_leftovers_of_a_crash_are_replaced(tmp_path: Path) -> None:
     directory = checkpoint(tmp_path, 1)
     (directory.parent / ".best_5.0_0000000001" / "something").mkdir(parents=True)
     assert keep_if_best(directory, 5.0, 1)

@@ -1,4 +1,4 @@
-"""The user's own encoder is found, tried, exported, or refused in a line that says what to do."""
+"""Custom encoders are imported, checked and exported, or rejected with a one-line error."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -36,7 +36,7 @@ Building = Callable[[str], ActorCritic]
 
 @pytest.fixture
 def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]:
-    """Builds the network with the class `Net` of this source, whose module lies in the working directory."""
+    """Return a function that builds the network with class `Net` of a source, a module in the working directory."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -49,7 +49,7 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]
     sys.modules.pop("users_own", None)
 
 
-def test_a_class_in_the_working_directory_is_found_and_exported(build: Building) -> None:
+def test_class_in_the_working_directory_is_imported_and_exported(build: Building) -> None:
     network = build("class Net(Base): pass")
     assert network.encoder.features == 6 * 4 * 5
     assert network.convolutional
@@ -65,7 +65,7 @@ def test_a_class_in_the_working_directory_is_found_and_exported(build: Building)
     np.testing.assert_allclose(log_probs, logits.log_softmax(-1).numpy()[np.arange(5), actions], atol=1e-5)
 
 
-def test_it_is_given_the_stacked_shape_and_observations_as_they_are(build: Building) -> None:
+def test_encoder_receives_the_stacked_shape_and_raw_observations(build: Building) -> None:
     network = build(
         """
 class Net(Base):
@@ -82,13 +82,13 @@ class Net(Base):
 
 
 @pytest.mark.parametrize("name", ["not_there_at_all:Net", "not_there.at_all:Net", "..:Net"])
-def test_a_module_that_is_not_there(name: str) -> None:
+def test_missing_module_is_reported(name: str) -> None:
     with pytest.raises(NetworkError, match=rf"policy\.encoder={name}: .*"):
         ActorCritic(PolicySpec(encoder=name), SPACES)
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("import not_installed_at_all", "No module named 'not_installed_at_all'; install it"),
         ("class net(Base): pass", r"users_own.py has no torch.nn.Module 'Net'; name"),
@@ -97,8 +97,8 @@ def test_a_module_that_is_not_there(name: str) -> None:
         ("class Net(Base):\n    def forward(self, x): raise KeyError('mine')", "KeyError: 'mine'"),
         ("class Net(Base):\n    def forward(self, x): return self.convolution(x.float())", "must return .2, features."),
         ("class Net(Base):\n    def forward(self, x): return super().forward(x).sum(0)", "must return .2, features."),
-        ("class Net(Base):\n    def forward(self, x): return None", "makes NoneType of 2 observations"),
-        ("class Net(Base):\n    def forward(self, x): return super().forward(x)[:1]", r"makes \(1, 120\)"),
+        ("class Net(Base):\n    def forward(self, x): return None", "returns NoneType for 2 observations"),
+        ("class Net(Base):\n    def forward(self, x): return super().forward(x)[:1]", r"returns \(1, 120\)"),
         ("class Net(Base):\n    def forward(self, x): return super().forward(x).double()", "must return torch.float32"),
         ("class Net(Base):\n    features = 7", r"features=7 but returns \(2, 120\)"),
         (
@@ -109,8 +109,8 @@ def test_a_module_that_is_not_there(name: str) -> None:
         ("class Net(Base:", "SyntaxError"),
     ],
 )
-def test_what_is_no_encoder_is_refused_in_one_line(build: Building, source: str, said: str) -> None:
-    with pytest.raises(NetworkError, match=rf"policy\.encoder=users_own:Net: .*{said}") as caught:
+def test_invalid_encoder_is_rejected_with_one_line(build: Building, source: str, message: str) -> None:
+    with pytest.raises(NetworkError, match=rf"policy\.encoder=users_own:Net: .*{message}") as caught:
         build(source)
     assert "\n" not in str(caught.value)
 
@@ -142,14 +142,14 @@ def test_shared_weights_and_constants_are_exported(build: Building) -> None:
 
 
 @pytest.mark.parametrize(
-    ("returned", "said"),
+    ("returned", "message"),
     [
         ("torch.linalg.eigvals(x[:, :4, None] * torch.ones(4)).real", "cannot be exported to ONNX"),
-        ("torch.atan(x.double()).float()", "of no use to actors: the program cannot be run"),
+        ("torch.atan(x.double()).float()", "actors cannot run the program of the encoder: the program cannot be run"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(build: Building, returned: str, said: str) -> None:
+def test_encoder_that_cannot_be_exported_is_rejected(build: Building, returned: str, message: str) -> None:
     network = build(FORWARD + returned)
-    with pytest.raises(NetworkError, match=said) as caught:
+    with pytest.raises(NetworkError, match=message) as caught:
         export_program(network, SPACES.observation)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The network is the same step by step and unrolled, one row or many, in every layout of an image."""
+"""The network gives the same results step by step and unrolled, for one row and many, in every image layout."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def recurrent() -> Policy:
 
 
 def step_by_step(network: ActorCritic, seen: Tensor, state: Tensor, starts: Tensor) -> Tensor:
-    """As an actor plays: one row after the other, the memory emptied where an episode starts. The oracle."""
+    """Compute row after row as an actor does, with the memory reset at episode starts: the oracle."""
     rows = []
     for row in range(len(seen)):
         for environment in range(len(state)):
@@ -58,7 +58,7 @@ def check_unroll(policy: Policy, starts: np.ndarray, seed: int) -> None:
     torch.testing.assert_close(logits, expected, atol=2e-5, rtol=1e-4)
 
 
-def test_forward_is_acting_row_by_row(policy: Policy) -> None:
+def test_forward_matches_acting_row_by_row(policy: Policy) -> None:
     starts = np.zeros((5, 3), np.bool_)
     starts[2, 0] = starts[3, 1] = starts[0, 2] = True
     check_unroll(policy, starts, 0)
@@ -75,7 +75,7 @@ def test_episodes_may_start_anywhere(recurrent: Policy, starts: list[list[bool]]
     check_unroll(recurrent, np.array(starts, np.bool_).T, seed)
 
 
-def test_nothing_is_remembered_across_a_start_and_all_else_is(recurrent: Policy) -> None:
+def test_memory_is_reset_only_at_episode_starts(recurrent: Policy) -> None:
     seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 1)))
     starts = torch.tensor([[False], [False], [True], [False]])
     states = [torch.zeros(1, 12), torch.ones(1, 12)]
@@ -85,7 +85,7 @@ def test_nothing_is_remembered_across_a_start_and_all_else_is(recurrent: Policy)
     assert (one[:2] - other[:2]).abs().amax(-1).min() > 1e-4
 
 
-def test_the_memory_is_learned_through_all_rows(recurrent: Policy) -> None:
+def test_gradients_flow_through_the_memory_of_all_rows(recurrent: Policy) -> None:
     seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 2))).requires_grad_()
     logits, _ = recurrent.network(seen, torch.zeros(2, 12), torch.zeros(4, 2, dtype=torch.bool))
     logits[3, 0].square().sum().backward()
@@ -94,7 +94,7 @@ def test_the_memory_is_learned_through_all_rows(recurrent: Policy) -> None:
     assert (seen.grad[:, 1] == 0).all()
 
 
-def test_the_gru_is_that_of_torch() -> None:
+def test_gru_matches_torch() -> None:
     ours, theirs = Gru(7, 5), nn.GRUCell(7, 5)
     with torch.no_grad():
         for parameter in ours.parameters():
@@ -107,7 +107,7 @@ def test_the_gru_is_that_of_torch() -> None:
         torch.testing.assert_close(ours.step(features, state)[0], theirs(features, state), atol=1e-6, rtol=1e-5)
 
 
-def test_one_row_and_many_give_the_same(policy: Policy) -> None:
+def test_one_row_and_many_rows_give_the_same(policy: Policy) -> None:
     seen, states = torch.from_numpy(policy.observations(6)), torch.from_numpy(policy.states(6))
     with torch.no_grad():
         together, _ = policy.network.act(seen, states)
@@ -115,7 +115,7 @@ def test_one_row_and_many_give_the_same(policy: Policy) -> None:
     torch.testing.assert_close(together, torch.cat(alone), atol=2e-5, rtol=1e-4)
 
 
-def test_under_autocast_the_heads_are_float32_and_near(policy: Policy) -> None:
+def test_heads_are_float32_under_autocast(policy: Policy) -> None:
     seen = torch.from_numpy(observations(policy.spaces.observation, (3, 4)))
     state, starts = torch.from_numpy(policy.states(4)), torch.zeros(3, 4, dtype=torch.bool)
     logits, values = policy.network(seen, state, starts)
@@ -139,7 +139,7 @@ def test_new_policies_are_nearly_uniform() -> None:
         assert torch.isfinite(values).all()
 
 
-def test_convolutional_is_said_of_images(policy: Policy) -> None:
+def test_convolutional_is_true_for_image_encoders(policy: Policy) -> None:
     assert policy.network.convolutional == (policy.spec.encoder != "mlp")
 
 
@@ -147,7 +147,7 @@ def test_convolutional_is_said_of_images(policy: Policy) -> None:
 
 
 def encoder_of(name: str, shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1) -> nn.Module:
-    torch.manual_seed(0)  # the same weights wherever the shapes agree
+    torch.manual_seed(0)  # the same weights for equal shapes
     space = ArraySpace.model_validate({"shape": shape, "dtype": dtype, "frames": frames})
     return build_encoder(PolicySpec(encoder=name), space).requires_grad_(False)
 
@@ -156,7 +156,7 @@ def encoder_of(name: str, shape: tuple[int, ...], dtype: str = "uint8", frames: 
     ("name", "shape", "features"),
     [("small", (84, 84), 256), ("nature", (84, 84), 512), ("impala", (84, 84), 256), ("article", (96, 96), 1152)],
 )
-def test_the_networks_of_the_literature(name: str, shape: tuple[int, ...], features: int) -> None:
+def test_sizes_of_published_networks(name: str, shape: tuple[int, ...], features: int) -> None:
     encoder = encoder_of(name, shape, frames=4)
     parameters = {name: p.numel() for name, p in encoder.named_parameters()}
     assert encoder.features == features
@@ -174,7 +174,7 @@ def test_the_networks_of_the_literature(name: str, shape: tuple[int, ...], featu
 
 @pytest.mark.parametrize("name", ENCODERS)
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_every_layout_shows_the_same_picture(name: str, dtype: str) -> None:
+def test_all_layouts_give_the_same_features(name: str, dtype: str) -> None:
     height, width, frames, colours = 40, 44, 2, 3
     pictures = observations(
         ArraySpace.model_validate({"shape": (frames * colours, height, width), "dtype": dtype}), (2,)
@@ -203,13 +203,13 @@ def test_layouts_of_one_frame(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["small", "nature", "impala"])
-def test_bytes_count_as_numbers_from_0_to_1(name: str) -> None:
+def test_bytes_are_scaled_to_the_unit_interval(name: str) -> None:
     seen = torch.from_numpy(observations(ArraySpace(shape=(40, 44), dtype="uint8"), (2,)))
     ours, plain = encoder_of(name, (40, 44), "uint8"), encoder_of(name, (40, 44), "float32")
     torch.testing.assert_close(ours(seen), plain(seen / 255.0), atol=1e-5, rtol=1e-4)
 
 
-def test_the_article_sees_contrast_and_not_brightness() -> None:
+def test_article_encoder_ignores_brightness() -> None:
     seen = torch.from_numpy(observations(ArraySpace(shape=(4, 48, 48), dtype="float32"), (2,)))
     encoder = encoder_of("article", (4, 48, 48), "float32")
     torch.testing.assert_close(encoder(seen), encoder(3.0 * seen + 5.0), atol=1e-4, rtol=1e-3)
@@ -217,7 +217,7 @@ def test_the_article_sees_contrast_and_not_brightness() -> None:
     assert torch.isfinite(black).all()
 
 
-def test_the_article_normalises_as_written() -> None:
+def test_article_encoder_normalises_each_image() -> None:
     seen = torch.from_numpy(observations(ArraySpace(shape=(4, 32, 32), dtype="float32"), (3,)))
     encoder = encoder_of("article", (4, 32, 32), "float32")
     centred = seen - seen.mean((1, 2, 3), keepdim=True)
@@ -233,7 +233,7 @@ def test_the_article_normalises_as_written() -> None:
     torch.testing.assert_close(encoder(seen), expected, atol=1e-5, rtol=1e-4)
 
 
-def test_an_mlp_may_have_no_layers_and_stacks_are_flattened() -> None:
+def test_mlp_without_layers_flattens_stacks() -> None:
     encoder = MultilayerPerceptron(ArraySpace(shape=(3,), dtype="float32", frames=2), (), "tanh")
     assert encoder.features == 6
     seen = torch.arange(12.0).reshape(2, 2, 3)
@@ -242,18 +242,18 @@ def test_an_mlp_may_have_no_layers_and_stacks_are_flattened() -> None:
 
 @pytest.mark.parametrize("name", ENCODERS)
 @pytest.mark.parametrize(("shape", "frames"), [((4,), 1), ((4,), 4), ((2, 3, 4, 5), 1)])
-def test_what_is_no_image_is_refused(name: str, shape: tuple[int, ...], frames: int) -> None:
-    with pytest.raises(NetworkError, match=rf"'{name}' sees images.*{shape[0]}.*policy\.encoder"):
+def test_observations_that_are_not_images_are_rejected(name: str, shape: tuple[int, ...], frames: int) -> None:
+    with pytest.raises(NetworkError, match=rf"'{name}' takes images.*{shape[0]}.*policy\.encoder"):
         encoder_of(name, shape, frames=frames)
 
 
 @pytest.mark.parametrize(("name", "shape"), [("nature", (20, 20)), ("nature", (84, 35)), ("article", (1, 96))])
-def test_an_image_too_small_is_refused(name: str, shape: tuple[int, ...]) -> None:
-    with pytest.raises(NetworkError, match=rf"'{name}' leaves nothing of a uint8 array of shape \({shape[0]}, "):
+def test_too_small_image_is_rejected(name: str, shape: tuple[int, ...]) -> None:
+    with pytest.raises(NetworkError, match=rf"'{name}' needs images larger than a uint8 array of shape \({shape[0]}, "):
         encoder_of(name, shape, frames=4)
 
 
-def test_the_smallest_images() -> None:
+def test_smallest_accepted_images() -> None:
     assert encoder_of("nature", (36, 36)).features == 512
     assert encoder_of("impala", (1, 1)).features == 256
     assert encoder_of("article", (2, 2)).features == 32

@@ -1,4 +1,4 @@
-"""The two runtimes hold each other to the same actions; faults of programs and weights are PolicyErrors."""
+"""Both runtimes choose the same actions; faulty programs and weights raise PolicyError."""
 
 import os
 import subprocess
@@ -16,7 +16,6 @@ from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import (
-    LOGITS,
     NEXT_STATE,
     OBSERVATIONS,
     STATE,
@@ -25,6 +24,7 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     program_hash,
 )
+from daedalus.policy.acting.sampling import LOGITS
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 
@@ -55,9 +55,11 @@ def generator() -> np.random.Generator:
 
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
 @pytest.mark.parametrize("rows", [1, 17])
-def test_both_runtimes_act_alike(policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]) -> None:
+def test_both_runtimes_choose_the_same_actions(
+    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
+) -> None:
     both = policy.runtimes()
-    for seed in (0, 1):  # also when weights follow weights
+    for seed in (0, 1):  # also after weights are replaced
         results = []
         for runtime in both:
             runtime.load(policy.weights(seed))
@@ -71,7 +73,7 @@ def test_both_runtimes_act_alike(policy: Policy, rows: int, random: Callable[[],
         np.testing.assert_allclose(state, torch_state, atol=2e-5, rtol=0)
 
 
-def test_the_state_comes_back_to_what_it_was_made_from(policy: Policy) -> None:
+def test_state_is_carried_from_row_to_row(policy: Policy) -> None:
     rows = 5
     for runtime in policy.runtimes():
         runtime.load(policy.weights())
@@ -89,7 +91,7 @@ def test_the_state_comes_back_to_what_it_was_made_from(policy: Policy) -> None:
             assert state is given
 
 
-def test_acting_is_the_policy_half_of_learning(policy: Policy) -> None:
+def test_acting_matches_the_policy_of_learning(policy: Policy) -> None:
     rows, weights = 16, policy.weights()
     policy.load(weights)
     observations, states = policy.observations(rows), policy.states(rows)
@@ -98,7 +100,9 @@ def test_acting_is_the_policy_half_of_learning(policy: Policy) -> None:
             torch.from_numpy(observations)[None], torch.from_numpy(states), torch.zeros(1, rows, dtype=torch.bool)
         )
     assert (logits.shape, values.shape) == ((1, rows, policy.spaces.action.count), (1, rows))
-    assert (logits.std() > 0.05) | (policy.spaces.action.count == 1)  # what follows can fail
+    assert (logits.std() > 0.05) | (
+        policy.spaces.action.count == 1
+    )  # otherwise the comparison below would prove nothing
     for runtime in policy.runtimes():
         runtime.load(weights)
         actions, log_probs, _ = runtime.act(observations, states, generator())
@@ -106,7 +110,7 @@ def test_acting_is_the_policy_half_of_learning(policy: Policy) -> None:
         np.testing.assert_allclose(log_probs, expected, atol=2e-5, rtol=0)
 
 
-def test_samples_follow_the_generator_alone(runtime: PolicyRuntime, one_policy: Policy) -> None:
+def test_samples_depend_only_on_the_generator(runtime: PolicyRuntime, one_policy: Policy) -> None:
     runtime.load(one_policy.weights())
     observations = one_policy.observations(256)
     first, again, other = (runtime.act(observations, NO_STATE, np.random.default_rng(seed))[0] for seed in (5, 5, 6))
@@ -126,12 +130,12 @@ def test_bytes_are_scaled_to_the_unit_interval() -> None:
 
 
 @pytest.mark.parametrize("name", ["my_module:Net", "os:system"])
-def test_torch_imports_no_module_that_the_wire_names(name: str) -> None:
+def test_torch_runtime_imports_no_module_named_on_the_wire(name: str) -> None:
     with pytest.raises(PolicyError, match="use --runtime onnx"):
         TorchRuntime(PolicySpec(encoder=name), spaces((84, 84)))
 
 
-def test_torch_refuses_a_network_that_is_not_for_the_space() -> None:
+def test_torch_runtime_rejects_an_encoder_that_does_not_fit_the_space() -> None:
     with pytest.raises(PolicyError, match="'nature'"):
         TorchRuntime(PolicySpec(encoder="nature"), spaces((4,), "float32"))
 
@@ -139,13 +143,13 @@ def test_torch_refuses_a_network_that_is_not_for_the_space() -> None:
 # ------------------------------------------------------------------------------------------ the program
 
 
-def test_a_program_wants_the_acting_parameters_by_their_names(policy: Policy) -> None:
+def test_inputs_of_a_program_are_the_acting_parameters(policy: Policy) -> None:
     names = OnnxRuntime(policy.program).weight_names
     assert len(set(names)) == len(names)
     assert set(names) == policy.acting_names()
 
 
-def test_a_program_holds_no_weights(policy: Policy) -> None:
+def test_program_contains_no_weights(policy: Policy) -> None:
     graph = onnx.load_model_from_string(policy.program).graph
     inputs, outputs = ([OBSERVATIONS, STATE], [LOGITS, NEXT_STATE])
     ends = 2 if policy.network.state_size else 1
@@ -155,13 +159,13 @@ def test_a_program_holds_no_weights(policy: Policy) -> None:
     assert len(policy.program) < 32_768
 
 
-def test_a_program_does_not_grow_with_its_network(one_policy: Policy) -> None:
+def test_size_of_a_program_is_independent_of_the_network_size(one_policy: Policy) -> None:
     wide = make_policy({"hidden": (1024, 1024)}, spaces((4,), "float32", actions=2))
     assert abs(len(wide.program) - len(one_policy.program)) < 64
 
 
-def test_a_program_depends_on_the_architecture_and_not_on_the_weights(policy: Policy) -> None:
-    for value in (0.0, 1.0, None):  # parameters that are alike must stay apart, too
+def test_program_depends_only_on_the_architecture(policy: Policy) -> None:
+    for value in (0.0, 1.0, None):  # also for parameters with equal values
         for parameter in policy.network.parameters():
             torch.nn.init.normal_(parameter) if value is None else torch.nn.init.constant_(parameter, value)
         again = export_program(policy.network, policy.spaces.observation)
@@ -169,7 +173,7 @@ def test_a_program_depends_on_the_architecture_and_not_on_the_weights(policy: Po
     assert program_hash(make_policy({"hidden": (5,)}, spaces((2,), "float32")).program) != program_hash(policy.program)
 
 
-def test_the_hash_of_a_program_is_sha256() -> None:
+def test_hash_of_a_program_is_sha256() -> None:
     assert program_hash(b"abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
@@ -177,7 +181,7 @@ Shapes = dict[str, list[int | None] | None]
 
 
 def model(nodes: list[onnx.NodeProto], inputs: Shapes, outputs: Shapes, *initializers: TensorProto) -> bytes:
-    """A model of float32 arrays."""
+    """Return a model with float32 inputs and outputs."""
     ends = [
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in side.items()]
         for side in (inputs, outputs)
@@ -188,12 +192,12 @@ def model(nodes: list[onnx.NodeProto], inputs: Shapes, outputs: Shapes, *initial
 
 
 def other_program(inputs: tuple[str, ...], output: str) -> bytes:
-    """A model that adds its inputs up."""
+    """Return a model that adds its inputs."""
     node = helper.make_node("Sum", list(inputs), [output])
     return model([node], {name: [None, 2] for name in inputs}, {output: [None, 2]})
 
 
-def test_a_program_from_elsewhere_runs_if_its_names_are_right() -> None:
+def test_foreign_program_runs_if_its_names_are_right() -> None:
     runtime = OnnxRuntime(other_program((OBSERVATIONS,), LOGITS))
     runtime.load({})
     actions, _, _ = runtime.act(np.array([[1, 2], [2, 1]], np.float32), NO_STATE, None)
@@ -201,13 +205,13 @@ def test_a_program_from_elsewhere_runs_if_its_names_are_right() -> None:
 
 
 @pytest.mark.parametrize(("inputs", "output"), [(("pixels",), LOGITS), ((OBSERVATIONS,), "values")])
-def test_a_program_with_other_ends_is_refused(inputs: tuple[str, ...], output: str) -> None:
-    with pytest.raises(PolicyError, match="must turn 'observations' into 'logits'"):
+def test_program_with_wrong_inputs_or_outputs_is_rejected(inputs: tuple[str, ...], output: str) -> None:
+    with pytest.raises(PolicyError, match="must compute 'logits' from 'observations'"):
         OnnxRuntime(other_program(inputs, output))
 
 
 def remembering(state: list[int | None] | None, made_of_it: str = "Identity") -> bytes:
-    """A model with a memory of that shape."""
+    """Return a model with a memory of this shape."""
     nodes = [
         helper.make_node("Identity", [OBSERVATIONS], [LOGITS]),
         helper.make_node(made_of_it, [STATE], [NEXT_STATE]),
@@ -215,7 +219,7 @@ def remembering(state: list[int | None] | None, made_of_it: str = "Identity") ->
     return model(nodes, {OBSERVATIONS: [None, 2], STATE: state}, {LOGITS: [None, 2], NEXT_STATE: None})
 
 
-def test_a_program_with_a_memory_says_how_much() -> None:
+def test_state_size_is_read_from_the_program() -> None:
     runtime = OnnxRuntime(remembering([None, 3]))
     runtime.load({})
     state = np.arange(6, dtype=np.float32).reshape(2, 3)
@@ -224,12 +228,12 @@ def test_a_program_with_a_memory_says_how_much() -> None:
 
 
 @pytest.mark.parametrize("shape", [[None, None], [None, 0], [None, 1 << 40], [3], [None, 3, 3], []])
-def test_a_memory_without_a_sensible_size_is_refused(shape: list[int | None]) -> None:
+def test_memory_of_invalid_size_is_rejected(shape: list[int | None]) -> None:
     with pytest.raises(PolicyError, match=r"'state'|cannot be run"):
         OnnxRuntime(remembering(shape))
 
 
-def test_a_memory_that_comes_out_in_another_shape_is_refused() -> None:
+def test_next_state_of_another_shape_is_rejected() -> None:
     runtime = OnnxRuntime(remembering([None, 3], "Transpose"))
     runtime.load({})
     with pytest.raises(PolicyError, match=r"'next_state' \(3, 2\)"):
@@ -237,7 +241,7 @@ def test_a_memory_that_comes_out_in_another_shape_is_refused() -> None:
 
 
 @pytest.mark.parametrize("operation", ["Transpose", "Size", "Neg"])
-def test_outputs_that_are_no_logits_are_refused(operation: str) -> None:
+def test_output_that_is_not_logits_is_rejected(operation: str) -> None:
     kind = TensorProto.INT64 if operation == "Size" else TensorProto.FLOAT
     result = helper.make_tensor_value_info(LOGITS, kind, None)
     source = helper.make_tensor_value_info(OBSERVATIONS, TensorProto.FLOAT, [None, None])
@@ -248,7 +252,7 @@ def test_outputs_that_are_no_logits_are_refused(operation: str) -> None:
         OnnxRuntime(program).act(np.ones((2, columns), np.float32), NO_STATE, None)
 
 
-def test_a_program_that_fails_while_it_acts_is_at_fault_itself(one_policy: Policy) -> None:
+def test_program_that_fails_while_acting_raises_policy_error(one_policy: Policy) -> None:
     runtime = OnnxRuntime(one_policy.program)
     with pytest.raises(PolicyError, match="the program failed"):  # nothing is loaded yet
         runtime.act(one_policy.observations(1), NO_STATE, None)
@@ -257,7 +261,7 @@ def test_a_program_that_fails_while_it_acts_is_at_fault_itself(one_policy: Polic
         runtime.act(np.zeros((1, 9), np.float32), NO_STATE, None)
 
 
-def test_a_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     np.arange(2, dtype=np.float32).tofile("secret")
     tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[2], data_location=TensorProto.EXTERNAL)
@@ -270,19 +274,19 @@ def test_a_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert os.listdir() == ["secret"]
 
 
-def test_a_program_whose_weights_have_no_fixed_shape_takes_none() -> None:
+def test_weights_without_a_fixed_shape_are_rejected() -> None:
     runtime = OnnxRuntime(other_program((OBSERVATIONS, "w"), LOGITS))
     with pytest.raises(PolicyError, match="'w'"):
         runtime.load({"w": np.zeros((1, 2), np.float32)})
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\0", b"garbage", bytes(1000), np.random.default_rng(0).bytes(1000)])
-def test_garbage_is_no_program(garbage: bytes) -> None:
+def test_garbage_is_rejected(garbage: bytes) -> None:
     with pytest.raises(PolicyError):
         OnnxRuntime(garbage)
 
 
-def test_a_program_cut_short_is_refused(one_policy: Policy) -> None:
+def test_truncated_program_is_rejected(one_policy: Policy) -> None:
     for length in range(1, len(one_policy.program), 37):
         with pytest.raises(PolicyError):
             OnnxRuntime(one_policy.program[:length])
@@ -291,7 +295,7 @@ def test_a_program_cut_short_is_refused(one_policy: Policy) -> None:
 # ---------------------------------------------------------------------------------------- the constants
 
 
-def test_constants_are_the_inputs_they_replace(policy: Policy) -> None:
+def test_constants_give_the_same_results_as_inputs(policy: Policy) -> None:
     weights = {name: array for name, array in policy.weights().items() if name in policy.acting_names()}
     merged = onnx.load_model_from_string(with_initializers(policy.program, weights))
     assert {tensor.name for tensor in merged.graph.initializer} == policy.acting_names()
@@ -304,20 +308,20 @@ def test_constants_are_the_inputs_they_replace(policy: Policy) -> None:
     assert list(merged.graph.input) == list(before.graph.input)
 
 
-def test_weights_of_convolutions_are_constants_and_others_are_fed(policy: Policy) -> None:
+def test_only_programs_with_convolutions_use_constants(policy: Policy) -> None:
     runtime = OnnxRuntime(policy.program)
     runtime.load(policy.weights())
     weights = policy.acting_names()
     fed = {entry.name for entry in runtime._session.get_inputs()} & weights
     assert fed == (set() if policy.network.convolutional else weights)
-    # What could be overridden, onnxruntime would not lay out beforehand.
+    # onnxruntime does not arrange constants that an input could override.
     assert not runtime._session.get_overridable_initializers()
 
 
 # ------------------------------------------------------------------------------------------ the weights
 
 
-def test_every_acting_weight_is_needed_and_named(runtime: PolicyRuntime, one_policy: Policy) -> None:
+def test_missing_weight_is_named(runtime: PolicyRuntime, one_policy: Policy) -> None:
     for name in one_policy.acting_names():
         weights = one_policy.weights()
         del weights[name]
@@ -325,7 +329,7 @@ def test_every_acting_weight_is_needed_and_named(runtime: PolicyRuntime, one_pol
             runtime.load(weights)
 
 
-def test_the_value_head_plays_no_part_in_acting(runtime: PolicyRuntime, one_policy: Policy) -> None:
+def test_acting_does_not_need_the_value_head(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations = one_policy.observations(32)
     runtime.load(one_policy.weights())
     _, with_head, _ = runtime.act(observations, NO_STATE, None)
@@ -337,7 +341,7 @@ def test_the_value_head_plays_no_part_in_acting(runtime: PolicyRuntime, one_poli
 
 
 @pytest.mark.parametrize("shape", [(64, 5), (63, 4), (4, 64), (256,), (64, 4, 1), (0, 4), ()])
-def test_weights_of_another_shape_are_refused_by_name(
+def test_weights_of_another_shape_are_rejected_by_name(
     runtime: PolicyRuntime, one_policy: Policy, shape: tuple[int, ...]
 ) -> None:
     name = "encoder.layers.0.weight"
@@ -345,14 +349,14 @@ def test_weights_of_another_shape_are_refused_by_name(
         runtime.load(one_policy.weights() | {name: np.zeros(shape, np.float32)})
 
 
-def test_onnx_takes_float32_weights_alone(one_policy: Policy) -> None:
+def test_onnx_runtime_requires_float32_weights(one_policy: Policy) -> None:
     weights = one_policy.weights()
     weights["policy_head.bias"] = weights["policy_head.bias"].astype(np.int64)
     with pytest.raises(PolicyError, match=r"policy_head\.bias"):
         OnnxRuntime(one_policy.program).load(weights)
 
 
-def test_refused_weights_leave_the_loaded_ones_in_force(policy: Policy) -> None:
+def test_rejected_weights_leave_the_loaded_ones_in_use(policy: Policy) -> None:
     observations, states = policy.observations(8), policy.states(8)
     for runtime in policy.runtimes():
         runtime.load(policy.weights())
@@ -362,7 +366,7 @@ def test_refused_weights_leave_the_loaded_ones_in_force(policy: Policy) -> None:
         np.testing.assert_array_equal(runtime.act(observations, states, None)[1], before)
 
 
-def test_new_weights_change_what_is_done_and_old_ones_bring_it_back(runtime: PolicyRuntime, one_policy: Policy) -> None:
+def test_new_weights_change_the_actions_and_old_ones_restore_them(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations, outputs = one_policy.observations(64), []
     for seed in (0, 1, 0):
         runtime.load(one_policy.weights(seed))
@@ -380,8 +384,8 @@ def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) ->
     assert runtime.act(one_policy.observations(2), NO_STATE, None)[0].shape == (2,)
 
 
-def test_onnxruntime_is_kept_from_telling_its_makers() -> None:
-    """Where it may, and cannot write down who we are, it says so."""
+def test_onnxruntime_sends_no_telemetry() -> None:
+    """With telemetry enabled, onnxruntime warns that it cannot store the identity of this machine."""
     environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
     environment |= {"HOME": "/proc", "XDG_CACHE_HOME": "/proc"}
     command = [sys.executable, "-c", "import daedalus.policy.acting.runtime"]

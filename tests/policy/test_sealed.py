@@ -1,4 +1,4 @@
-"""A sealed directory is read as it was written, or not at all; and it is written whole, or not at all."""
+"""Sealed directories: reading detects every damage, and writing is atomic."""
 
 import errno
 import hashlib
@@ -27,7 +27,7 @@ def read_all(directory: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
 
 
 def is_damaged(directory: Path) -> bool:
-    """Whether reading it all ends in a DamagedError that names the directory; no other exception will do."""
+    """Assert that reading all files raises a DamagedError that names the directory, and no other exception."""
     with pytest.raises(DamagedError, match=re.escape(str(directory))):
         read_all(directory)
     return True
@@ -39,18 +39,18 @@ def sealed(tmp_path: Path) -> Path:
     return tmp_path / "0001"
 
 
-def test_what_was_written_is_read(sealed: Path) -> None:
+def test_written_files_are_read_back(sealed: Path) -> None:
     assert read_all(sealed) == (FILES, CONTENT)
     assert sorted(entry.name for entry in sealed.iterdir()) == ["empty", "manifest.json", "program", "seal", "weights"]
     assert [entry.name for entry in sealed.parent.iterdir()] == ["0001"]
 
 
-def test_missing_parents_are_made(tmp_path: Path) -> None:
+def test_missing_parents_are_created(tmp_path: Path) -> None:
     write_sealed(tmp_path / "run" / "checkpoints" / "0001", FILES, CONTENT)
     assert read_all(tmp_path / "run" / "checkpoints" / "0001") == (FILES, CONTENT)
 
 
-def test_a_manifest_can_be_read_by_anyone(sealed: Path) -> None:
+def test_manifest_is_plain_json(sealed: Path) -> None:
     manifest = json.loads((sealed / "manifest.json").read_bytes())
     assert manifest["content"] == CONTENT
     assert {name: entry["bytes"] for name, entry in manifest["files"].items()} == {
@@ -64,7 +64,7 @@ WRITTEN = [name for name, data in FILES.items() if data] + ["manifest.json", "se
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_flipped_bit_anywhere_is_damage(sealed: Path, name: str) -> None:
+def test_flipped_bit_is_detected(sealed: Path, name: str) -> None:
     whole = (sealed / name).read_bytes()
     for position in range(len(whole)):
         torn = bytearray(whole)
@@ -76,7 +76,7 @@ def test_a_flipped_bit_anywhere_is_damage(sealed: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_file_torn_at_any_length_is_damage(sealed: Path, name: str) -> None:
+def test_truncated_file_is_detected(sealed: Path, name: str) -> None:
     whole = (sealed / name).read_bytes()
     for length in range(len(whole)):
         (sealed / name).write_bytes(whole[:length])
@@ -84,7 +84,7 @@ def test_a_file_torn_at_any_length_is_damage(sealed: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*WRITTEN, "empty"])
-def test_a_file_that_grew_vanished_or_became_a_directory_is_damage(sealed: Path, name: str) -> None:
+def test_longer_missing_or_replaced_file_is_detected(sealed: Path, name: str) -> None:
     with open(sealed / name, "ab") as file:
         file.write(b"\0")
     assert is_damaged(sealed)
@@ -94,40 +94,40 @@ def test_a_file_that_grew_vanished_or_became_a_directory_is_damage(sealed: Path,
     assert is_damaged(sealed)
 
 
-def test_a_directory_that_is_not_there_or_is_a_file_is_damage(tmp_path: Path) -> None:
+def test_missing_directory_is_reported_as_damaged(tmp_path: Path) -> None:
     assert is_damaged(tmp_path / "absent")
     (tmp_path / "file").write_bytes(b"")
     assert is_damaged(tmp_path / "file")
 
 
-def test_a_name_that_was_never_written_is_damage(sealed: Path) -> None:
+def test_unknown_file_name_is_rejected(sealed: Path) -> None:
     for name in ("other", "manifest.json", "../0001/weights"):
-        with pytest.raises(DamagedError, match=f"{re.escape(str(sealed))}: has no"):
+        with pytest.raises(DamagedError, match=f"{re.escape(str(sealed))}: no file"):
             SealedDirectory(sealed).read(name)
 
 
-def test_a_manifest_of_another_directory_does_not_fit(sealed: Path) -> None:
+def test_manifest_of_another_directory_is_detected(sealed: Path) -> None:
     write_sealed(sealed.parent / "0002", {**FILES, "weights": bytes(40)}, CONTENT)
     for name in ("manifest.json", "seal"):
         shutil.copy(sealed.parent / "0002" / name, sealed / name)
     assert is_damaged(sealed)
 
 
-def test_a_manifest_beyond_all_reason_is_not_read(sealed: Path) -> None:
+def test_huge_manifest_is_not_read(sealed: Path) -> None:
     manifest = (sealed / "manifest.json").read_bytes().ljust((16 << 20) + 1)
     (sealed / "manifest.json").write_bytes(manifest)
     (sealed / "seal").write_text(hashlib.sha256(manifest).hexdigest())
     assert is_damaged(sealed)
 
 
-# ------------------------------------------------------------------------------------------- refused disks
+# ------------------------------------------------------------------------------------------- failing disks
 
 Failing = Callable[[str, int], None]
 
 
 @pytest.fixture
 def disk_full(monkeypatch: pytest.MonkeyPatch) -> Failing:
-    """disk_full(call, n): the n-th call (from 0) of that function of `os` fails, and those after it."""
+    """Return disk_full(call, n): makes the n-th call (from 0) of that function of `os` fail, and all later calls."""
 
     def arrange(call: str, allowed: int) -> None:
         working, left = getattr(os, call), [allowed]
@@ -148,7 +148,7 @@ REFUSALS = [("fsync", allowed) for allowed in range(len(FILES) + 3)] + [("replac
 
 
 @pytest.mark.parametrize(("call", "allowed"), REFUSALS)
-def test_a_write_that_fails_leaves_nothing(tmp_path: Path, disk_full: Failing, call: str, allowed: int) -> None:
+def test_failed_write_leaves_no_files(tmp_path: Path, disk_full: Failing, call: str, allowed: int) -> None:
     write_sealed(tmp_path / "0001", FILES, CONTENT)
     disk_full(call, allowed)
     with pytest.raises(OSError, match="No space left"):
@@ -158,9 +158,7 @@ def test_a_write_that_fails_leaves_nothing(tmp_path: Path, disk_full: Failing, c
 
 
 @pytest.mark.parametrize(("call", "allowed"), REFUSALS)
-def test_an_overwrite_that_fails_leaves_the_older_one(
-    sealed: Path, disk_full: Failing, call: str, allowed: int
-) -> None:
+def test_failed_overwrite_keeps_the_older_directory(sealed: Path, disk_full: Failing, call: str, allowed: int) -> None:
     disk_full(call, allowed)
     with pytest.raises(OSError, match="No space left"):
         write_sealed(sealed, dict.fromkeys(FILES, b"new"), {})
@@ -168,7 +166,7 @@ def test_an_overwrite_that_fails_leaves_the_older_one(
     assert read_all(sealed) == (FILES, CONTENT)
 
 
-def test_once_renamed_it_is_whole_even_if_the_rename_cannot_be_synced(sealed: Path, disk_full: Failing) -> None:
+def test_directory_is_complete_if_syncing_the_rename_fails(sealed: Path, disk_full: Failing) -> None:
     newer = dict.fromkeys(FILES, b"new")
     disk_full("fsync", len(FILES) + 3)
     with pytest.raises(OSError, match="No space left"):
@@ -177,7 +175,7 @@ def test_once_renamed_it_is_whole_even_if_the_rename_cannot_be_synced(sealed: Pa
     assert read_all(sealed) in ((newer, CONTENT), (FILES, CONTENT))
 
 
-def test_an_overwrite_replaces_everything(sealed: Path) -> None:
+def test_overwrite_replaces_all_files(sealed: Path) -> None:
     newer = {name: data + b"newer" for name, data in FILES.items() if name != "program"}
     write_sealed(sealed, newer, {"policy_version": 4})
     reread = SealedDirectory(sealed)
@@ -187,7 +185,7 @@ def test_an_overwrite_replaces_everything(sealed: Path) -> None:
     assert [entry.name for entry in sealed.parent.iterdir()] == ["0001"]
 
 
-def test_what_an_earlier_attempt_left_behind_is_no_obstacle(tmp_path: Path) -> None:
+def test_leftovers_of_an_earlier_attempt_are_replaced(tmp_path: Path) -> None:
     leftover = tmp_path / f".0001.{os.getpid()}.partial"
     leftover.mkdir()
     (leftover / "old").write_bytes(b"junk")
@@ -206,7 +204,7 @@ POLICY_CONTENT: dict[str, Any] = {
 POLICY_FILES = {PROGRAM_FILE: b"program", PARAMETERS_FILE: safetensors.numpy.save({"w": np.ones(3, np.float32)})}
 
 
-def test_a_saved_policy_is_read(tmp_path: Path) -> None:
+def test_saved_policy_is_read_back(tmp_path: Path) -> None:
     write_sealed(tmp_path / "0007", POLICY_FILES, POLICY_CONTENT)
     policy = read_policy(tmp_path / "0007")
     assert (policy.policy_version, policy.program, policy.spec.environment.id) == (7, b"program", "CartPole-v1")
@@ -224,14 +222,14 @@ def test_a_saved_policy_is_read(tmp_path: Path) -> None:
         {"spaces": {}},
     ],
 )
-def test_a_policy_of_another_release_is_refused_by_its_directory(tmp_path: Path, changed: dict[str, Any]) -> None:
+def test_policy_of_another_release_is_rejected_with_its_directory(tmp_path: Path, changed: dict[str, Any]) -> None:
     write_sealed(tmp_path / "0007", POLICY_FILES, POLICY_CONTENT | changed)
     with pytest.raises(DamagedError, match=re.escape(str(tmp_path / "0007"))):
         read_policy(tmp_path / "0007")
 
 
 @pytest.mark.parametrize("name", POLICY_CONTENT)
-def test_a_policy_that_lacks_something_is_refused(tmp_path: Path, name: str) -> None:
+def test_incomplete_policy_is_rejected(tmp_path: Path, name: str) -> None:
     content = {key: value for key, value in POLICY_CONTENT.items() if key != name}
     write_sealed(tmp_path / "0007", POLICY_FILES, content)
     with pytest.raises(DamagedError, match="another release"):
@@ -239,13 +237,13 @@ def test_a_policy_that_lacks_something_is_refused(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("weights", [b"", b"junk", bytes(100)])
-def test_weights_that_are_not_safetensors_are_refused(tmp_path: Path, weights: bytes) -> None:
+def test_weights_that_are_not_safetensors_are_rejected(tmp_path: Path, weights: bytes) -> None:
     write_sealed(tmp_path / "0007", {**POLICY_FILES, PARAMETERS_FILE: weights}, POLICY_CONTENT)
     with pytest.raises(DamagedError, match="another release"):
         read_policy(tmp_path / "0007")
 
 
-def test_checkpoints_are_listed_newest_first_and_nothing_else_is(tmp_path: Path) -> None:
+def test_checkpoints_are_listed_newest_first(tmp_path: Path) -> None:
     assert checkpoints(tmp_path) == []
     for name in ("0000000009", "0000000010", ".0000000011.77.partial", "notes"):
         (tmp_path / "checkpoints" / name).mkdir(parents=True)

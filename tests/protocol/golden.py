@@ -1,4 +1,4 @@
-"""One message of every kind, always the same, and the bytes of each as they lie in golden/v{PROTOCOL_VERSION}/.
+"""One fixed message of every kind; their bytes are in golden/v{PROTOCOL_VERSION}/.
 
 A change of the wire shows as other bytes. One that is meant raises PROTOCOL_VERSION, and `PYTHONPATH=. python
 tests/protocol/golden.py` writes the bytes of the new version; those of the old ones stay.
@@ -150,7 +150,7 @@ MESSAGES: dict[str, Message] = {
 
 
 def path(name: str, version: int = PROTOCOL_VERSION) -> Path:
-    """Where the bytes of a message lie."""
+    """Return the file with the bytes of a message."""
     return FOLDER / f"v{version}" / f"{name}.bin"
 
 

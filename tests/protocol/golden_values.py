@@ -1,4 +1,4 @@
-"""What the golden messages hold, as JSON beside their bytes: for clients in languages that cannot read golden.py.
+"""Contents of the golden messages as JSON beside their bytes, for clients in other languages.
 
 Of each message its kind, its fields and, by name, the dtype, shape and values of its arrays; those row by row in the
 order of the shape, whatever order they travel in. `PYTHONPATH=. python tests/protocol/golden_values.py` writes them.
@@ -18,7 +18,7 @@ PATH: Path = FOLDER / f"v{PROTOCOL_VERSION}" / "values.json"
 
 
 def values() -> dict[str, Any]:
-    """By the name of each message, what it holds."""
+    """Return the content of each message by its name."""
     described = {}
     for name, message in MESSAGES.items():
         arrays: list[tuple[str, np.ndarray]] = []

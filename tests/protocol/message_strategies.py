@@ -120,7 +120,7 @@ def rollouts(draw: st.DrawFn) -> Rollout:
     episodes = draw(st.integers(0, rows * environments))
     dtype = draw(st.sampled_from(["<f4", "|u1"]))
     length, frame = draw(st.integers(rows + 1, rows + 4)), draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
-    if draw(st.booleans()):  # environment by environment in memory, and so on the wire
+    if draw(st.booleans()):  # with the environment axis first in memory, and so on the wire
         frames = bits(random, dtype, (environments, length, *frame)).swapaxes(0, 1)
     else:
         frames = bits(random, dtype, (length, environments, *frame))

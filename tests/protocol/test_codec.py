@@ -1,4 +1,4 @@
-"""What is encoded comes back, in the bytes that are documented."""
+"""Encoded messages are decoded unchanged, and their bytes are as documented."""
 
 import dataclasses
 import struct
@@ -34,12 +34,12 @@ from daedalus.protocol.messages import (
 )
 
 
-def test_every_kind_of_message_is_tried() -> None:
+def test_strategies_cover_every_kind_of_message() -> None:
     assert set(KINDS) == set(get_args(Message))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_a_message_comes_back_bit_for_bit(kind: type) -> None:
+def test_message_is_decoded_bit_for_bit(kind: type) -> None:
     @repeatable
     @given(message=KINDS[kind])
     def returns(message: Message) -> None:
@@ -59,12 +59,12 @@ def test_decoded_arrays_are_read_only(message: Message) -> None:
 
 @repeatable
 @given(message=messages)
-def test_encoding_is_a_function_of_the_message(message: Message) -> None:
+def test_encoding_is_deterministic(message: Message) -> None:
     data = encode(message)
     assert encode(decode(data, LIMITS)) == data
 
 
-def test_arrays_travel_whatever_their_memory_looks_like() -> None:
+def test_arrays_of_any_memory_layout_are_encoded() -> None:
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
     weights = {"turned": values.T, "stepped": values[:, ::-2], "big": values.astype(">f4"), "scalar": values[0, 0, 1]}
     came = decode(encode(dataclasses.replace(SNAPSHOT, weights=weights)), LIMITS)
@@ -74,7 +74,7 @@ def test_arrays_travel_whatever_their_memory_looks_like() -> None:
         np.testing.assert_array_equal(came.weights[name], array)
 
 
-def test_an_array_whose_second_axis_comes_first_in_memory_is_sent_and_comes_so() -> None:
+def test_swapped_memory_order_is_kept() -> None:
     data = encode(some_rollout(PIXELS))
     flags, content, body = unwire(data)
     assert content["arrays"][0] == ["frames", "|u1", [9, 4, 2, 3], True]
@@ -84,18 +84,18 @@ def test_an_array_whose_second_axis_comes_first_in_memory_is_sent_and_comes_so()
     came = decode(data, LIMITS)
     assert isinstance(came, Rollout)
     np.testing.assert_array_equal(came.frames, PIXELS)
-    assert came.frames.swapaxes(0, 1).flags.c_contiguous  # without a copy that would turn it round
+    assert came.frames.swapaxes(0, 1).flags.c_contiguous  # no copy has changed the order
     assert encode(came) == data
 
 
-def test_the_same_array_comes_back_the_same_in_either_order() -> None:
+def test_both_memory_orders_decode_to_the_same_array() -> None:
     came = [decode(encode(some_rollout(frames)), LIMITS) for frames in (PIXELS, PIXELS.copy(order="C"))]
     assert the_same(came[0], came[1])
     assert [unwire(encode(each))[1]["arrays"][0][3] for each in came] == [True, False]
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (1, 3), (3, 1), (2, 0), (0, 2), (2, 3, 4), (2, 3, 4, 5)])
-def test_every_shape_of_two_dimensions_and_more_travels_swapped(shape: tuple[int, ...]) -> None:
+def test_every_shape_of_at_least_two_dimensions_can_be_swapped(shape: tuple[int, ...]) -> None:
     values = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
     turned = np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
     came = decode(encode(dataclasses.replace(SNAPSHOT, weights={"w": turned})), LIMITS)
@@ -103,7 +103,7 @@ def test_every_shape_of_two_dimensions_and_more_travels_swapped(shape: tuple[int
     np.testing.assert_array_equal(came.weights["w"], values)
 
 
-def test_who_lies_about_the_order_gets_another_array_of_the_shape_that_was_named() -> None:
+def test_wrong_swapped_flag_keeps_the_declared_shape() -> None:
     _, content, body = unwire(encode(SNAPSHOT))
     assert content["arrays"][0] == ["weights/w", "<f4", [2, 2], False]
     for shape, values in (([2, 2], [[1.0, 3.0], [2.0, 4.0]]), ([1, 4], [[1.0, 2.0, 3.0, 4.0]])):
@@ -113,8 +113,8 @@ def test_who_lies_about_the_order_gets_another_array_of_the_shape_that_was_named
         np.testing.assert_array_equal(came.weights["w"], values)
 
 
-def test_a_picture_that_stays_travels_once_for_all_its_frames() -> None:
-    """Environment by environment zstd has just seen a frame's predecessor; time by time it has forgotten it."""
+def test_constant_picture_compresses_to_one_frame() -> None:
+    """With the environment axis first, a frame follows its predecessor within zstd's window."""
     noise = np.random.default_rng(1).integers(0, 256, (4, 1, 400, 400), np.uint8)
     frames = np.repeat(noise, 9, axis=1).swapaxes(0, 1)
     assert len(encode(some_rollout(frames))) < 1.01 * noise.size
@@ -122,13 +122,13 @@ def test_a_picture_that_stays_travels_once_for_all_its_frames() -> None:
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float16", "int8", "int16", "uint32", "uint64", "complex64", "O", "U3"])
-def test_a_dtype_that_does_not_travel_is_our_own_fault(dtype: str) -> None:
-    with pytest.raises(ValueError, match=r"weights/w.*does not travel"):
+def test_encoding_an_unsupported_dtype_raises_value_error(dtype: str) -> None:
+    with pytest.raises(ValueError, match=r"weights/w.*the protocol does not support"):
         encode(dataclasses.replace(SNAPSHOT, weights={"w": np.zeros(2, dtype)}))
 
 
-def test_threads_may_encode_and_decode_at_once() -> None:
-    """A zstd context shared by threads fails, or crashes, within a few of these."""
+def test_threads_may_encode_and_decode_concurrently() -> None:
+    """A zstd context shared by threads fails or crashes within a few of these operations."""
     failures: list[object] = []
 
     def work(value: int) -> None:
@@ -153,7 +153,7 @@ def test_threads_may_encode_and_decode_at_once() -> None:
 # --------------------------------------------------------------------------------- the layout, golden
 
 
-def test_the_bytes_of_version_5_are_as_documented() -> None:
+def test_bytes_of_version_5_are_as_documented() -> None:
     header = msgpack.packb(
         {
             "kind": "Snapshot",
@@ -169,7 +169,7 @@ def test_the_bytes_of_version_5_are_as_documented() -> None:
     assert encode(SNAPSHOT) == expected + header + padding + body
 
 
-def test_the_prefix_can_be_read_with_struct_alone() -> None:
+def test_prefix_can_be_read_with_struct() -> None:
     data = SAMPLES["rollout"]
     magic, version, flags, length = struct.unpack_from("<4sHHI", data)
     assert (magic, version, flags) == (b"DAED", 5, 1)
@@ -182,7 +182,7 @@ def test_the_prefix_can_be_read_with_struct_alone() -> None:
     assert zstandard.ZstdDecompressor().decompress(data[start:]) == bytes(content["size"])
 
 
-def test_a_body_that_would_not_shrink_travels_plain() -> None:
+def test_incompressible_body_is_sent_uncompressed() -> None:
     noise = np.frombuffer(np.random.default_rng(0).bytes(1000), "|u1")
     assert unwire(encode(Program(hash="h", model=noise)))[0] == 0
     assert unwire(encode(Program(hash="h", model=np.zeros(1000, "|u1"))))[0] == 1

@@ -1,4 +1,4 @@
-"""Whatever the bytes: a message or a ProtocolError."""
+"""Decoding arbitrary bytes gives a message or a ProtocolError."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from daedalus.protocol.messages import (
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-def test_a_message_cut_at_any_length_is_refused(name: str) -> None:
+def test_truncated_message_is_rejected(name: str) -> None:
     data = SAMPLES[name]
     decode(data, LIMITS)
     for length in range(len(data)):
@@ -24,16 +24,16 @@ def test_a_message_cut_at_any_length_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-def test_a_message_with_something_after_it_is_refused(name: str) -> None:
+def test_message_with_trailing_bytes_is_rejected(name: str) -> None:
     for extra in (b"\0", b"\0" * 8, SAMPLES[name]):
-        if name in ("join", "status"):  # without a body: what follows would be one
+        if name in ("join", "status"):  # without a body: trailing bytes would be a body
             extra = extra.rjust(16, b"\0")
         with pytest.raises(ProtocolError):
             decode(SAMPLES[name] + extra, LIMITS)
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-def test_no_flipped_bit_raises_anything_but_a_protocol_error(name: str) -> None:
+def test_flipped_bit_raises_only_protocol_errors(name: str) -> None:
     for position in range(len(SAMPLES[name])):
         for bit in range(8):
             data = bytearray(SAMPLES[name])
@@ -43,14 +43,14 @@ def test_no_flipped_bit_raises_anything_but_a_protocol_error(name: str) -> None:
 
 @repeatable
 @given(data=st.binary(max_size=200))
-def test_random_bytes_are_refused(data: bytes) -> None:
+def test_random_bytes_are_rejected(data: bytes) -> None:
     with pytest.raises(ProtocolError):
         decode(data, LIMITS)
 
 
 @repeatable
 @given(header=st.binary(max_size=100), body=st.binary(max_size=64), flags=st.integers(0, 2))
-def test_random_headers_are_refused(header: bytes, body: bytes, flags: int) -> None:
+def test_random_headers_are_rejected(header: bytes, body: bytes, flags: int) -> None:
     with pytest.raises(ProtocolError):
         decode(wire_header(header, body, flags=flags), LIMITS)
 
@@ -60,7 +60,7 @@ def test_random_headers_are_refused(header: bytes, body: bytes, flags: int) -> N
     message=messages,
     edits=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 3), st.binary(max_size=8)), min_size=1, max_size=5),
 )
-def test_edited_messages_are_decoded_or_refused(message: Message, edits: list[tuple[int, int, bytes]]) -> None:
+def test_edited_messages_are_decoded_or_rejected(message: Message, edits: list[tuple[int, int, bytes]]) -> None:
     data = encode(message)
     for position, removed, inserted in edits:
         start = position % (len(data) + 1)
@@ -84,12 +84,10 @@ anything = st.recursive(
 
 @settings(repeatable, max_examples=400)
 @given(message=messages, choices=st.lists(st.integers(0, 30), min_size=8, max_size=8), value=anything)
-def test_a_header_with_any_value_anywhere_is_decoded_or_refused(
-    message: Message, choices: list[int], value: Any
-) -> None:
+def test_header_with_replaced_values_is_decoded_or_rejected(message: Message, choices: list[int], value: Any) -> None:
     flags, content, body = unwire(encode(message))
     node, key = content, "fields"
-    for choice in choices:  # walks down to some entry of the header and puts the value there
+    for choice in choices:  # descends to an entry of the header and replaces it
         entries = list(node) if isinstance(node, dict) else list(range(len(node)))
         key: Any = entries[choice % len(entries)]
         if choice > 24 or not isinstance(node[key], dict | list) or not node[key]:

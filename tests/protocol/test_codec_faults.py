@@ -1,4 +1,4 @@
-"""One fault at a time: each is refused by a reason that names it."""
+"""Each fault in a message is rejected with a reason that names it."""
 
 import contextlib
 import copy
@@ -53,23 +53,26 @@ SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
     "array a map": (lambda c: c["arrays"].__setitem__(0, {}), "a name, a dtype, a shape and whether"),
     "array of version 1": (lambda c: c["arrays"][0].pop(), "a name, a dtype, a shape and whether it is swapped"),
     "array with more": (lambda c: c["arrays"][0].append(False), "a name, a dtype, a shape and whether"),
-    "swapped a number": (lambda c: c["arrays"][0].__setitem__(3, 1), "'weights/w' cannot be swapped like that"),
-    "swapped text": (lambda c: c["arrays"][0].__setitem__(3, "true"), "cannot be swapped like that"),
-    "swapped nil": (lambda c: c["arrays"][0].__setitem__(3, None), "cannot be swapped like that"),
-    "swapped without a second axis": (lambda c: c["arrays"][1].__setitem__(3, True), "'weights/b' cannot be swapped"),
-    "swapped scalar": (lambda c: c["arrays"].__setitem__(1, ["b", "<f4", [], True]), "'b' cannot be swapped"),
-    "dtype float64": (lambda c: c["arrays"][0].__setitem__(1, "<f8"), "does not travel"),
-    "dtype object": (lambda c: c["arrays"][0].__setitem__(1, "|O"), "does not travel"),
-    "dtype big-endian": (lambda c: c["arrays"][0].__setitem__(1, ">f4"), "does not travel"),
-    "dtype a list": (lambda c: c["arrays"][0].__setitem__(1, ["<f4"]), "does not travel"),
-    "shape a number": (lambda c: c["arrays"][0].__setitem__(2, 4), "no proper shape"),
-    "side negative": (lambda c: c["arrays"][0].__setitem__(2, [-2, -2]), "no proper shape"),
-    "side -1": (lambda c: c["arrays"][0].__setitem__(2, [2, -1]), "no proper shape"),
-    "side a float": (lambda c: c["arrays"][0].__setitem__(2, [2.0, 2]), "no proper shape"),
-    "side NaN": (lambda c: c["arrays"][0].__setitem__(2, [float("nan"), 2]), "no proper shape"),
-    "side a bool": (lambda c: c["arrays"][0].__setitem__(2, [True, 4]), "no proper shape"),
-    "side too long": (lambda c: c["arrays"][0].__setitem__(2, [2**40, 2]), "no proper shape"),
-    "too many dimensions": (lambda c: c["arrays"][0].__setitem__(2, [1] * 9), "no proper shape"),
+    "swapped a number": (lambda c: c["arrays"][0].__setitem__(3, 1), "'weights/w' has an invalid swapped flag"),
+    "swapped text": (lambda c: c["arrays"][0].__setitem__(3, "true"), "has an invalid swapped flag"),
+    "swapped nil": (lambda c: c["arrays"][0].__setitem__(3, None), "has an invalid swapped flag"),
+    "swapped without a second axis": (
+        lambda c: c["arrays"][1].__setitem__(3, True),
+        "'weights/b' has an invalid swapped flag",
+    ),
+    "swapped scalar": (lambda c: c["arrays"].__setitem__(1, ["b", "<f4", [], True]), "'b' has an invalid swapped flag"),
+    "dtype float64": (lambda c: c["arrays"][0].__setitem__(1, "<f8"), "has an unsupported dtype"),
+    "dtype object": (lambda c: c["arrays"][0].__setitem__(1, "|O"), "has an unsupported dtype"),
+    "dtype big-endian": (lambda c: c["arrays"][0].__setitem__(1, ">f4"), "has an unsupported dtype"),
+    "dtype a list": (lambda c: c["arrays"][0].__setitem__(1, ["<f4"]), "has an unsupported dtype"),
+    "shape a number": (lambda c: c["arrays"][0].__setitem__(2, 4), "an invalid shape"),
+    "side negative": (lambda c: c["arrays"][0].__setitem__(2, [-2, -2]), "an invalid shape"),
+    "side -1": (lambda c: c["arrays"][0].__setitem__(2, [2, -1]), "an invalid shape"),
+    "side a float": (lambda c: c["arrays"][0].__setitem__(2, [2.0, 2]), "an invalid shape"),
+    "side NaN": (lambda c: c["arrays"][0].__setitem__(2, [float("nan"), 2]), "an invalid shape"),
+    "side a bool": (lambda c: c["arrays"][0].__setitem__(2, [True, 4]), "an invalid shape"),
+    "side too long": (lambda c: c["arrays"][0].__setitem__(2, [2**40, 2]), "an invalid shape"),
+    "too many dimensions": (lambda c: c["arrays"][0].__setitem__(2, [1] * 9), "an invalid shape"),
     "shape larger than the body": (lambda c: c["arrays"][0].__setitem__(2, [2, 200]), "the body declares 24"),
     "product of sides huge": (lambda c: c["arrays"][0].__setitem__(2, [1 << 26] * 8), "the body declares 24"),
     "size less than the arrays": (lambda c: c.update(size=16), "the body declares 16"),
@@ -79,7 +82,7 @@ SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
 
 
 @pytest.mark.parametrize("fault", SNAPSHOT_FAULTS)
-def test_a_header_with_one_fault_is_refused_by_that_fault(fault: str) -> None:
+def test_faulty_header_is_rejected_with_the_fault(fault: str) -> None:
     edit, reason = SNAPSHOT_FAULTS[fault]
     _, content, body = unwire(SAMPLES["snapshot"])
     edit(content)
@@ -88,7 +91,7 @@ def test_a_header_with_one_fault_is_refused_by_that_fault(fault: str) -> None:
 
 
 @pytest.mark.parametrize("sides", [[0] + [1 << 26] * 3, [1 << 26] * 3 + [0], [1 << 26] * 7 + [0]])
-def test_an_empty_array_with_huge_sides_is_refused_or_empty(sides: list[int]) -> None:
+def test_empty_array_with_huge_sides_is_rejected_or_empty(sides: list[int]) -> None:
     _, content, _ = unwire(SAMPLES["snapshot"])
     for swapped in (False, True):
         content.update(arrays=[["weights/w", "<f4", sides, swapped]], size=0)
@@ -99,7 +102,7 @@ def test_an_empty_array_with_huge_sides_is_refused_or_empty(sides: list[int]) ->
 
 
 @pytest.mark.parametrize("message", [Join(actor="a", incarnation=1), WELCOME, SNAPSHOT, some_rollout()])
-def test_every_field_is_needed_and_no_other_is_known(message: Message) -> None:
+def test_missing_and_unknown_fields_are_rejected(message: Message) -> None:
     flags, content, body = unwire(encode(message))
     for name in content["fields"]:
         less = copy.deepcopy(content)
@@ -111,7 +114,7 @@ def test_every_field_is_needed_and_no_other_is_known(message: Message) -> None:
         decode(wire(content, body, flags=flags), LIMITS)
 
 
-def test_faults_within_a_nested_message_are_named_by_their_path() -> None:
+def test_faults_in_a_nested_message_are_named_by_path() -> None:
     flags, content, body = unwire(SAMPLES["rollout"])
     for identity, reason in (
         (1, "'identity' must be a map"),
@@ -124,7 +127,7 @@ def test_faults_within_a_nested_message_are_named_by_their_path() -> None:
             decode(wire(content, body, flags=flags), LIMITS)
 
 
-def test_every_array_of_a_rollout_is_needed() -> None:
+def test_missing_array_of_a_rollout_is_rejected() -> None:
     rollout = some_rollout()
     for name in ("frames", "initial_state", "actions", "valid", "episode_lengths"):
         flags, content, body = unwire(encode(rollout))
@@ -134,21 +137,21 @@ def test_every_array_of_a_rollout_is_needed() -> None:
             decode(wire(content, body, flags=flags), LIMITS)
 
 
-def test_an_array_beyond_the_expected_is_refused() -> None:
+def test_unknown_array_is_rejected() -> None:
     _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="")))
     content.update(arrays=[["extra", "|u1", [8], False]], size=8)
     with pytest.raises(ProtocolError, match="RunEnded has no array 'extra'"):
         decode(wire(content, bytes(8)), LIMITS)
 
 
-def test_a_body_with_room_that_no_array_takes_is_refused() -> None:
+def test_body_larger_than_its_arrays_is_rejected() -> None:
     _, content, body = unwire(SAMPLES["snapshot"])
     content["size"] += 8
     with pytest.raises(ProtocolError, match="the arrays take 24 bytes, the body declares 32"):
         decode(wire(content, body + bytes(8)), LIMITS)
 
 
-def test_shapes_that_do_not_fit_together_are_refused_by_the_messages_own_check() -> None:
+def test_inconsistent_shapes_are_rejected_by_the_message_class() -> None:
     flags, content, body = unwire(SAMPLES["rollout"])
     assert content["arrays"][2][0] == "actions"
     content["arrays"][2][2] = [4, 8]
@@ -157,7 +160,7 @@ def test_shapes_that_do_not_fit_together_are_refused_by_the_messages_own_check()
 
 
 @pytest.mark.parametrize("code", ["other", "", 1, None, ["mismatch"]])
-def test_a_choice_outside_its_list_is_refused(code: Any) -> None:
+def test_unknown_choice_is_rejected(code: Any) -> None:
     _, content, _ = unwire(encode(Refusal(code="mismatch", reason="")))
     content["fields"]["code"] = code
     with pytest.raises(ProtocolError, match="'code' must be one of mismatch"):
@@ -165,7 +168,7 @@ def test_a_choice_outside_its_list_is_refused(code: Any) -> None:
 
 
 @pytest.mark.parametrize("spec", [None, 1, [], {}, {"environment": {"id": "x"}, "typo": 1}])
-def test_a_specification_that_does_not_hold_is_refused(spec: Any) -> None:
+def test_invalid_specification_is_rejected(spec: Any) -> None:
     _, content, _ = unwire(encode(WELCOME))
     content["fields"]["spec"] = spec
     with pytest.raises(ProtocolError, match="Welcome: "):
@@ -173,11 +176,11 @@ def test_a_specification_that_does_not_hold_is_refused(spec: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [2, 255])
-def test_a_truth_value_is_0_or_1(value: int) -> None:
+def test_bool_that_is_neither_0_nor_1_is_rejected(value: int) -> None:
     _, content, _ = unwire(SAMPLES["snapshot"])
     content.update(arrays=[["weights/w", "|b1", [8], False]], size=8)
     decode(wire(content, bytes([0, 1] * 4)), LIMITS)
-    with pytest.raises(ProtocolError, match="'weights/w' has a truth value that is neither 0 nor 1"):
+    with pytest.raises(ProtocolError, match="'weights/w' has a bool that is neither 0 nor 1"):
         decode(wire(content, bytes([0, 1, 0, 1, 0, 1, 0, value])), LIMITS)
 
 
@@ -187,7 +190,7 @@ def test_the_header_must_be_a_map() -> None:
             decode(wire(content), LIMITS)
 
 
-def test_unknown_flags_and_magic_are_refused() -> None:
+def test_unknown_flags_and_magic_are_rejected() -> None:
     _, content, body = unwire(SAMPLES["snapshot"])
     with pytest.raises(ProtocolError, match="unknown flags 2"):
         decode(wire(content, body, flags=2), LIMITS)
@@ -196,7 +199,7 @@ def test_unknown_flags_and_magic_are_refused() -> None:
 
 
 @pytest.mark.parametrize("version", [0, 4, 6, 65_535])
-def test_another_version_is_named_beside_our_own(version: int) -> None:
+def test_error_names_both_protocol_versions(version: int) -> None:
     for data in (wire({}, version=version), wire_header(b"\xc1 of the future", version=version)):
         with pytest.raises(VersionMismatchError, match=rf"version {version}, this one {PROTOCOL_VERSION}:") as refused:
             decode(data, LIMITS)

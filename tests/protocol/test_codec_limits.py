@@ -1,4 +1,4 @@
-"""What a message may cost its reader before it is refused."""
+"""Memory that a hostile message can make its reader allocate."""
 
 import dataclasses
 import struct
@@ -30,7 +30,7 @@ from daedalus.protocol.messages import (
 
 
 def peak_bytes(data: bytes, limits: Limits) -> int:
-    """The most memory that refusing `data` took."""
+    """Return the peak memory of rejecting `data`."""
     tracemalloc.start()
     try:
         with pytest.raises(ProtocolError):
@@ -41,7 +41,7 @@ def peak_bytes(data: bytes, limits: Limits) -> int:
 
 
 def zeros_frame(size: int, *, declared: bool) -> bytes:
-    """A zstd frame of `size` zeros, made without ever holding them."""
+    """Return a zstd frame of `size` zeros, without allocating them."""
     compressor = zstandard.ZstdCompressor().compressobj(size=size if declared else -1)
     chunk = bytes(1 << 20)
     return b"".join(compressor.compress(chunk) for _ in range(size >> 20)) + compressor.flush()
@@ -52,24 +52,24 @@ SMALL = Limits(max_bytes=1 << 20, max_header_bytes=4096, max_arrays=4)
 
 
 def bomb(frame: bytes, size: int) -> bytes:
-    """A program, which may travel compressed, of `size` bytes."""
+    """Return a Program message, which may be compressed, of `size` bytes."""
     _, content, _ = unwire(encode(Program(hash="", model=np.zeros(1, np.uint8))))
     content.update(arrays=[["model", "|u1", [size], False]], size=size)
     return wire(content, frame, flags=1)
 
 
-def test_a_frame_that_declares_more_than_the_header_is_not_unpacked() -> None:
+def test_frame_that_declares_more_than_the_header_is_not_decompressed() -> None:
     frame = zeros_frame(BOMB, declared=True)
     assert len(frame) < 1 << 20
     assert peak_bytes(bomb(frame, 1 << 16), SMALL) < 2 << 20
     assert peak_bytes(bomb(frame, BOMB), SMALL) < 2 << 20
 
 
-def test_a_frame_that_declares_nothing_is_not_unpacked() -> None:
+def test_frame_without_a_declared_size_is_not_decompressed() -> None:
     assert peak_bytes(bomb(zeros_frame(BOMB, declared=False), 1 << 16), SMALL) < 2 << 20
 
 
-def test_a_frame_that_lies_about_its_size_is_unpacked_no_further() -> None:
+def test_frame_is_not_decompressed_beyond_its_declared_size() -> None:
     frame = zeros_frame(BOMB, declared=True)
     lie = frame.replace(struct.pack("<I", BOMB), struct.pack("<I", 1 << 16), 1)
     assert lie != frame
@@ -78,14 +78,14 @@ def test_a_frame_that_lies_about_its_size_is_unpacked_no_further() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in SAMPLES if name not in ("rollout", "pixels", "program")])
-def test_what_is_never_sent_compressed_is_not_unpacked(name: str) -> None:
+def test_kinds_that_are_never_compressed_are_not_decompressed(name: str) -> None:
     _, content, body = unwire(SAMPLES[name])
     frame = zstandard.ZstdCompressor().compress(bytes(body))
-    with pytest.raises(ProtocolError, match="does not travel compressed"):
+    with pytest.raises(ProtocolError, match="must not be compressed"):
         decode(wire(content, frame, flags=1), LIMITS)
 
 
-def test_a_frame_that_holds_less_than_it_declares_is_refused() -> None:
+def test_frame_smaller_than_declared_is_rejected() -> None:
     frame = zstandard.ZstdCompressor().compress(bytes(1 << 16))
     assert isinstance(decode(bomb(frame, 1 << 16), LIMITS), Program)
     for body in (frame[:-4], frame + frame, frame + b"x", b"", b"not zstd", bytes(8)):
@@ -102,24 +102,24 @@ def test_a_frame_that_holds_less_than_it_declares_is_refused() -> None:
         b"\xc6\xff\xff\xff\xff",  # bytes
         b"\xc9\xff\xff\xff\xff\x01",  # extension
         b"\xdd\x00\xff\xff\xff" * 100,  # lists in lists
-        b"\xc4\x04abcd",  # bytes at all
-        b"\xd6\x01abcd",  # an extension at all
+        b"\xc4\x04abcd",  # any bytes
+        b"\xd6\x01abcd",  # any extension
         b"\xd6\xffabcd",  # a timestamp
         b"\xa2\xff\xff",  # text that is not UTF-8
         b"\xc1",  # never used
         b"\x91" * 4000,  # deep
         b"\x81\xa1a" * 1300,  # deep
-        b"\x81\x90\x01",  # a list for a key
-        b"\x81\x01\x01",  # a number for a key
+        b"\x81\x90\x01",  # a list as a key
+        b"\x81\x01\x01",  # a number as a key
         b"\x80\x80",  # two values
     ],
 )
-def test_a_header_that_declares_the_moon_costs_nothing(header: bytes) -> None:
+def test_header_with_huge_declared_sizes_allocates_nothing(header: bytes) -> None:
     assert peak_bytes(wire_header(header), SMALL) < 1 << 20
 
 
 @pytest.mark.parametrize("depth", [100, 254, 255, 400, 500, 511, 512, 2000])
-def test_deep_nesting_is_decoded_or_refused(depth: int) -> None:
+def test_deep_nesting_is_decoded_or_rejected(depth: int) -> None:
     _, content, _ = unwire(encode(WELCOME))
     for opening, closing in ((b"\x91", b""), (b"\x81\xa1a", b"")):
         nested = opening * depth + b"\x01" + closing
@@ -128,7 +128,7 @@ def test_deep_nesting_is_decoded_or_refused(depth: int) -> None:
         decoded_or_refused(wire_header(header))
 
 
-def test_a_header_beyond_its_limit_is_not_read() -> None:
+def test_header_beyond_the_limit_is_not_read() -> None:
     _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="x" * 5000)))
     with pytest.raises(ProtocolError, match=r"the header declares .* the limit is 4096"):
         decode(wire(content), SMALL)
@@ -136,7 +136,7 @@ def test_a_header_beyond_its_limit_is_not_read() -> None:
         decode(PREFIX.pack(b"DAED", PROTOCOL_VERSION, 0, 2**32 - 1), SMALL)
 
 
-def test_more_arrays_than_the_limit_are_refused() -> None:
+def test_more_arrays_than_the_limit_are_rejected() -> None:
     many = {f"w{index}": np.zeros(1, np.float32) for index in range(5)}
     data = encode(dataclasses.replace(SNAPSHOT, weights=many))
     decode(data, LIMITS)
@@ -144,7 +144,7 @@ def test_more_arrays_than_the_limit_are_refused() -> None:
         decode(data, SMALL)
 
 
-def test_a_body_at_the_limit_is_accepted_and_one_beyond_it_refused() -> None:
+def test_body_at_the_limit_is_accepted_and_a_larger_one_rejected() -> None:
     limits = Limits(max_bytes=4096)
     for count, kind in ((1024, Snapshot), (1026, None)):
         data = encode(dataclasses.replace(SNAPSHOT, weights={"w": np.zeros(count, np.float32)}))

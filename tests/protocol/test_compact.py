@@ -1,4 +1,4 @@
-"""bfloat16 against torch's own, and differences against what they are made of."""
+"""bfloat16 against torch's, and differences against the weights that they were computed from."""
 
 import warnings
 
@@ -21,10 +21,10 @@ halves = shapes.flatmap(
 
 @repeatable
 @given(patterns)
-def test_rounding_is_torchs_for_every_bit_pattern(pattern: np.ndarray) -> None:
+def test_rounding_matches_torch_for_every_bit_pattern(pattern: np.ndarray) -> None:
     weights = np.asarray(pattern.view(np.float32))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch has a word to say of arrays that cannot be written to
+        warnings.simplefilter("ignore")  # torch warns about read-only arrays
         expected = torch.from_numpy(weights.copy()).bfloat16().float().numpy()
     found = float32(bfloat16({"w": weights}))["w"]
     assert (found.shape, found.dtype) == (weights.shape, np.float32)
@@ -33,7 +33,7 @@ def test_rounding_is_torchs_for_every_bit_pattern(pattern: np.ndarray) -> None:
 
 @repeatable
 @given(halves, st.booleans())
-def test_planes_give_back_the_bits(pair: tuple[np.ndarray, np.ndarray], whole: bool) -> None:
+def test_bits_are_restored_from_planes(pair: tuple[np.ndarray, np.ndarray], whole: bool) -> None:
     bits, base = ({"w": np.asarray(array)} for array in pair)
     there = planes(bits, None if whole else base)
     assert there["w"].shape == (2, *bits["w"].shape)
@@ -43,15 +43,15 @@ def test_planes_give_back_the_bits(pair: tuple[np.ndarray, np.ndarray], whole: b
     np.testing.assert_array_equal(back, bits["w"])
 
 
-def test_a_difference_by_hand() -> None:
+def test_hand_worked_difference() -> None:
     base = {"w": np.array([5, 5, 0, 0xFFFF], np.uint16)}
-    bits = {"w": np.array([5, 4, 0x0102, 0], np.uint16)}  # by 0, -1, 258 and, round the corner, 1
+    bits = {"w": np.array([5, 4, 0x0102, 0], np.uint16)}  # by 0, -1, 258 and, wrapping around, 1
     assert planes(bits, base)["w"].tolist() == [[0, 0, 2, 0], [0, 1, 4, 2]]
     assert planes(bits, None)["w"].tolist() == [[0, 0, 1, 0], [5, 4, 2, 0]]
 
 
-def test_a_small_step_makes_small_planes() -> None:
-    """What it is for: nearly all of the high bytes are 0."""
+def test_small_update_gives_planes_of_mostly_zeros() -> None:
+    """Nearly all of the high bytes are 0, which is why planes compress well."""
     random = np.random.default_rng(1)
     weights = random.normal(0, 0.05, 10_000).astype(np.float32)
     step = weights + random.normal(0, 1e-4, 10_000).astype(np.float32)
@@ -70,11 +70,11 @@ def test_a_small_step_makes_small_planes() -> None:
         {"w": np.zeros((), np.uint8)},
     ],
 )
-def test_planes_that_do_not_fit_are_refused(damaged: dict[str, np.ndarray]) -> None:
-    with pytest.raises(ValueError, match=r"differences of other weights|must be uint8"):
+def test_planes_that_do_not_fit_the_base_are_rejected(damaged: dict[str, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match=r"other names or shapes|must be uint8"):
         bits_of(damaged, {"w": np.zeros(3, np.uint16)})
 
 
-def test_other_dtypes_have_no_bfloat16() -> None:
+def test_other_dtypes_are_rejected() -> None:
     with pytest.raises(ValueError, match="'w' has dtype float64"):
         bfloat16({"w": np.zeros(3)})

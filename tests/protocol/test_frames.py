@@ -1,4 +1,4 @@
-"""protocol/frames.py against gymnasium's frame stack: what the actor sees, what the learner makes of its rollouts."""
+"""protocol/frames.py against gymnasium's frame stack: the actor's observations and those of the learner."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,12 +6,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from collectors import started_collector
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.actor.collecting.collector import Collector
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits
@@ -23,7 +23,7 @@ IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1
 
 
 class Film(gymnasium.Env[np.ndarray, np.int64]):
-    """Shows a picture that it never showed before at each step; its episodes are as long as they are said to be."""
+    """Environment with a new picture at each step and episodes of given lengths."""
 
     def __init__(self, space: ArraySpace, number: int, lengths: list[int]) -> None:
         self.observation_space = gymnasium.spaces.Box(0, 255, space.shape, np.dtype(space.dtype).type)
@@ -47,7 +47,7 @@ class Film(gymnasium.Env[np.ndarray, np.int64]):
 
 @dataclass
 class Films:
-    """E of them as the collector wants them."""
+    """E of these environments with the interface that the collector takes."""
 
     space: ArraySpace
     lengths: list[list[int]]
@@ -83,7 +83,7 @@ class Films:
 
 
 class Spectator:
-    """A policy that remembers all it was shown."""
+    """A policy that records all observations."""
 
     state_size = 0
 
@@ -101,19 +101,19 @@ class Spectator:
 
 
 def collected(films: Films, rows: int, count: int) -> tuple[list[Rollout], np.ndarray]:
-    """Rollouts as they reach the learner, and the observations that their actions were chosen from."""
+    """Return rollouts as the learner decodes them, and the observations from which their actions were chosen."""
     spectator = Spectator()
-    collector = Collector(films, spectator, EnvironmentSpec(id="Film-v0"), rollout_length=rows, seed=1)
+    collector = started_collector(EnvironmentSpec(id="Film-v0"), spectator, rollout_length=rows, environments=films)
     rollouts = []
     for _ in range(count):
-        came = decode(encode(collector.collect(IDENTITY, 0)), Limits())
+        came = decode(encode(collector.collect(IDENTITY)), Limits())
         assert isinstance(came, Rollout)
         rollouts.append(came)
     return rollouts, np.stack(spectator.seen)
 
 
 def rebuilt(rollout: Rollout, space: ArraySpace) -> np.ndarray:
-    """The learner's observations [T+1, E, k, *frame_shape], in memory that held something else before."""
+    """Return the learner's observations [T+1, E, k, *frame_shape], computed into memory that held other values."""
     shape = (rollout.rows + 1, rollout.environments, space.frames, *space.shape)
     out = np.full(shape, 77, space.dtype)
     stack_rows(rollout.frames, rollout.valid, out)
@@ -131,7 +131,7 @@ episodes = st.lists(st.integers(1, 9), min_size=1, max_size=5)
     shape=st.sampled_from([(2, 3), (2, 3, 1), (4,)]),
     dtype=st.sampled_from(["uint8", "float32"]),
 )
-def test_every_row_of_every_rollout_is_what_gymnasiums_frame_stack_shows(
+def test_rows_of_rollouts_match_gymnasiums_frame_stack(
     depth: int, more_rows: int, lengths: list[list[int]], shape: tuple[int, ...], dtype: Any
 ) -> None:
     space = ArraySpace(shape=shape, dtype=dtype, frames=depth)
@@ -150,7 +150,7 @@ def test_every_row_of_every_rollout_is_what_gymnasiums_frame_stack_shows(
         np.testing.assert_array_equal(rebuilt(rollout, space), expected[first : first + rows + 1])
 
 
-def test_stacks_by_hand() -> None:
+def test_hand_worked_stacks_of_a_rollout() -> None:
     """Frames 1 to 7 of one environment, a stack of 3, four rows; row 1 only reset, so that an episode starts at row 2.
 
     Frame 4 is the last of the episode before, frame 5 the first of the new one.
@@ -162,7 +162,7 @@ def test_stacks_by_hand() -> None:
     assert out[:, 0, :, 0].tolist() == [[1, 2, 3], [2, 3, 4], [5, 5, 5], [5, 5, 6], [5, 6, 7]]
 
 
-def test_running_stacks_by_hand() -> None:
+def test_hand_worked_running_stacks() -> None:
     stack = FrameStack(ArraySpace(shape=(1,), dtype="uint8", frames=3), 2)
     seen = []
     for frame, starts in ((1, (True, True)), (2, (False, False)), (3, (False, True)), (4, (False, False))):
@@ -173,21 +173,21 @@ def test_running_stacks_by_hand() -> None:
 
 
 @pytest.mark.parametrize("depth", [1, 4])
-def test_a_stack_of_one_frame_is_the_frame(depth: int) -> None:
+def test_stack_of_one_frame_is_the_frame(depth: int) -> None:
     space = ArraySpace(shape=(2, 3), dtype="uint8", frames=depth)
     stack = FrameStack(space, 5)
     assert stack.observations.shape == (5, *space.stacked_shape)
     assert stack.frames.shape == (5, depth, 2, 3)
 
 
-def test_a_float_environments_numbers_travel_as_float32() -> None:
+def test_float_observations_are_sent_as_float32() -> None:
     stack = FrameStack(ArraySpace(shape=(2,), dtype="float32", frames=2), 1)
     stack.push(np.array([[0.1, 0.2]]), np.array([True]))
     assert stack.observations.dtype == np.float32
     np.testing.assert_array_equal(stack.observations[0], np.array([[0.1, 0.2]] * 2, np.float32))
 
 
-def test_images_are_sent_environment_by_environment_and_vectors_time_by_time() -> None:
+def test_images_are_sent_with_environments_first_and_vectors_with_time_first() -> None:
     for shape, swapped in (((2, 3), True), ((4,), False)):
         rollouts, _ = collected(Films(ArraySpace(shape=shape, dtype="uint8"), [[3], [4]]), rows=5, count=1)
         assert rollouts[0].frames.swapaxes(0, 1).flags.c_contiguous == swapped

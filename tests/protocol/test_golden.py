@@ -1,4 +1,4 @@
-"""The bytes of every message as they were written down: a change of the wire is seen, and meant."""
+"""The stored bytes of every message: they make each change of the wire format visible."""
 
 import json
 import typing
@@ -18,7 +18,7 @@ OLD = sorted(FOLDER.glob("v*/*.bin"))
 
 
 def plain(data: bytes) -> bytes:
-    """A message with its body decompressed: zstd's own output may differ from release to release."""
+    """Return a message with its body decompressed: the output of zstd may differ between releases."""
     magic, version, flags, length = PREFIX.unpack_from(data)
     start = PREFIX.size + length
     start += -start % 8
@@ -26,22 +26,22 @@ def plain(data: bytes) -> bytes:
     return PREFIX.pack(magic, version, flags, length) + data[PREFIX.size : start] + body
 
 
-def test_every_kind_of_message_is_there() -> None:
+def test_every_kind_of_message_has_golden_bytes() -> None:
     assert {type(message) for message in MESSAGES.values()} == set(typing.get_args(Message))
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-def test_the_bytes_are_those_that_were_written_down(name: str) -> None:
+def test_bytes_match_the_golden_bytes(name: str) -> None:
     written = path(name).read_bytes()
     assert plain(encode(MESSAGES[name])) == plain(written)
     assert the_same(decode(written, Limits()), MESSAGES[name])
 
 
 @pytest.mark.parametrize("old", [file for file in OLD if file.parent.name != f"v{PROTOCOL_VERSION}"], ids=str)
-def test_the_bytes_of_other_versions_are_refused_by_their_version(old: Path) -> None:
+def test_bytes_of_other_versions_are_rejected_with_their_version(old: Path) -> None:
     with pytest.raises(VersionMismatchError, match=f"version {old.parent.name[1:]}, this one {PROTOCOL_VERSION}"):
         decode(old.read_bytes(), Limits())
 
 
-def test_what_the_messages_hold_is_written_down_for_other_languages() -> None:
+def test_contents_of_the_golden_messages_are_stored_as_json() -> None:
     assert json.loads(golden_values.PATH.read_text()) == json.loads(json.dumps(golden_values.values()))

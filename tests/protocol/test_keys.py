@@ -10,21 +10,21 @@ offline = settings(max_examples=50, deadline=None, derandomize=True)
 
 @offline
 @given(name=names)
-def test_a_good_name_is_returned_as_it_is(name: str) -> None:
+def test_valid_name_is_returned(name: str) -> None:
     assert keys.check_name(name, "run") == name
 
 
 @pytest.mark.parametrize(
     "name", ["", "a/b", "*", "a*", "**", "$", "a$", "-a", ".a", "_a", "a b", "a\n", "é", "a?", "a#", "x" * 65]
 )
-def test_a_name_that_cannot_be_one_chunk_of_a_key_is_refused_by_what_it_is(name: str) -> None:
+def test_invalid_name_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match="actor name"):
         keys.check_name(name, "actor name")
 
 
 @offline
 @given(run=names, actor=names)
-def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) -> None:
+def test_keys_of_a_run_are_distinct_and_under_its_name(run: str, actor: str) -> None:
     made = [
         keys.join(run),
         keys.program(run, actor),
@@ -41,17 +41,17 @@ def test_the_keys_of_a_run_are_distinct_and_live_under_it(run: str, actor: str) 
 
 @offline
 @given(run=names, actor=names)
-def test_the_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
+def test_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
     assert keys.last_chunk(keys.rollouts(run, actor)) == actor
     assert keys.last_chunk(keys.evaluations(run, actor)) == actor
 
 
 @offline
 @given(run=names, actor=names, incarnation=st.integers(0, 2**63 - 1))
-def test_a_presence_key_tells_whose_life_it_is(run: str, actor: str, incarnation: int) -> None:
+def test_presence_key_is_parsed(run: str, actor: str, incarnation: int) -> None:
     assert keys.parse_presence(keys.presence(run, actor, incarnation)) == (actor, incarnation)
 
 
 @pytest.mark.parametrize("life", ["", "x", "-1", "1.0", "*", "9" * 20, "\u0663"])
-def test_a_presence_key_of_no_actor_of_ours_tells_of_nobody(life: str) -> None:
+def test_malformed_presence_key_gives_none(life: str) -> None:
     assert keys.parse_presence(keys.presence("r", "a", life)) is None

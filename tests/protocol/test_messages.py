@@ -25,17 +25,17 @@ def rollout(**changed: np.ndarray) -> Rollout:
     return Rollout(identity=identity, policy_version=0, **(arrays | changed))
 
 
-def test_a_rollout_tells_its_rows_and_environments() -> None:
+def test_rollout_has_rows_and_environments() -> None:
     made = rollout()
     assert (made.rows, made.environments) == (T, E)
 
 
-def test_as_many_episodes_may_end_as_there_are_rows() -> None:
+def test_an_episode_may_end_in_every_row() -> None:
     made = rollout(episode_returns=np.zeros(T * E, np.float32), episode_lengths=np.ones(T * E, np.int32))
     assert len(made.episode_returns) == T * E
 
 
-def test_a_rollout_without_ended_episodes_is_a_rollout() -> None:
+def test_rollout_without_ended_episodes_is_valid() -> None:
     made = rollout(episode_returns=np.zeros(0, np.float32), episode_lengths=np.zeros(0, np.int32))
     assert len(made.episode_returns) == 0
 
@@ -45,7 +45,7 @@ ROW_ARRAYS = ("behaviour_log_probs", "rewards", "terminated", "truncated", "vali
 
 @pytest.mark.parametrize("name", ROW_ARRAYS)
 @pytest.mark.parametrize("shape", [(T,), (T + 1, E), (T, E + 1), (E, T), (T, E, 1), (0, E), ()])
-def test_an_array_of_rows_with_another_shape_than_actions_is_named(name: str, shape: tuple[int, ...]) -> None:
+def test_array_of_another_shape_than_actions_is_named(name: str, shape: tuple[int, ...]) -> None:
     dtype = getattr(rollout(), name).dtype
     with pytest.raises(ValueError, match=f"^{name} must be"):
         rollout(**{name: np.zeros(shape, dtype)})
@@ -53,60 +53,60 @@ def test_an_array_of_rows_with_another_shape_than_actions_is_named(name: str, sh
 
 @pytest.mark.parametrize("name", [*ROW_ARRAYS, "initial_state", "episode_returns"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float64])
-def test_an_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
+def test_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
     right = getattr(rollout(), name)
     with pytest.raises(ValueError, match=f"^{name} must be {right.dtype}"):
         rollout(**{name: right.astype(dtype)})
 
 
 @pytest.mark.parametrize("shape", [(T, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), (0, E, 4), ()])
-def test_frames_need_a_row_more_than_actions_at_least(shape: tuple[int, ...]) -> None:
+def test_frames_need_at_least_one_row_more_than_actions(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"^frames must be \[4 or more, 2, ...\]"):
         rollout(frames=np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("shape", [(T + 1, E, 4), (T + 4, E, 4), (T + 4, E, 8, 8, 3)])
-def test_a_stack_brings_frames_of_before_the_first_row(shape: tuple[int, ...]) -> None:
+def test_frame_stack_adds_frames_before_the_first_row(shape: tuple[int, ...]) -> None:
     assert rollout(frames=np.zeros(shape, np.uint8)).rows == T
 
 
 @pytest.mark.parametrize("shape", [(E + 1, 5), (E,), (T, E, 5), ()])
-def test_a_memory_of_other_environments_is_refused(shape: tuple[int, ...]) -> None:
+def test_state_of_another_number_of_environments_is_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"^initial_state must be \[2, S\]"):
         rollout(initial_state=np.zeros(shape, np.float32))
 
 
-def test_a_policy_may_remember_nothing() -> None:
+def test_state_may_be_empty() -> None:
     assert rollout(initial_state=np.zeros((E, 0), np.float32)).initial_state.shape == (E, 0)
 
 
 @pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
-def test_actions_of_another_rank_are_refused(shape: tuple[int, ...]) -> None:
+def test_actions_of_another_rank_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"^actions must be"):
         rollout(actions=np.zeros(shape, np.int64))
 
 
 @pytest.mark.parametrize(("rows", "environments"), [(0, E), (T, 0)])
-def test_an_empty_rollout_is_refused(rows: int, environments: int) -> None:
+def test_empty_rollout_is_rejected(rows: int, environments: int) -> None:
     with pytest.raises(ValueError, match="at least one row and one environment"):
         rollout(actions=np.zeros((rows, environments), np.int64))
 
 
 @pytest.mark.parametrize("name", ["actions", "episode_lengths"])
-def test_what_counts_must_be_integers(name: str) -> None:
+def test_actions_and_lengths_must_be_integers(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}.* integers"):
         rollout(**{name: getattr(rollout(), name).astype(np.float32)})
 
 
 @pytest.mark.parametrize("shape", [(), (K + 1,), (K, 1)])
-def test_returns_and_lengths_of_episodes_go_together(shape: tuple[int, ...]) -> None:
+def test_returns_and_lengths_must_have_the_same_shape(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="episode_returns and episode_lengths"):
         rollout(episode_returns=np.zeros(shape, np.float32))
     with pytest.raises(ValueError, match="episode_returns and episode_lengths"):
         rollout(episode_lengths=np.zeros(shape, np.int32))
 
 
-def test_more_episodes_than_rows_are_refused() -> None:
+def test_more_episodes_than_rows_are_rejected() -> None:
     many = T * E + 1
     with pytest.raises(ValueError, match="more episodes ended"):
         rollout(episode_returns=np.zeros(many, np.float32), episode_lengths=np.ones(many, np.int32))
@@ -116,14 +116,14 @@ def report(returns: np.ndarray, lengths: np.ndarray) -> EvaluationReport:
     return EvaluationReport(evaluator="e", learner_epoch=1, policy_version=2, returns=returns, lengths=lengths)
 
 
-def test_a_report_has_a_length_for_each_return() -> None:
+def test_report_has_a_length_for_each_return() -> None:
     report(np.zeros(3, np.float32), np.ones(3, np.int32))
     for returns, lengths in ((3, 2), (0, 0), ((3, 1), (3, 1)), ((), ())):
-        with pytest.raises(ValueError, match=r"^returns and lengths must be \[K\] alike, with K at least 1"):
+        with pytest.raises(ValueError, match=r"^returns and lengths must both be \[K\], with K at least 1"):
             report(np.zeros(returns, np.float32), np.ones(lengths, np.int32))
 
 
 @pytest.mark.parametrize(("returns", "lengths"), [("f8", "i4"), ("i4", "i4"), ("f4", "f4"), ("f4", "i8")])
-def test_a_report_of_other_dtypes_is_refused(returns: str, lengths: str) -> None:
+def test_report_of_other_dtypes_is_rejected(returns: str, lengths: str) -> None:
     with pytest.raises(ValueError, match=r"^returns must be float32 and lengths int32"):
         report(np.zeros(3, returns), np.ones(3, lengths))

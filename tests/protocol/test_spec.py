@@ -26,7 +26,7 @@ def run(**sections: Any) -> RunSpec:
     return RunSpec.model_validate({"environment": ENVIRONMENT, **sections})
 
 
-def test_an_environment_alone_makes_a_run() -> None:
+def test_environment_is_the_only_required_section() -> None:
     assert run().training == TrainingSpec()
     assert not run().algorithm.synchronous
     assert run(training={"algorithm": "a2c"}).algorithm.synchronous
@@ -47,9 +47,7 @@ def test_an_environment_alone_makes_a_run() -> None:
         (DiscreteSpace, SPACES["action"]),
     ],
 )
-def test_a_field_that_is_not_known_is_refused_by_its_name(
-    specification: type[Specification], fields: dict[str, Any]
-) -> None:
+def test_unknown_field_is_rejected_by_name(specification: type[Specification], fields: dict[str, Any]) -> None:
     specification.model_validate(fields)
     with pytest.raises(ValidationError, match=r"entropy_bonsu\n.*not permitted"):
         specification.model_validate({**fields, "entropy_bonsu": 1})
@@ -64,7 +62,7 @@ def test_unknown_fields_are_refused_within_sections(section: str) -> None:
 
 
 @pytest.mark.parametrize("status", [ActorStatus, RunStatus])
-def test_a_status_must_be_complete(status: type[Specification]) -> None:
+def test_status_must_be_complete(status: type[Specification]) -> None:
     with pytest.raises(ValidationError, match="Field required"):
         status.model_validate({})
 
@@ -159,7 +157,7 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
 
 
 @pytest.mark.parametrize(("specification", "field", "value"), OUT_OF_RANGE)
-def test_a_value_out_of_range_is_refused_by_its_fields_name(
+def test_value_out_of_range_is_rejected_with_the_name_of_its_field(
     specification: type[Specification], field: str, value: Any
 ) -> None:
     required = {ArraySpace: {"shape": [4], "dtype": "uint8"}, EnvironmentSpec: ENVIRONMENT}.get(specification, {})
@@ -173,21 +171,21 @@ def test_a2c_refuses_a_batch_size_of_its_own() -> None:
         run(training={"algorithm": "a2c", "batch_rollouts": 4})
 
 
-def test_a_specification_cannot_be_changed() -> None:
+def test_specification_is_immutable() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         run().training.seed = 2  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_a_specification_survives_its_own_json() -> None:
+def test_specification_is_restored_from_its_json() -> None:
     spec = run(training={"target_return": 475.0}, policy={"hidden": [8, 16]})
     assert RunSpec.model_validate_json(spec.model_dump_json()) == spec
 
 
-def test_spaces_say_what_they_are() -> None:
+def test_spaces_have_a_readable_string() -> None:
     assert str(Spaces.model_validate(SPACES)) == "observation: float32 array of shape (4,); action: 2 choices"
 
 
-def test_a_stack_adds_an_axis_of_its_own_and_one_frame_none() -> None:
+def test_stack_adds_an_axis_unless_it_has_one_frame() -> None:
     one = ArraySpace(shape=(84, 96, 3), dtype="uint8")
     four = ArraySpace(shape=(84, 96, 3), dtype="uint8", frames=4)
     assert one.stacked_shape == (84, 96, 3)
@@ -196,7 +194,7 @@ def test_a_stack_adds_an_axis_of_its_own_and_one_frame_none() -> None:
     assert str(four) == "uint8 array of shape (84, 96, 3), 4 stacked"
 
 
-def test_a_stack_longer_than_a_rollout_is_refused_and_the_way_out_named() -> None:
+def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
     run(environment={**ENVIRONMENT, "frame_stack": 4}, collection={"rollout_length": 4})
     with pytest.raises(ValidationError, match=r"frame_stack is 4.*rollout_length is 3, make it at least 4"):
         run(environment={**ENVIRONMENT, "frame_stack": 4}, collection={"rollout_length": 3})
@@ -212,7 +210,7 @@ def test_a_stack_longer_than_a_rollout_is_refused_and_the_way_out_named() -> Non
         ({"algorithm": "a3c", "max_policy_lag": 0}, 1, 0),
     ],
 )
-def test_the_lag_bound_counts_batches_unless_it_is_given(fields: dict[str, Any], updates: int, bound: int) -> None:
+def test_default_lag_bound_counts_batches(fields: dict[str, Any], updates: int, bound: int) -> None:
     spec = TrainingSpec.model_validate(fields)
     assert (spec.updates_per_batch, spec.policy_lag_bound) == (updates, bound)
 

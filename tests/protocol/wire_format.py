@@ -1,4 +1,4 @@
-"""The wire format once more, written by hand, and a few messages in it: shared by the tests of the codec."""
+"""A second, independent implementation of the wire format, and a few messages, for the tests of the codec."""
 
 import contextlib
 import dataclasses
@@ -29,7 +29,7 @@ repeatable = settings(max_examples=60, deadline=None, derandomize=True)
 
 
 def wire(content: Any, body: bytes = b"", *, flags: int = 0, version: int = PROTOCOL_VERSION) -> bytes:
-    """A message from the content of its header."""
+    """Return the bytes of a message with this header."""
     return wire_header(msgpack.packb(content) or b"", body, flags=flags, version=version)
 
 
@@ -39,7 +39,7 @@ def wire_header(header: bytes, body: bytes = b"", *, flags: int = 0, version: in
 
 
 def unwire(data: bytes) -> tuple[int, dict[str, Any], bytes]:
-    """Flags, header content and body of a message."""
+    """Return flags, header content and body of a message."""
     magic, version, flags, length = PREFIX.unpack_from(data)
     assert (magic, version) == (b"DAED", PROTOCOL_VERSION)
     end = PREFIX.size + length
@@ -49,7 +49,7 @@ def unwire(data: bytes) -> tuple[int, dict[str, Any], bytes]:
 
 
 def bits(random: np.random.Generator, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Any bit pattern of a dtype, NaNs and infinities among them."""
+    """Return arrays of any bit pattern, including NaN and infinity."""
     if dtype == "|b1":
         return random.integers(0, 2, shape).astype(np.bool_)
     count = int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -57,7 +57,7 @@ def bits(random: np.random.Generator, dtype: str, shape: tuple[int, ...]) -> np.
 
 
 def the_same(left: Any, right: Any) -> bool:
-    """Equality of messages, their arrays bit for bit."""
+    """Return whether two messages are equal, with arrays compared bit for bit."""
     if type(left) is not type(right):
         return False
     if isinstance(left, np.ndarray):
@@ -77,7 +77,7 @@ def arrays_of(message: Message) -> list[np.ndarray]:
 
 
 def decoded_or_refused(data: bytes, limits: Limits = LIMITS) -> None:
-    """Anything but a message or a ProtocolError fails the test that calls this."""
+    """Decode bytes; any exception except ProtocolError fails the calling test."""
     with contextlib.suppress(ProtocolError):
         assert isinstance(decode(data, limits), Message)
 
@@ -118,7 +118,7 @@ STATUS = wire(  # every field of a status, as another implementation could write
 
 
 def some_rollout(frames: np.ndarray | None = None) -> Rollout:
-    """Eight rows of four environments, whose policy remembers two numbers."""
+    """Return a rollout of eight rows and four environments with a state of size two."""
     rows = np.zeros((8, 4))
     return Rollout(
         identity=IDENTITY,
@@ -136,6 +136,6 @@ def some_rollout(frames: np.ndarray | None = None) -> Rollout:
     )
 
 
-PIXELS = np.arange(4 * 9 * 6, dtype=np.uint8).reshape(4, 9, 2, 3).swapaxes(0, 1)  # environment by environment
+PIXELS = np.arange(4 * 9 * 6, dtype=np.uint8).reshape(4, 9, 2, 3).swapaxes(0, 1)  # with the environment axis first
 SAMPLES = {"join": encode(JOIN), "snapshot": encode(SNAPSHOT), "rollout": encode(some_rollout()), "status": STATUS}
 SAMPLES["pixels"] = encode(some_rollout(PIXELS))

@@ -1,4 +1,4 @@
-"""Who may do what, over real TLS on a real router: the learner, an actor, another actor, an operator, a stranger."""
+"""Permissions of each role over real TLS on a real router, and rejected certificates."""
 
 import socket
 import time
@@ -15,7 +15,7 @@ from daedalus.transport.interface import AddressInUseError, RefusedError, Transp
 from daedalus.transport.zenoh_transport import connect, listen
 
 LIMIT = 60.0
-DENIED_SECONDS = 1.0  # for an answer that must not come
+DENIED_SECONDS = 1.0  # to wait for an answer that must not arrive
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def strange(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Another CA's, which names its actors and its learner alike."""
+    """Return certificates of another CA, with the same names."""
     return make_certificates(tmp_path_factory.mktemp("strange") / "certs")
 
 
@@ -42,7 +42,7 @@ def listen_somewhere(folder: Path) -> tuple[str, Transport]:
 
 @pytest.fixture(scope="module")
 def address(certificates: Path) -> Iterator[str]:
-    """A router, and a learner that is its client and answers everything."""
+    """Run a router, and a learner that is its client and answers every query."""
     where, router = listen_somewhere(certificates / "router")
     with closing(router), closing(connect([where], load(certificates / "learner", "learner"))) as learner:
         for key in (
@@ -58,7 +58,7 @@ def address(certificates: Path) -> Iterator[str]:
 
 
 IDENTITIES = {
-    "learner": ("learner", "learner", "learner"),  # its folder, its role, the name that it uploads under
+    "learner": ("learner", "learner", "learner"),  # folder, role, name for uploads
     "actor": ("actor-arm", "actor", "arm"),
     "one of an actor's host": ("actor-arm", "actor", "arm.3"),
     "another actor": ("actor-box", "actor", "box"),
@@ -67,7 +67,7 @@ IDENTITIES = {
 
 
 class Scene:
-    """One identity, and an honest learner and actor that watch what it does."""
+    """A transport with the tested identity, and a learner and an actor that observe it."""
 
     def __init__(self, address: str, certificates: Path, identity: str, stack: ExitStack) -> None:
         folder, role, self.name = IDENTITIES[identity]
@@ -82,12 +82,12 @@ class Scene:
         return self.own.query(key, b"x", timeout=DENIED_SECONDS) == [b"the learner's"]
 
     def arrives(self, end: Transport, other: Transport, key: str) -> bool:
-        """Whether what `end` publishes on a key reaches `other`, who surely gets what comes from the learner."""
+        """Return whether a value that `end` publishes on a key reaches `other`, which receives the learner's values."""
         news: list[bytes] = []
         inbox = other.subscribe(key, lambda: news.append(inbox.take() or b""))
         self.until_heard(lambda: self.learner.publish(key, b"first"), lambda: b"first" in news)
         end.publish(key, b"second")
-        end.query(keys.join("r"), timeout=DENIED_SECONDS)  # all that was sent before is through
+        end.query(keys.join("r"), timeout=DENIED_SECONDS)  # returns after everything sent before has arrived
         self.until_heard(lambda: self.learner.publish(key, b"third"), lambda: b"third" in news)
         return b"second" in news
 
@@ -172,12 +172,14 @@ ALLOWED = {
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda operation: operation.__name__)
 @pytest.mark.parametrize("identity", IDENTITIES)
-def test_the_table(address: str, certificates: Path, identity: str, operation: Callable[[Scene], bool]) -> None:
+def test_table_of_permissions(
+    address: str, certificates: Path, identity: str, operation: Callable[[Scene], bool]
+) -> None:
     with ExitStack() as stack:
         assert operation(Scene(address, certificates, identity, stack)) == (operation in ALLOWED[identity])
 
 
-def test_all_see_the_learner_go(address: str, certificates: Path) -> None:
+def test_every_identity_sees_the_learner_disappear(address: str, certificates: Path) -> None:
     with ExitStack() as stack:
         scene = Scene(address, certificates, "actor", stack)
         there: list[bool] = []
@@ -188,18 +190,18 @@ def test_all_see_the_learner_go(address: str, certificates: Path) -> None:
         scene.until_heard(lambda: None, lambda: there == [True, False])
 
 
-# ------------------------------------------------------------------------------------- strangers and mistakes
+# ------------------------------------------------------------------------------------- unknown identities and mistakes
 
 
-def test_a_stranger_is_not_let_in_at_all(address: str, strange: Path) -> None:
+def test_certificate_of_another_ca_is_rejected(address: str, strange: Path) -> None:
     with pytest.raises(RefusedError, match="different CAs"):
         connect([address], load(strange / "actor-arm", "actor"))
-    with pytest.raises(TransportError, match="wants --tls"):
+    with pytest.raises(TransportError, match="requires --tls"):
         connect([address.replace("tls/", "tcp/")])
 
 
-def test_a_stranger_who_knows_the_ca_by_sight_is_refused(address: str, certificates: Path, strange: Path) -> None:
-    """It trusts our CA; its own certificate is still another's."""
+def test_foreign_certificate_with_our_ca_file_is_rejected(address: str, certificates: Path, strange: Path) -> None:
+    """The client trusts our CA, but its certificate is signed by another one."""
     (strange / "actor-box" / "ca.pem").write_bytes((certificates / "actor-box" / "ca.pem").read_bytes())
     with pytest.raises(CredentialsError, match="different CAs"):
         load(strange / "actor-box", "actor")
@@ -207,34 +209,34 @@ def test_a_stranger_who_knows_the_ca_by_sight_is_refused(address: str, certifica
         connect([address], unchecked(strange / "actor-box"))
 
 
-def test_an_expired_certificate_is_found_before_it_is_used(certificates: Path) -> None:
-    with pytest.raises(CredentialsError, match="expired: issue it anew"):
+def test_expired_certificate_is_rejected_when_loaded(certificates: Path) -> None:
+    with pytest.raises(CredentialsError, match="expired: issue a new one"):
         load(issue_expired(certificates, "actor", "arm"), "actor")
 
 
-def test_an_expired_certificate_is_refused_and_its_owner_told(address: str, certificates: Path) -> None:
+def test_expired_certificate_is_refused_with_a_reason(address: str, certificates: Path) -> None:
     with pytest.raises(RefusedError, match=r"refuses the certificate in .*expired"):
         connect([address], unchecked(issue_expired(certificates, "actor", "arm")))
 
 
-def test_nobody_talks_to_a_listener_whose_certificate_is_expired(certificates: Path) -> None:
+def test_listener_with_an_expired_certificate_is_not_trusted(certificates: Path) -> None:
     address, router = listen_somewhere(issue_expired(certificates, "router"))
-    with closing(router), pytest.raises(RefusedError, match=r"does not serve: .*expired"):
+    with closing(router), pytest.raises(RefusedError, match=r"cannot be verified: .*expired"):
         connect([address], load(certificates / "actor-arm", "actor"))
 
 
-def test_an_actor_cannot_pass_for_a_learner(certificates: Path) -> None:
-    """Not by its own start, and not to an actor that trusts the CA."""
-    with pytest.raises(CredentialsError, match="holds the certificate of actor 'arm': learner was expected"):
+def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> None:
+    """The learner refuses to start with it, and an actor refuses to connect to it."""
+    with pytest.raises(CredentialsError, match="holds the certificate of actor 'arm', but learner is required"):
         load(certificates / "actor-arm", "learner")
     folder = certificates / "actor-arm"
     (folder / "names.json").write_text('{"actors": [], "operators": []}')
     address, router = listen_somewhere(folder)
-    with closing(router), pytest.raises(RefusedError, match="does not serve"):
+    with closing(router), pytest.raises(RefusedError, match="cannot be verified"):
         connect([address], load(certificates / "actor-box", "actor"))
 
 
-def test_a_host_that_the_certificate_does_not_name_is_not_trusted(certificates: Path) -> None:
+def test_host_missing_in_the_certificate_is_not_trusted(certificates: Path) -> None:
     address, router = listen_somewhere(certificates / "router")
     port = address.rpartition(":")[2]
     with closing(router):
@@ -247,7 +249,7 @@ def test_a_host_that_the_certificate_does_not_name_is_not_trusted(certificates: 
         connect([other], load(certificates / "actor-arm", "actor"))
 
 
-def test_a_name_that_was_revoked_may_do_nothing_any_more(tmp_path: Path) -> None:
+def test_revoked_name_has_no_permissions(tmp_path: Path) -> None:
     from daedalus.cli.commands.certs import certs
 
     folder = make_certificates(tmp_path / "certs")
@@ -270,14 +272,14 @@ def test_a_name_that_was_revoked_may_do_nothing_any_more(tmp_path: Path) -> None
         (lambda folder: (folder / "ca.pem").write_text("x"), "ca.pem is damaged"),
     ],
 )
-def test_a_damaged_folder_is_named(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
+def test_damaged_folder_is_reported(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     folder = make_certificates(tmp_path / "certs") / "actor-arm"
     damage(folder)
     with pytest.raises(CredentialsError, match=message):
         load(folder, "actor")
 
 
-def test_a_certificate_and_a_key_that_do_not_fit_are_named(certificates: Path, tmp_path: Path) -> None:
+def test_key_of_another_certificate_is_reported(certificates: Path, tmp_path: Path) -> None:
     for name, source in (("ca.pem", "actor-arm"), ("certificate.pem", "actor-arm"), ("key.pem", "actor-box")):
         (tmp_path / name).write_bytes((certificates / source / name).read_bytes())
     with pytest.raises(CredentialsError, match=r"key.pem is not the key of certificate.pem"):
@@ -285,7 +287,7 @@ def test_a_certificate_and_a_key_that_do_not_fit_are_named(certificates: Path, t
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"actors": []}'])
-def test_a_listener_that_does_not_know_whom_to_let_in_does_not_start(tmp_path: Path, text: str) -> None:
+def test_listener_without_authorised_names_does_not_start(tmp_path: Path, text: str) -> None:
     folder = make_certificates(tmp_path / "certs") / "learner"
     (folder / "names.json").write_text(text)
     with pytest.raises(CredentialsError, match=r"names\.json"):

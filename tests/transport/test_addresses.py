@@ -1,4 +1,4 @@
-"""transport/addresses.py: what may be listened on, and connected to."""
+"""transport/addresses.py: which addresses are allowed."""
 
 import pytest
 
@@ -6,36 +6,36 @@ from daedalus.transport.addresses import AddressError, check_connecting, check_l
 
 
 @pytest.mark.parametrize("address", ["tcp/127.0.0.1:7447", "tcp/127.8.9.1:1", "tcp/localhost:7447", "tcp/[::1]:7447"])
-def test_loopback_needs_nothing(address: str) -> None:
+def test_loopback_needs_no_certificates(address: str) -> None:
     check_listening([address], tls=False, insecure=False)
     check_listening([address], tls=True, insecure=False)
 
 
 @pytest.mark.parametrize("address", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.1:7447", "tcp/gpu-box:7447"])
-def test_beyond_loopback_needs_certificates_or_a_word(address: str) -> None:
-    for tls, hint in ((False, "give it certificates"), (True, "listen on tls/")):
+def test_listening_beyond_loopback_needs_certificates_or_insecure(address: str) -> None:
+    for tls, hint in ((False, "use certificates"), (True, "listen on tls/")):
         with pytest.raises(AddressError, match=f"{hint}.*--insecure"):
             check_listening(["tcp/127.0.0.1:1", address], tls=tls, insecure=False)
     check_listening([address], tls=False, insecure=True)
     check_listening([address.replace("tcp/", "tls/")], tls=True, insecure=False)
 
 
-def test_certificates_and_protocol_go_together() -> None:
+def test_protocol_must_fit_the_use_of_certificates() -> None:
     with pytest.raises(AddressError, match="needs certificates"):
         check_listening(["tls/127.0.0.1:1"], tls=False, insecure=True)
     with pytest.raises(AddressError, match="needs certificates"):
         check_connecting(["tls/h:1"], tls=False)
-    with pytest.raises(AddressError, match="begins with tls/"):
+    with pytest.raises(AddressError, match="must begin with tls/"):
         check_connecting(["tcp/h:1"], tls=True)
     check_connecting(["tls/h:1", "tls/i:2"], tls=True)
     check_connecting(["tcp/h:1"], tls=False)
 
 
 @pytest.mark.parametrize("address", ["", "h:1", "udp/h:1", "tcp/h", "tcp/:1", "tcp/h:x", "tcp/h:65536", "tls//h:-1"])
-def test_what_is_no_address_is_told_what_one_is(address: str) -> None:
+def test_malformed_address_is_rejected_with_the_right_form(address: str) -> None:
     for check in (
         lambda: check_listening([address], tls=True, insecure=True),
         lambda: check_connecting([address], tls=address.startswith("tls")),
     ):
-        with pytest.raises(AddressError, match=r"must be like tcp/HOST:PORT"):
+        with pytest.raises(AddressError, match=r"is not an address: write tcp/HOST:PORT"):
             check()

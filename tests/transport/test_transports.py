@@ -1,6 +1,6 @@
-"""One contract, held by every transport; what only Zenoh can do is at the end.
+"""The contract of every transport; tests of Zenoh alone are at the end.
 
-Sessions are always closed by the fixture: one that leaks would keep the process from ending.
+A fixture closes all sessions: an open session would prevent the process from ending.
 """
 
 import itertools
@@ -16,13 +16,13 @@ from daedalus.transport.interface import AddressInUseError, Request, Transport, 
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 from daedalus.transport.zenoh_transport import connect, listen
 
-WAIT = 30.0  # seconds; generous, so that only a real fault reaches it
+WAIT = 30.0  # seconds; generous, so that only a real fault exceeds it
 MakeEnd = Callable[[], Transport]
 numbers = itertools.count()
 
 
 class Tape(queue.SimpleQueue[Any]):
-    """A callback that keeps what it is called with; `next` waits for it."""
+    """A callback that records its arguments; `next` waits for the next call."""
 
     def __call__(self, *arguments: Any) -> None:
         self.put(arguments[0] if len(arguments) == 1 else arguments)
@@ -42,7 +42,7 @@ def listen_somewhere() -> tuple[str, Transport]:
         endpoint = free_endpoint()
         try:
             return endpoint, listen([endpoint])
-        except AddressInUseError:  # somebody took it in the meantime
+        except AddressInUseError:  # another process took it meanwhile
             continue
     raise AssertionError("no free port")
 
@@ -53,7 +53,7 @@ def memory_ends() -> MakeEnd:
 
 
 def zenoh_ends() -> MakeEnd:
-    """The first end is the router, the others are its clients."""
+    """Return a function that opens a router first, and then its clients."""
     endpoints: list[str] = []
 
     def make() -> Transport:
@@ -68,7 +68,7 @@ def zenoh_ends() -> MakeEnd:
 
 @pytest.fixture
 def closing() -> Iterator[Callable[[Transport], Transport]]:
-    """Closes what it was given, when the test is over."""
+    """Return a function that registers transports to be closed after the test."""
     ends: list[Transport] = []
 
     def keep(end: Transport) -> Transport:
@@ -88,14 +88,14 @@ def make_end(request: pytest.FixtureRequest, closing: Callable[[Transport], Tran
 
 @pytest.fixture(params=["router to client", "client to router", "client to client"])
 def pair(request: pytest.FixtureRequest, make_end: MakeEnd) -> tuple[Transport, Transport]:
-    """Two ends, in every constellation that Zenoh tells apart: (the one that serves, the one that asks)."""
+    """Return two transports in every arrangement that Zenoh distinguishes: (server, client of the query)."""
     router, first, second = make_end(), make_end(), make_end()
     constellations = {"router to client": (router, first), "client to router": (first, router)}
     return constellations.get(request.param, (first, second))
 
 
 def settle(declarer: Transport, other: Transport) -> None:
-    """Waits until `other` can know all that `declarer` declared so far: declarations keep their order."""
+    """Wait until `other` knows all declarations of `declarer` so far: declarations keep their order."""
     key = f"settled/{next(numbers)}"
     tape = Tape()
     other.watch_presence(key, tape)
@@ -110,7 +110,7 @@ def echo(request: Request) -> None:
 # -------------------------------------------------------------------------------------------- queries
 
 
-def test_a_question_is_answered_with_its_key_and_payload_at_hand(pair: tuple[Transport, Transport]) -> None:
+def test_query_is_answered_from_its_key_and_payload(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
     server.serve("d/r/join", echo)
     settle(server, asker)
@@ -119,13 +119,13 @@ def test_a_question_is_answered_with_its_key_and_payload_at_hand(pair: tuple[Tra
     assert asker.query("d/r/join", timeout=WAIT) == [b"d/r/join "]
 
 
-def test_an_end_answers_itself(make_end: MakeEnd) -> None:
+def test_transport_answers_its_own_queries(make_end: MakeEnd) -> None:
     end = make_end()
     end.serve("d/r/join", echo)
     assert end.query("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]
 
 
-def test_nobody_answers_a_question_that_nobody_serves(pair: tuple[Transport, Transport]) -> None:
+def test_query_without_a_server_has_no_answers(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
     server.serve("d/r/join", echo)
     settle(server, asker)
@@ -133,7 +133,7 @@ def test_nobody_answers_a_question_that_nobody_serves(pair: tuple[Transport, Tra
         assert asker.query(key, timeout=WAIT) == []
 
 
-def test_a_served_wildcard_stands_for_one_chunk(pair: tuple[Transport, Transport]) -> None:
+def test_wildcard_of_a_server_matches_one_chunk(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
     server.serve("d/r/rollouts/*", echo)
     settle(server, asker)
@@ -142,7 +142,7 @@ def test_a_served_wildcard_stands_for_one_chunk(pair: tuple[Transport, Transport
     assert asker.query("d/r/rollouts/a/b", timeout=WAIT) == []
 
 
-def test_an_asked_wildcard_reaches_all_that_match_and_each_sees_its_own_key(make_end: MakeEnd) -> None:
+def test_wildcard_of_a_query_reaches_every_matching_server(make_end: MakeEnd) -> None:
     asker, first, second = make_end(), make_end(), make_end()
     for end, key in ((first, "d/one/status"), (second, "d/two/status"), (second, "d/two/join")):
         end.serve(key, echo)
@@ -161,7 +161,7 @@ def test_every_server_of_one_key_answers(make_end: MakeEnd) -> None:
     assert sorted(asker.query("d/*/status", timeout=WAIT)) == [b"first", b"second"]
 
 
-def test_what_is_sent_is_answered_exactly_once(pair: tuple[Transport, Transport]) -> None:
+def test_async_query_is_answered_exactly_once(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
 
     def answer_twice(request: Request) -> None:
@@ -178,14 +178,14 @@ def test_what_is_sent_is_answered_exactly_once(pair: tuple[Transport, Transport]
     assert tape.empty()
 
 
-def test_what_nobody_serves_is_answered_by_none(pair: tuple[Transport, Transport]) -> None:
+def test_async_query_without_a_server_is_answered_by_none(pair: tuple[Transport, Transport]) -> None:
     _, asker = pair
     tape = Tape()
     asker.query_async("d/r/nobody", b"x", timeout=WAIT, on_answer=tape)
     assert tape.next() is None
 
 
-def test_an_answer_may_come_later_and_from_another_thread(pair: tuple[Transport, Transport]) -> None:
+def test_request_may_be_answered_later_and_from_another_thread(pair: tuple[Transport, Transport]) -> None:
     server, asker = pair
     requests, answers = Tape(), Tape()
     server.serve("d/r/program/*", requests)
@@ -199,11 +199,11 @@ def test_an_answer_may_come_later_and_from_another_thread(pair: tuple[Transport,
     thread.join(WAIT)
     assert answers.next() == b"!"
     request.reply(b"again")
-    asker.query_async("d/r/nobody", b"", timeout=WAIT, on_answer=answers)  # comes after whatever "again" could cause
+    asker.query_async("d/r/nobody", b"", timeout=WAIT, on_answer=answers)  # completes after any effect of "again"
     assert answers.next() is None
 
 
-def test_a_request_that_is_forgotten_is_answered_by_none(make_end: MakeEnd) -> None:
+def test_dropped_request_is_answered_by_none(make_end: MakeEnd) -> None:
     server, asker = make_end(), make_end()
     server.serve("d/r/join", lambda request: None)
     settle(server, asker)
@@ -213,7 +213,7 @@ def test_a_request_that_is_forgotten_is_answered_by_none(make_end: MakeEnd) -> N
     assert tape.next() is None
 
 
-def test_an_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
+def test_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
     server, asker = make_end(), make_end()
     requests = Tape()
     server.serve("d/r/join", requests)
@@ -223,7 +223,7 @@ def test_an_answer_after_the_timeout_is_dropped(make_end: MakeEnd) -> None:
     assert answers == []
 
 
-def test_an_end_that_closed_serves_no_more(make_end: MakeEnd) -> None:
+def test_closed_transport_serves_no_queries(make_end: MakeEnd) -> None:
     asker, server = make_end(), make_end()
     gone = Tape()
     asker.watch_presence("d/r/learner", gone)
@@ -255,7 +255,7 @@ def test_only_the_newest_value_is_kept(pair: tuple[Transport, Transport]) -> Non
     assert inbox.take() == b"4"
 
 
-def test_every_follower_gets_the_value_and_no_other_key_does(make_end: MakeEnd) -> None:
+def test_value_reaches_every_subscriber_of_its_key_only(make_end: MakeEnd) -> None:
     publisher, first, second = make_end(), make_end(), make_end()
     first_news, second_news, other_news = Tape(), Tape(), Tape()
     first_inbox = first.subscribe("d/r/snapshots", lambda: first_news(None))
@@ -270,14 +270,14 @@ def test_every_follower_gets_the_value_and_no_other_key_does(make_end: MakeEnd) 
     assert other_news.empty()
 
 
-def test_a_value_that_nobody_follows_is_no_error(make_end: MakeEnd) -> None:
+def test_publishing_without_subscribers_is_allowed(make_end: MakeEnd) -> None:
     make_end().publish("d/r/snapshots", b"x")
 
 
 # ------------------------------------------------------------------------------------------- presence
 
 
-def test_a_watch_tells_who_is_there_who_comes_and_who_goes(pair: tuple[Transport, Transport]) -> None:
+def test_watch_reports_present_new_and_ended_keys(pair: tuple[Transport, Transport]) -> None:
     actor, learner = pair
     tape = Tape()
     actor.declare_presence("d/r/actors/early")
@@ -292,7 +292,7 @@ def test_a_watch_tells_who_is_there_who_comes_and_who_goes(pair: tuple[Transport
     assert tape.empty()
 
 
-def test_every_watch_is_told(make_end: MakeEnd) -> None:
+def test_every_watch_is_called(make_end: MakeEnd) -> None:
     actor, first, second = make_end(), make_end(), make_end()
     tapes = [Tape(), Tape()]
     first.watch_presence("d/r/actors/*", tapes[0])
@@ -301,7 +301,7 @@ def test_every_watch_is_told(make_end: MakeEnd) -> None:
     assert [tape.next() for tape in tapes] == [("d/r/actors/a", True)] * 2
 
 
-def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
+def test_presence_lasts_while_any_transport_declares_it(make_end: MakeEnd) -> None:
     learner, first, second = make_end(), make_end(), make_end()
     shared, own = Tape(), Tape()
     for end, key in ((first, "d/r/actors/a"), (second, "d/r/actors/a"), (first, "d/r/own")):
@@ -311,7 +311,7 @@ def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
     assert own.next() == ("d/r/own", True)
     learner.watch_presence("d/r/actors/*", shared)
     assert shared.next() == ("d/r/actors/a", True)
-    while not shared.empty():  # one call for each end is as good as one for both
+    while not shared.empty():  # one call for each transport is allowed, as is one for both
         assert shared.next() == ("d/r/actors/a", True)
     first.close()
     assert own.next() == ("d/r/own", False)
@@ -321,7 +321,7 @@ def test_presence_lasts_while_any_end_announces_it(make_end: MakeEnd) -> None:
     assert sorted((shared.next(), shared.next())) == [("d/r/actors/a", False), ("d/r/actors/b", False)]
 
 
-def test_closing_twice_is_closing_once(make_end: MakeEnd) -> None:
+def test_close_is_idempotent(make_end: MakeEnd) -> None:
     learner, actor = make_end(), make_end()
     tape = Tape()
     learner.watch_presence("d/r/actors/*", tape)
@@ -337,19 +337,19 @@ def test_closing_twice_is_closing_once(make_end: MakeEnd) -> None:
 # ---------------------------------------------------------------------------------------- Zenoh alone
 
 
-def test_a_taken_address_is_named(closing: Callable[[Transport], Transport]) -> None:
+def test_address_in_use_is_reported(closing: Callable[[Transport], Transport]) -> None:
     endpoint, router = listen_somewhere()
     closing(router)
     with pytest.raises(AddressInUseError, match=f"{endpoint} is already in use.*--listen"):
         closing(listen([endpoint]))
 
 
-def test_an_address_that_cannot_be_is_refused(closing: Callable[[Transport], Transport]) -> None:
+def test_impossible_address_is_reported(closing: Callable[[Transport], Transport]) -> None:
     with pytest.raises(TransportError, match="cannot listen on tcp/256"):
         closing(listen(["tcp/256.0.0.1:1"]))
 
 
-def test_a_dead_address_is_named_at_once(closing: Callable[[Transport], Transport]) -> None:
+def test_unreachable_address_is_reported_at_once(closing: Callable[[Transport], Transport]) -> None:
     endpoint = free_endpoint()
     refused = Tape()
 
@@ -363,7 +363,7 @@ def test_a_dead_address_is_named_at_once(closing: Callable[[Transport], Transpor
     assert refused.next() == f"nothing answers at {endpoint}"
 
 
-def test_a_client_is_answered_by_none_once_its_router_is_gone(closing: Callable[[Transport], Transport]) -> None:
+def test_query_is_answered_by_none_after_the_router_closed(closing: Callable[[Transport], Transport]) -> None:
     endpoint, router = listen_somewhere()
     closing(router)
     client = closing(connect([endpoint]))
@@ -378,7 +378,7 @@ def test_a_client_is_answered_by_none_once_its_router_is_gone(closing: Callable[
 
 
 @pytest.mark.parametrize("act", ["ask", "send", "publish"])
-def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[Transport], Transport]) -> None:
+def test_closed_transport_raises_transport_error(act: str, closing: Callable[[Transport], Transport]) -> None:
     end = closing(listen_somewhere()[1])
     end.close()
     acts: dict[str, Callable[[], object]] = {
@@ -390,21 +390,53 @@ def test_a_closed_end_says_that_it_can_do_no_more(act: str, closing: Callable[[T
         acts[act]()
 
 
+def raise_fault(*_arguments: object) -> None:
+    raise RuntimeError("a fault of ours")
+
+
+@pytest.mark.parametrize("callback", ["handler", "answer", "subscriber", "presence"])
+def test_exception_in_a_callback_reaches_the_threads_excepthook(
+    callback: str, closing: Callable[[Transport], Transport], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = Tape()
+    monkeypatch.setattr(threading, "excepthook", faults)
+    endpoint, router = listen_somewhere()
+    closing(router)
+    client = closing(connect([endpoint]))
+    if callback == "handler":
+        client.serve("d/r/join", raise_fault)
+        settle(client, router)
+        assert router.query("d/r/join", timeout=WAIT) == []
+    elif callback == "answer":
+        client.query_async("d/r/join", b"", timeout=WAIT, on_answer=raise_fault)
+    elif callback == "subscriber":
+        client.subscribe("d/r/snapshots", raise_fault)
+        settle(client, router)
+        router.publish("d/r/snapshots", b"x")
+    else:
+        client.watch_presence("d/r/actors/*", raise_fault)
+        router.declare_presence("d/r/actors/a")
+    fault = faults.next()
+    assert (fault.exc_type, str(fault.exc_value)) == (RuntimeError, "a fault of ours")
+    assert fault.exc_traceback.tb_next.tb_frame.f_code.co_name in ("raise_fault", "on_query", "on_end", "on_sample")
+    assert fault.thread is not None
+
+
 # ------------------------------------------------------------------------------------------- reopening
 
 
-def test_what_cannot_die_is_not_reopened(make_end: MakeEnd) -> None:
+def test_routers_and_memory_transports_are_not_reopened(make_end: MakeEnd) -> None:
     assert make_end().reopen() is False
 
 
 @pytest.fixture
 def client(closing: Callable[[Transport], Transport]) -> tuple[Transport, Transport]:
-    """A router, and a client of it."""
+    """Return a router and a client of it."""
     endpoint, router = listen_somewhere()
     return closing(router), closing(connect([endpoint]))
 
 
-def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport, Transport]) -> None:
+def test_reopened_client_repeats_its_declarations(client: tuple[Transport, Transport]) -> None:
     router, end = client
     news, seen, there = Tape(), Tape(), Tape()
     end.serve("d/r/join", echo)
@@ -419,7 +451,7 @@ def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport
     end.query_async("d/r/status", b"1", timeout=WAIT, on_answer=answers)
     assert answers.next() == b"d/r/status 1"
     assert end.reopen() is True
-    # Who was there is gone for a moment: it may have left while the session was dead.
+    # Present keys are reported as absent first: they may have ended while the session was dead.
     assert [seen.next(), seen.next()] == [("d/r/learner", False), ("d/r/learner", True)]
     assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
     settle(end, router)
@@ -431,7 +463,7 @@ def test_a_client_that_was_reopened_does_all_that_it_did(client: tuple[Transport
     assert answers.next() == b"d/r/status 2"
 
 
-def test_a_client_that_others_reach_is_left_as_it_is(client: tuple[Transport, Transport]) -> None:
+def test_reachable_client_is_not_reopened(client: tuple[Transport, Transport]) -> None:
     router, end = client
     there = Tape()
     router.watch_presence("d/r/actors/*", there)
@@ -443,7 +475,7 @@ def test_a_client_that_others_reach_is_left_as_it_is(client: tuple[Transport, Tr
     assert [there.next(), there.next()] == [("d/r/actors/a", False), ("d/r/actors/a", True)]
 
 
-def test_a_client_whose_router_is_gone_stays_as_it_is(closing: Callable[[Transport], Transport]) -> None:
+def test_client_without_a_router_keeps_its_session(closing: Callable[[Transport], Transport]) -> None:
     endpoint, router = listen_somewhere()
     closing(router)
     end = closing(connect([endpoint]))
@@ -454,7 +486,7 @@ def test_a_client_whose_router_is_gone_stays_as_it_is(closing: Callable[[Transpo
     assert end.query("d/r/join", b"x", timeout=WAIT) == [b"d/r/join x"]  # itself
 
 
-def test_a_closed_client_is_not_brought_back(client: tuple[Transport, Transport]) -> None:
+def test_closed_client_is_not_reopened(client: tuple[Transport, Transport]) -> None:
     _, end = client
     end.close()
     assert end.reopen() is False

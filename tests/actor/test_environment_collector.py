@@ -1,4 +1,4 @@
-"""Every row of a rollout in its place, shown by an environment that counts."""
+"""EnvironmentCollector: the place of every row in a rollout, checked with an environment that counts."""
 
 import copy
 import itertools
@@ -7,20 +7,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from collectors import collect, started_collector
 
-from daedalus.actor.collecting.collector import Collector
-from daedalus.actor.environments.make import make_environments
-from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
-IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 
 
 class Scripted:
-    """A policy that plays 0, 1, 2, ... and over again, the same in every environment.
+    """A policy that chooses 0, 1, 2, ... in turn, the same in every environment.
 
-    Its memory is two numbers: how many rows it remembers, and the sum of the steps that it saw in them.
+    Its memory is two numbers: the rows that it remembers, and the sum of the steps that it observed in them.
     """
 
     state_size = 2
@@ -49,11 +47,11 @@ class Scripted:
 def collected() -> tuple[list[Rollout], Scripted]:
     """Three rollouts of four rows, one environment, episodes of 3 (terminated), 2 (truncated), 1 (terminated)."""
     policy = Scripted()
-    collector = Collector(make_environments(COUNTING, 1), policy, COUNTING, rollout_length=4, seed=1)
-    return [copy.deepcopy(collector.collect(IDENTITY, 7)) for _ in range(3)], policy
+    collector = started_collector(COUNTING, policy, rollout_length=4)
+    return [copy.deepcopy(collect(collector)) for _ in range(3)], policy
 
 
-# Written out by hand: twelve rows of episodes 0 (three steps, terminated), 1 (two steps, truncated), 2 (one step,
+# By hand: twelve rows of episodes 0 (three steps, terminated), 1 (two steps, truncated), 2 (one step,
 # terminated), 3 (three steps). X marks the reset rows: row 3 after episode 0, row 6 after episode 1, row 8 after 2.
 #          row:           0    1    2    3X   4    5    6X   7    8X   9   10   11
 EPISODE = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2, 3, 3, 3])
@@ -79,27 +77,27 @@ def test_each_row_holds_its_observation_action_and_reward(collected: tuple[list[
     np.testing.assert_allclose(rows(rollouts, "behaviour_log_probs"), -0.5 * np.arange(1, 13))
 
 
-def test_termination_truncation_and_reset_rows_are_told_apart(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_rows_distinguish_termination_truncation_and_resets(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     np.testing.assert_array_equal(rows(rollouts, "terminated"), TERMINATED)
     np.testing.assert_array_equal(rows(rollouts, "truncated"), TRUNCATED)
     np.testing.assert_array_equal(rows(rollouts, "valid"), VALID)
 
 
-def test_the_row_after_an_end_shows_the_true_last_observation(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_reset_row_holds_the_true_last_observation_of_the_episode(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     # Row 2 ends episode 0; row 3 still shows its observation 3, which the value of row 2's successor needs.
     np.testing.assert_array_equal(rollouts[0].frames[3, 0], [0, 3])
     np.testing.assert_array_equal(rollouts[1].frames[2, 0], [1, 2])
 
 
-def test_the_last_observation_of_a_rollout_is_the_first_of_the_next(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_last_observation_of_a_rollout_is_the_first_of_the_next(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     for before, after in itertools.pairwise(rollouts):
         np.testing.assert_array_equal(before.frames[-1], after.frames[0])
 
 
-def test_episodes_are_reported_where_they_end_with_their_true_returns(
+def test_episode_returns_are_in_the_rollout_where_the_episode_ends(
     collected: tuple[list[Rollout], Scripted],
 ) -> None:
     rollouts, _ = collected
@@ -110,43 +108,41 @@ def test_episodes_are_reported_where_they_end_with_their_true_returns(
     assert [rollout.episode_lengths.tolist() for rollout in rollouts] == [[3], [2, 1], [3]]
 
 
-def test_rewards_are_scaled_for_learning_and_not_in_returns() -> None:
+def test_rewards_are_scaled_and_episode_returns_are_not() -> None:
     spec = COUNTING.model_copy(update={"reward_scale": 0.5})
-    collector = Collector(make_environments(spec, 2), Scripted(), spec, rollout_length=3, seed=1)
-    rollout = collector.collect(IDENTITY, 0)
+    collector = started_collector(spec, Scripted(), count=2, rollout_length=3)
+    rollout = collect(collector)
     np.testing.assert_allclose(rollout.rewards[:, 0], 0.5 * REWARD[:3], rtol=1e-6)
     np.testing.assert_allclose(rollout.episode_returns, [REWARD[:3].sum()] * 2, rtol=1e-6)
-    second = collector.collect(IDENTITY, 0)  # scaling must not reach into what is carried over
+    second = collect(collector)  # scaling must not change what is carried over
     np.testing.assert_allclose(second.rewards[:, 1], 0.5 * REWARD[3:6], rtol=1e-6)
 
 
-def test_rewards_are_clipped_then_scaled_for_learning_and_not_in_returns() -> None:
+def test_rewards_are_clipped_before_scaling_and_episode_returns_are_not() -> None:
     spec = COUNTING.model_copy(update={"reward_clip": 10.5, "reward_scale": 0.5})
-    collector = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=4, seed=1)
-    rollouts = [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+    collector = started_collector(spec, Scripted(), rollout_length=4)
+    rollouts = [copy.deepcopy(collect(collector)) for _ in range(3)]
     assert (REWARD > 10.5).any()
-    assert ((REWARD > 5.25) & (REWARD < 10.5)).any()  # scaled first, these would be among the clipped
+    assert ((REWARD > 5.25) & (REWARD < 10.5)).any()  # these would be clipped if scaling came first
     np.testing.assert_allclose(rows(rollouts, "rewards"), 0.5 * np.minimum(REWARD, 10.5), rtol=1e-6)
     returns = np.concatenate([rollout.episode_returns for rollout in rollouts])
     np.testing.assert_allclose(returns, [(REWARD * (EPISODE == episode)).sum() for episode in range(4)], rtol=1e-6)
 
 
-def test_a_continuing_task_has_no_ends_but_cuts() -> None:
-    def collect(spec: EnvironmentSpec) -> list[Rollout]:
-        collector = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=4, seed=1)
-        return [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+def test_bootstrap_terminations_turns_terminations_into_truncations() -> None:
+    def collect_three(spec: EnvironmentSpec) -> list[Rollout]:
+        collector = started_collector(spec, Scripted(), rollout_length=4)
+        return [copy.deepcopy(collect(collector)) for _ in range(3)]
 
-    episodic, bootstrap_terminations = (
-        collect(COUNTING),
-        collect(COUNTING.model_copy(update={"bootstrap_terminations": True})),
-    )
+    episodic = collect_three(COUNTING)
+    bootstrapped = collect_three(COUNTING.model_copy(update={"bootstrap_terminations": True}))
     terminated, truncated = rows(episodic, "terminated"), rows(episodic, "truncated")
     assert terminated.any()
     assert truncated.any()
-    assert not rows(bootstrap_terminations, "terminated").any()
-    np.testing.assert_array_equal(rows(bootstrap_terminations, "truncated"), terminated | truncated)
+    assert not rows(bootstrapped, "terminated").any()
+    np.testing.assert_array_equal(rows(bootstrapped, "truncated"), terminated | truncated)
     for name in ("valid", "rewards", "episode_returns", "episode_lengths"):
-        for ours, plain in zip(bootstrap_terminations, episodic, strict=True):
+        for ours, plain in zip(bootstrapped, episodic, strict=True):
             np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
 
 
@@ -163,38 +159,37 @@ class _Losing(gymnasium.Env[np.ndarray, np.int64]):
         return np.zeros(2, np.float32), -3.0, False, False, {}
 
 
-def test_losses_are_clipped_as_gains_are() -> None:
+def test_negative_rewards_are_clipped_like_positive_ones() -> None:
     gymnasium.register("Losing-v0", lambda **_kwargs: _Losing())
     spec = EnvironmentSpec(id="Losing-v0", max_episode_steps=2, reward_clip=1.0, reward_scale=2.0)
-    rollout = Collector(make_environments(spec, 1), Scripted(), spec, rollout_length=2, seed=1).collect(IDENTITY, 0)
+    rollout = collect(started_collector(spec, Scripted(), rollout_length=2))
     assert rollout.rewards[:, 0].tolist() == [-2.0, -2.0]
     assert rollout.episode_returns.tolist() == [-6.0]
 
 
-# Before each of the twelve rows: how many rows of its episode were acted upon, and the sum of their steps. The reset
-# row of an episode is its last; what is made of it is forgotten.
+# The memory before each of the twelve rows: the earlier rows of the episode, and the sum of their steps. The reset row
+# of an episode is its last; the memory that follows it is discarded.
 REMEMBERED = np.array([[0, 0], [1, 0], [2, 1], [3, 3], [0, 0], [1, 0], [2, 1], [0, 0], [1, 0], [0, 0], [1, 0], [2, 1]])
 
 
-def test_memory_is_of_the_running_episode_alone(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_memory_covers_the_running_episode_only(collected: tuple[list[Rollout], Scripted]) -> None:
     _, policy = collected
     np.testing.assert_array_equal(np.concatenate(policy.remembered), REMEMBERED)
 
 
-def test_a_rollout_ships_the_memory_as_it_was_before_its_first_row(collected: tuple[list[Rollout], Scripted]) -> None:
+def test_rollout_holds_the_memory_before_its_first_row(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     np.testing.assert_array_equal(
         np.concatenate([rollout.initial_state for rollout in rollouts]), REMEMBERED[[0, 4, 8]]
     )
-    assert rollouts[2].initial_state.any()  # begun in the middle of an episode
+    assert rollouts[2].initial_state.any()  # it begins in the middle of an episode
 
 
-def test_environments_remember_apart() -> None:
-    """Two that end at other steps: each forgets at its own starts."""
+def test_each_environment_has_its_own_memory() -> None:
+    """Their episodes end at different steps: each memory is reset at the starts of its own episodes."""
     spec = EnvironmentSpec(id="CartPole-v1")
-    environments, policy = make_environments(spec, 3), Scripted(choices=1)
-    collector = Collector(environments, policy, spec, rollout_length=40, seed=3)
-    rollout = collector.collect(IDENTITY, 0)
+    policy = Scripted(choices=1)
+    rollout = collect(started_collector(spec, policy, count=3, rollout_length=40, seed=3))
     starts = np.concatenate([np.zeros((1, 3), bool), ~rollout.valid[:-1]])
     assert (starts.any(axis=1) != starts.all(axis=1)).any()
     expected = np.zeros(3)
@@ -204,13 +199,12 @@ def test_environments_remember_apart() -> None:
         expected += 1
 
 
-def test_a_policy_without_memory_ships_none() -> None:
-    policy = Forgetful()
-    rollout = Collector(make_environments(COUNTING, 3), policy, COUNTING, rollout_length=4, seed=1).collect(IDENTITY, 0)
+def test_rollout_of_a_policy_without_memory_has_an_empty_state() -> None:
+    rollout = collect(started_collector(COUNTING, Memoryless(), count=3, rollout_length=4))
     assert rollout.initial_state.shape == (3, 0)
 
 
-class Forgetful(Scripted):
+class Memoryless(Scripted):
     state_size = 0
 
     def act(
@@ -223,27 +217,25 @@ class Forgetful(Scripted):
 STACKED = COUNTING.model_copy(update={"frame_stack": 3})
 
 
-def test_each_frame_is_shipped_once_after_the_stack_of_the_first_row() -> None:
-    policy = Forgetful()
-    collector = Collector(make_environments(STACKED, 1), policy, STACKED, rollout_length=4, seed=1)
-    rollouts = [copy.deepcopy(collector.collect(IDENTITY, 0)) for _ in range(3)]
+def test_each_frame_is_in_a_rollout_once_after_the_stack_of_the_first_row() -> None:
+    collector = started_collector(STACKED, Memoryless(), rollout_length=4)
+    rollouts = [copy.deepcopy(collect(collector)) for _ in range(3)]
     shown = [frame.tolist() for frame in np.stack([EPISODE, STEP], axis=1)]
     assert rollouts[0].frames[:, 0].tolist() == [shown[0]] * 2 + shown[:5]
-    # Row 4 is the first of episode 1: the stack that it begins with shows nothing of episode 0.
+    # Row 4 is the first of episode 1: its stack has no frame of episode 0.
     assert rollouts[1].frames[:, 0].tolist() == [shown[4]] * 2 + shown[4:9]
     # Row 8 is the reset row of episode 2, which was two frames long.
     assert rollouts[2].frames[:, 0].tolist() == [shown[7], shown[7], *shown[8:], [3, 3]]
 
 
-def test_cartpoles_own_vector_entry_point_resets_on_truncation_too() -> None:
-    """The notes' notebook resets on termination only; an episode cut by its limit then never ends."""
+def test_cartpole_vector_entry_point_resets_after_truncations_too() -> None:
+    """An implementation that resets on termination only never ends a truncated episode."""
     spec = EnvironmentSpec(id="CartPole-v1", max_episode_steps=5)
-    collector = Collector(make_environments(spec, 3), Scripted(choices=2), spec, rollout_length=12, seed=3)
-    rollout = collector.collect(IDENTITY, 0)
+    rollout = collect(started_collector(spec, Scripted(choices=2), count=3, rollout_length=12, seed=3))
     assert rollout.truncated[[4, 10]].all()
     assert not rollout.terminated.any()
     assert not rollout.valid[[5, 11]].any()
     assert rollout.valid.sum() == 3 * 10
-    assert (np.abs(rollout.frames[6]) <= 0.05).all()  # a fresh start
-    assert (np.abs(rollout.frames[5]) > 0.05).any()  # the true last one
+    assert (np.abs(rollout.frames[6]) <= 0.05).all()  # the start of an episode
+    assert (np.abs(rollout.frames[5]) > 0.05).any()  # the true last observation
     np.testing.assert_array_equal(rollout.episode_lengths, [5] * 6)

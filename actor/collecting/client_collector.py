@@ -1,0 +1,179 @@
+"""Rollouts from a loop that the caller owns: rows are written as the loop reports observations and rewards."""
+
+import copy
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+
+_MAX_FULL_ROLLOUTS = 8  # that the service has not taken yet; beyond that the oldest is dropped
+_NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # `collect` replaces it
+
+
+class ClientCollector:
+    """A Collector between two threads: the caller's, which acts, and the service's, which sends the rollouts."""
+
+    def __init__(self, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> None:
+        """`observation_space` and `action_space` are those of the caller's loop."""
+        self._observation_space, self._action_space = observation_space, action_space
+        self.policy_loaded = threading.Event()  # the caller may act
+        self.on_rollout: Callable[[], None] = lambda: None  # called on the caller's thread when a rollout is full
+        self._lock = threading.Lock()  # guards the next five
+        self.dropped = 0  # rollouts that were replaced by newer ones before the service took them
+        self._transforms: Transforms | None = None
+        self._next_policy: tuple[PolicyRuntime, RolloutWriter] | None = None  # begun, and not acting yet
+        self._snapshot: Snapshot | None = None  # the newest
+        self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
+        # For the caller's thread only:
+        self._policy: tuple[PolicyRuntime, RolloutWriter] | None = None
+        self._loaded: Snapshot | None = None  # in the runtime
+        self._last_frame: np.ndarray | None = None  # [1, *frame_shape]
+        self._acted = False  # the current row has an action and no outcome yet
+        self._episode_ended = False  # the next row is a reset row
+        self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
+
+    # -------------------------------------------------------------------------------- on the service's thread
+
+    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+        """See Collector."""
+        if spec.algorithm.synchronous:
+            raise ActorError(
+                f"a run with {spec.training.algorithm} makes its actors wait for each update, but a client cannot "
+                "wait: use another algorithm"
+            )
+        with self._lock:
+            self._transforms = Transforms(spec.environment, self._observation_space, self._action_space)
+            return self._transforms.spaces, 1
+
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+        """See Collector. Discard the rollouts of the previous policy."""
+        assert self._transforms is not None
+        writer = RolloutWriter(
+            self._transforms.spaces,
+            1,
+            runtime,
+            spec.environment,
+            rollout_length=spec.collection.rollout_length,
+            random=np.random.default_rng(seed),
+        )
+        with self._lock:
+            self._next_policy, self._snapshot = (runtime, writer), None
+            self._full.clear()
+
+    def load(self, snapshot: Snapshot) -> None:
+        """See Collector."""
+        with self._lock:
+            self._snapshot = snapshot
+        self.policy_loaded.set()
+
+    def has_rollout(self) -> bool:
+        """See Collector."""
+        return bool(self._full)
+
+    def collect(self, identity: RolloutIdentity) -> Rollout | None:
+        """See Collector. Return the oldest full rollout."""
+        with self._lock:
+            return replace(self._full.popleft(), identity=identity) if self._full else None
+
+    def close(self) -> None:
+        """See Collector. There is nothing to release."""
+
+    # --------------------------------------------------------------------------------- on the caller's thread
+
+    def act(self, observation: Any) -> Any:
+        """Return the action for an observation, which the last action, or the last episode's end, led to."""
+        frame = self._to_frame(observation)
+        self._switch_policy(frame)
+        assert self._policy is not None
+        if self._acted:
+            self._record(frame)
+        if self._episode_ended:  # write the reset row, whose action has no effect
+            self._choose()
+            self._episode_ended = False
+            self._record(frame)
+        self._acted = True
+        assert self._transforms is not None
+        return self._transforms.env_actions(self._choose())[0]
+
+    def reward(self, value: float) -> None:
+        """Add to the reward of the last action."""
+        if not self._acted:
+            raise ValueError("a reward came before any action of this episode: call act() first")
+        if not np.isfinite(value):
+            raise ValueError(f"the reward is {value}: it must be finite")
+        self._reward += float(value)
+
+    def end_episode(self, observation: Any, *, terminated: bool) -> None:
+        """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""
+        if not self._acted:
+            raise ValueError("the episode ended without any action: call act() first")
+        if observation is not None:
+            self._last_frame = self._to_frame(observation)
+        elif not terminated:
+            raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
+        self._terminated, self._truncated = terminated, not terminated
+        assert self._last_frame is not None
+        self._record(self._last_frame)
+        self._episode_ended = True
+
+    def _to_frame(self, observation: Any) -> np.ndarray:
+        """Return a checked observation as the run has it, [1, *frame_shape]."""
+        space = self._observation_space
+        frame = np.asarray(observation, space.dtype)
+        if frame.shape != space.shape:
+            raise ValueError(f"the observation has shape {frame.shape}, but its space has shape {space.shape}")
+        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+            raise ValueError("the observation has a value that is not finite")
+        assert self._transforms is not None
+        return self._transforms.frames(frame[None])
+
+    def _switch_policy(self, frame: np.ndarray) -> None:
+        """Continue with a policy that has begun meanwhile; discard the unfinished rollout of the previous one."""
+        self._last_frame = frame
+        with self._lock:
+            if self._next_policy is None or self._snapshot is None:
+                return
+            self._policy, self._next_policy = self._next_policy, None
+        self._acted = self._episode_ended = False
+        self._reward, self._terminated, self._truncated, self._loaded = 0.0, False, False, None
+        self._policy[1].start(frame)
+
+    def _choose(self) -> np.ndarray:
+        """Return the actions [1] of the next row; load the newest weights first if the row begins a rollout."""
+        assert self._policy is not None
+        runtime, writer = self._policy
+        if writer.is_between_rollouts:
+            with self._lock:
+                snapshot = self._snapshot
+            if snapshot is not None and snapshot is not self._loaded:
+                runtime.load(snapshot.weights)
+                self._loaded = snapshot
+        return writer.act()
+
+    def _record(self, frame: np.ndarray) -> None:
+        """Complete the row of the last action."""
+        assert self._policy is not None
+        assert self._loaded is not None
+        writer = self._policy[1]
+        full = writer.record(frame, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated]))
+        self._acted, self._reward, self._terminated, self._truncated = False, 0.0, False, False
+        if not full:
+            return
+        rollout = copy.deepcopy(writer.finish(_NO_IDENTITY, self._loaded.policy_version))
+        with self._lock:
+            if self._next_policy is None:  # otherwise the rollout is meant for a previous learner
+                self.dropped += len(self._full) == _MAX_FULL_ROLLOUTS
+                self._full.append(rollout)
+        self.on_rollout()

@@ -1,0 +1,83 @@
+"""Rollouts from environments that the actor creates and steps itself. No network, no threads."""
+
+import numpy as np
+
+from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.actor.environments.make import make_environments
+from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+
+class EnvironmentCollector:
+    """A Collector that creates environments as the run specifies and steps them.
+
+    A rollout's arrays are views of the collector's: encode or copy the rollout before the next `collect`.
+    """
+
+    def __init__(self, count: int | None = None, wrap: str | None = None) -> None:
+        """Create no environments yet.
+
+        Args:
+          count: E, the number of environments; None: as many as the run specifies.
+          wrap: see make_environments.
+        """
+        self._count, self._wrap = count, wrap
+        self._environments: VectorEnvironment | None = None
+        self._spec: EnvironmentSpec | None = None  # of the environments
+        self._runtime: PolicyRuntime | None = None
+        self._writer: RolloutWriter | None = None
+        self._policy_version = -1
+
+    def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
+        """See Collector. Reuse the environments of an earlier run with the same specification."""
+        if self._spec != spec.environment:
+            self.close()
+        if self._environments is None:
+            count = self._count or spec.collection.envs_per_actor
+            self._environments = make_environments(spec.environment, count, wrap=self._wrap)
+            self._spec = spec.environment
+        return self._environments.spaces, self._environments.count
+
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+        """See Collector. Reset the environments."""
+        environments = self._environments
+        assert environments is not None
+        environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
+        self._runtime = runtime
+        self._writer = RolloutWriter(
+            environments.spaces,
+            environments.count,
+            runtime,
+            spec.environment,
+            rollout_length=spec.collection.rollout_length,
+            random=np.random.default_rng(action_seed),
+        )
+        self._writer.start(environments.reset(int(environment_seed)))
+
+    def load(self, snapshot: Snapshot) -> None:
+        """See Collector."""
+        assert self._runtime is not None
+        self._runtime.load(snapshot.weights)
+        self._policy_version = snapshot.policy_version
+
+    def has_rollout(self) -> bool:
+        """See Collector. `collect` never waits for anybody here."""
+        return True
+
+    def collect(self, identity: RolloutIdentity) -> Rollout:
+        """See Collector. Step the environments until the rollout is full."""
+        writer, environments = self._writer, self._environments
+        assert writer is not None
+        assert environments is not None
+        while not writer.record(*environments.step(writer.act())):
+            pass
+        return writer.finish(identity, self._policy_version)
+
+    def close(self) -> None:
+        """See Collector. Close the environments."""
+        if self._environments is not None:
+            self._environments.close()
+        self._environments = self._spec = self._runtime = self._writer = None

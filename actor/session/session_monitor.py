@@ -1,0 +1,91 @@
+"""The waits of an actor's thread: for room to send, for snapshots, or for a reason to stop collecting."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from daedalus.actor.session.learner_presence import LearnerPresence
+from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
+from daedalus.actor.session.state_lock import StateLock
+from daedalus.actor.session.upload_session import UploadSession
+from daedalus.protocol.messages import Join
+
+_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
+_SILENCE_SECONDS = 10.0  # without a message for so long, the actor asks whether the learner is there
+
+
+class SessionMonitor:
+    """The waits of one actor. Each is timed, sends the rollouts that fall due, and notices the session's end."""
+
+    def __init__(
+        self,
+        uploads: UploadSession,
+        presence: LearnerPresence,
+        queries: LearnerQueries,
+        join: Join,
+        lock: StateLock,
+        stop: threading.Event,
+    ) -> None:
+        """`join` is the request that asks whether the learner is there; `stop` ends every wait."""
+        self._uploads, self._presence, self._queries, self._join = uploads, presence, queries, join
+        self._lock, self._stop = lock, stop
+
+    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
+        """Wait until `ready` returns True; return False if `timeout` seconds pass first. Raises as `check` does.
+
+        `ready` is called after every announced change, without the lock: it may take its time, such as to decode a
+        snapshot, while the transport's threads go on delivering.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            self._uploads.send_due()
+            self._probe_if_silent()
+            changes = self._lock.changes
+            self.check()
+            if ready():
+                self.check()  # a verdict that came while `ready` ran may be why it returned True
+                return True
+            now = time.monotonic()
+            if deadline is not None and now >= deadline:
+                return False
+            with self._lock:
+                due = self._uploads.in_flight.next_due()
+            until = min(moment for moment in (deadline, due, now + _HEARTBEAT_SECONDS) if moment is not None)
+            self._lock.wait_for_change(changes, max(until - now, 0.0))
+
+    def wait_for_room(self) -> None:
+        """Wait until one more rollout may be collected and sent. Raises as `check` does."""
+        self.wait(lambda: self._uploads.in_flight.has_room)
+
+    def wait_for_message(self, timeout: float) -> None:
+        """Wait for any message of the learner, at most `timeout` seconds. Raises as `check` does."""
+        since = self._presence.heard_at
+        self.wait(lambda: self._presence.heard_at > since, timeout)
+
+    def check(self) -> None:
+        """Raise if there is a reason to stop collecting.
+
+        Raises RunOverError if the run or the actor is over, ActorError in quarantine, LearnerLostError if the learner
+        left or does not accept rollouts of this learner epoch any more.
+        """
+        if self._stop.is_set():
+            raise RunOverError("stopped")
+        with self._lock:
+            ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
+            left = self._presence.left
+        if ended_by == "quarantined":
+            raise ActorError(f"the learner quarantined this actor: {reason}; fix the cause and restart the actor")
+        if ended_by == "finished":
+            raise RunOverError("the run is over")
+        if left or ended_by == "fenced":
+            raise LearnerLostError
+
+    def _probe_if_silent(self) -> None:
+        """After a long silence ask whether the learner is there: a dead session can look alive.
+
+        Raises LearnerLostError if nobody responds.
+        """
+        if time.monotonic() > self._presence.heard_at + _SILENCE_SECONDS:
+            if not self._queries.learner_responds(self._uploads.run, self._join):
+                raise LearnerLostError
+            self._presence.heard()

@@ -1,0 +1,164 @@
+"""ClientCollector, compared with an EnvironmentCollector that steps the same environment."""
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from collectors import started_collector
+
+from daedalus.actor.collecting.client_collector import _MAX_FULL_ROLLOUTS, ClientCollector
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spec import RunSpec
+
+IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
+ROWS = 5
+
+
+def run_spec(**environment: Any) -> RunSpec:
+    settings = {"id": "counting_environment:Counting-v0", **environment}
+    return RunSpec.model_validate({"environment": settings, "collection": {"rollout_length": ROWS}})
+
+
+class Played:
+    """A policy with a memory for an environment, and weights of several versions."""
+
+    def __init__(self, spec: RunSpec) -> None:
+        self.spec = spec
+        environments = make_environments(spec.environment, 1)
+        self.spaces = environments.spaces
+        environments.close()
+        policy = spec.policy.model_copy(update={"memory": "gru", "memory_units": 4, "hidden": (8,)})
+        self.network = ActorCritic(policy, self.spaces)
+        self.model = export_program(self.network, self.spaces.observation)
+
+    def runtime(self) -> OnnxRuntime:
+        return OnnxRuntime(self.model)
+
+    def snapshot(self, version: int) -> Snapshot:
+        weights = {
+            name: parameter.detach().numpy() * np.float32(1 + 0.1 * version)
+            for name, parameter in self.network.named_parameters()
+        }
+        return Snapshot(learner_epoch=1, policy_version=version, program="", weights=weights)
+
+
+def take(client: ClientCollector) -> Rollout:
+    """The oldest full rollout."""
+    rollout = client.collect(IDENTITY)
+    assert rollout is not None
+    return rollout
+
+
+@dataclass
+class Robot:
+    """An environment and its current observation."""
+
+    environment: gymnasium.Env
+    observation: np.ndarray
+
+
+def drive(client: ClientCollector, robot: Robot, steps: int) -> None:
+    """Run the caller's loop; continue where the last call ended."""
+    for _ in range(steps):
+        observation, reward, terminated, truncated, _ = robot.environment.step(client.act(robot.observation))
+        client.reward(float(reward) / 2)
+        client.reward(float(reward) / 2)
+        if terminated or truncated:
+            client.end_episode(observation, terminated=terminated)
+            observation, _ = robot.environment.reset()
+        robot.observation = observation
+
+
+def begun(played: Played) -> tuple[ClientCollector, Robot]:
+    environment = gymnasium.make(played.spec.environment.id).unwrapped
+    client = ClientCollector(environment.observation_space, environment.action_space)
+    assert client.prepare(played.spec) == (played.spaces, 1)
+    client.begin(played.runtime(), played.spec, 3)
+    client.load(played.snapshot(0))
+    return client, Robot(environment, environment.reset(seed=1)[0])
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{}, {"frame_stack": 3}, {"reward_scale": 0.25, "reward_clip": 1.0}, {"bootstrap_terminations": True}],
+    ids=["plain", "stacked", "scaled", "bootstrap_terminations"],
+)
+def test_client_rollouts_equal_those_of_an_environment_collector(environment: dict[str, Any]) -> None:
+    played = Played(run_spec(**environment))
+    client, robot = begun(played)
+    collector = started_collector(
+        played.spec.environment, played.runtime(), rollout_length=ROWS, seed=3, weights=played.snapshot(0).weights
+    )
+    # Each collector samples from one generator: give the client the seed that the other derives for its actions.
+    _, action_seed = np.random.SeedSequence(3).generate_state(2)
+    client.begin(played.runtime(), played.spec, int(action_seed))
+    client.load(played.snapshot(0))
+    found: list[Rollout] = []
+    for version in range(8):
+        collector.load(played.snapshot(version))
+        expected = copy.deepcopy(collector.collect(IDENTITY))
+        while not client.has_rollout():
+            drive(client, robot, 1)
+            if client._loaded is not None and client._loaded.policy_version == version:
+                client.load(played.snapshot(version + 1))  # for the next rollout
+        found.append(take(client))
+        for name in Rollout.__dataclass_fields__:
+            left, right = getattr(found[-1], name), getattr(expected, name)
+            assert np.array_equal(left, right), (version, name, left, right)
+    assert sum(len(rollout.episode_returns) for rollout in found) > 5
+    collector.close()
+
+
+def test_oldest_rollouts_are_dropped_when_nobody_takes_them() -> None:
+    client, robot = begun(Played(run_spec()))
+    drive(client, robot, 200)
+    assert len(client._full) == _MAX_FULL_ROLLOUTS
+    assert client.dropped > 0
+
+
+def test_new_policy_acts_from_the_first_step_after_its_weights_came() -> None:
+    played = Played(run_spec())
+    client, robot = begun(played)
+    drive(client, robot, 3)
+    client.begin(played.runtime(), played.spec, 4)
+    drive(client, robot, 40)  # before its weights came, the previous policy acts, and its rollouts are discarded
+    assert not client.has_rollout()
+    client.load(played.snapshot(7))
+    drive(client, robot, 2 * ROWS)
+    assert take(client).policy_version == 7
+
+
+def test_invalid_calls_raise_and_change_nothing() -> None:
+    client, robot = begun(Played(run_spec()))
+    with pytest.raises(ValueError, match="before any action"):
+        client.reward(1.0)
+    with pytest.raises(ValueError, match="without any action"):
+        client.end_episode(None, terminated=True)
+    client.act(robot.observation)
+    with pytest.raises(ValueError, match="must be finite"):
+        client.reward(float("nan"))
+    with pytest.raises(ValueError, match="needs its last observation"):
+        client.end_episode(None, terminated=False)
+    with pytest.raises(ValueError, match="the observation has shape"):
+        client.act(np.zeros(99, np.float32))
+    client.reward(1.0)
+    client.end_episode(None, terminated=True)
+    drive(client, robot, ROWS)
+    rollout = take(client)
+    assert rollout.terminated[0, 0]
+    assert rollout.episode_returns[0] == 1.0
+
+
+def test_synchronous_run_is_refused() -> None:
+    spec = run_spec().model_copy(update={"training": run_spec().training.model_copy(update={"algorithm": "a2c"})})
+    environment = gymnasium.make(spec.environment.id)
+    with pytest.raises(ActorError, match="a client cannot wait: use another algorithm"):
+        ClientCollector(environment.observation_space, environment.action_space).prepare(spec)

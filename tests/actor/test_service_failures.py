@@ -1,0 +1,161 @@
+"""ActorService against a scripted learner, over the memory transport: failures, refusals and the end of the run."""
+
+import threading
+
+import pytest
+from log_lines import LINES
+from processes import LIMIT, until
+from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
+
+from daedalus.actor.session import learner_queries, session_monitor
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    Refusal,
+    RunEnded,
+    Welcome,
+)
+from daedalus.transport.interface import TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+
+@pytest.mark.parametrize("how", ["fenced", "left"])
+def test_actor_joins_again_after_the_learner_restarted(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+    first = ScriptedLearner(network)
+    first.publish(4)
+    _, request = first.receive()
+    if how == "fenced":
+        first.epoch = 2
+        first.publish(0, push=False)
+        acknowledge(request, "fenced")
+        second = first
+    else:
+        first.transport.close()
+        second = ScriptedLearner(network, epoch=2)
+        second.publish(0)
+    while (received := second.receive())[0].identity.learner_epoch == 1:
+        acknowledge(received[1], "fenced")
+    assert received[0].identity.sequence == 0
+    assert any("went away" in text for text in LINES)
+
+
+@pytest.mark.parametrize("how", ["run_ended", "finished"])
+def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningActor, how: str) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    if how == "run_ended":
+        learner.transport.publish(keys.snapshots("r"), encode(RunEnded(learner_epoch=1, reason="solved")))
+        acknowledge(request, "accepted")
+    else:
+        acknowledge(request, "finished")
+    actor.join()
+    assert actor.error is None
+    assert LINES[-1].startswith("the run is over")
+
+
+def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    learner.transport.publish(keys.snapshots("r"), b"\xff" * 100)
+    acknowledge(request, "accepted")
+    _, request = learner.receive()
+    acknowledge(request, "accepted")
+    learner.receive()
+    assert any("ignored a damaged message" in text for text in LINES)
+
+
+def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    learner.refusal = Refusal(code="mismatch", reason="its environment has 3 choices")
+    actor = RunningActor(network)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "its environment has 3 choices" in str(actor.error)
+
+
+def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
+    for run in ("one", "two"):
+        transport = MemoryTransport(network)
+        welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
+        transport.serve(keys.join(run), lambda request, welcome=welcome: request.reply(welcome))
+    actor = RunningActor(network)
+    actor.join()
+    assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
+
+
+def test_actor_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:
+    actor = RunningActor(network, timeout=0.05)
+    actor.join()
+    assert "no learner answered within 0.05 s" in str(actor.error)
+
+
+def test_quarantine_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    request.reply(encode(Acknowledgement(verdict="quarantined", reason="3 unfit rollouts in a row")))
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "quarantined this actor: 3 unfit rollouts in a row" in str(actor.error)
+
+
+def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    for count in range(60):
+        _, request = learner.receive()
+        if count < 15:
+            acknowledge(request, "rejected" if count else "accepted")
+        else:
+            request.reply(encode(Acknowledgement(verdict="rejected", reason="policy lag 31, at most 30 is allowed")))
+        if count < 15:
+            assert not any("rejected" in line for line in LINES)
+    (warning,) = [line for line in LINES if "rejected the last" in line]
+    assert "policy lag 31, at most 30 is allowed" in warning
+    assert "max_policy_lag" in warning
+
+
+def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
+    network: MemoryNetwork, actor: RunningActor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 0.1)
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    held = [learner.receive(), learner.receive()]  # never answered
+    assert learner.joins.get(timeout=LIMIT).spaces is None
+    assert learner.joins.get(timeout=LIMIT).spaces == SPACES
+    for _ in range(3):
+        assert learner.joins.get(timeout=LIMIT).spaces is None  # the probe is answered: the learner is only slow
+    assert not any("went away" in text for text in LINES)
+    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # no valid message
+    until(lambda: any("went away" in text for text in LINES))
+    learner.transport.serve(keys.join("r"), learner._join)
+    again = learner.receive()
+    assert again[0].identity in [rollout.identity for rollout, _ in held]  # the same rollout again
+
+
+def test_actor_reopens_its_transport_while_nobody_answers(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
+    reopened = threading.Semaphore(0)
+
+    def reopen(transport: MemoryTransport) -> bool:
+        reopened.release()
+        raise TransportError("nothing answers there")
+
+    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
+    actor = RunningActor(network)
+    for _ in range(3):
+        assert reopened.acquire(timeout=LIMIT)
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    learner.receive()
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None

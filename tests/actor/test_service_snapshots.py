@@ -1,0 +1,151 @@
+"""ActorService against a scripted learner, over the memory transport: which snapshots it collects with."""
+
+import threading
+
+import pytest
+from log_lines import LINES
+from processes import LIMIT, until
+from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
+
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.session import learner_queries, service
+from daedalus.protocol.codec import decode
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import (
+    Message,
+    Rollout,
+    RolloutIdentity,
+    Snapshot,
+)
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+
+def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(network: MemoryNetwork) -> None:
+    actor = RunningActor(network, link="wan")
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    received = [learner.receive()[0] for _ in range(service._SLOW_LINK_WINDOW)]
+    assert [rollout.policy_version for rollout in received] == [3] * len(received)
+    assert learner.rollouts.empty()
+    actor.stop.set()
+    actor.join()
+
+
+def test_actor_never_subscribes_on_a_link_measured_as_slow(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    followed: list[object] = []
+    monkeypatch.setattr(MemoryTransport, "subscribe", lambda *arguments: followed.append(arguments))
+    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    actor = RunningActor(network)
+    assert learner.receive()[0].policy_version == 3
+    assert any(text.startswith("slow link: ") for text in LINES)
+    assert followed == []
+    actor.stop.set()
+    actor.join()
+
+
+def test_rollout_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    first, second = learner.receive(), learner.receive()
+    learner.publish(4)  # while the window is full
+    acknowledge(first[1], "accepted")
+    assert [second[0].policy_version, learner.receive()[0].policy_version] == [3, 4]
+
+
+def test_actor_collects_with_the_newest_snapshot(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    versions = []
+    for version in (5, 6, 7, 8):
+        rollout, request = learner.receive()
+        versions.append(rollout.policy_version)
+        learner.publish(version)
+        acknowledge(request, "accepted", version)
+    assert versions[0] == 0
+    assert versions == sorted(versions)
+    assert versions[-1] >= 5
+
+
+class SlowClient(EnvironmentCollector):
+    """A collector whose rollouts are complete only after weights of version 1 came."""
+
+    def has_rollout(self) -> bool:
+        return self._policy_version >= 1
+
+    def collect(self, identity: RolloutIdentity) -> Rollout | None:  # type: ignore[override] - as Collector has it
+        return super().collect(identity) if self.has_rollout() else None
+
+
+def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    actor = RunningActor(network, collector=SlowClient())
+    until(lambda: any("joined run" in text for text in LINES))
+    assert learner.rollouts.empty()
+    learner.publish(1)
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_acknowledgement_is_received_while_a_snapshot_is_decoded(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoding megabytes must not hold the lock that the transport's threads need."""
+    decoding, released = threading.Event(), threading.Event()
+
+    def slow_decode(data: bytes, limits: Limits) -> Message:
+        message = decode(data, limits)
+        if isinstance(message, Snapshot) and message.policy_version == 1:
+            decoding.set()
+            assert released.wait(LIMIT)
+        return message
+
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    monkeypatch.setattr(learner_queries, "decode", slow_decode)
+    try:
+        learner.publish(1)
+        assert decoding.wait(LIMIT)
+        answering = threading.Thread(target=acknowledge, args=(request, "accepted", 1), daemon=True)
+        answering.start()
+        answering.join(5.0)
+        assert not answering.is_alive(), "the transport's thread waited for the decoder"
+    finally:
+        released.set()
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_actor_requests_a_snapshot_whose_push_was_lost(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    rollout, request = learner.receive()
+    learner.publish(1, push=False)
+    while rollout.policy_version == 0:
+        acknowledge(request, "accepted", 1)
+        rollout, request = learner.receive()
+    assert rollout.policy_version == 1
+
+
+def test_synchronous_actor_requests_the_next_version_if_its_push_was_lost(network: MemoryNetwork) -> None:
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    learner.publish(1, push=False)
+    acknowledge(request, "accepted", 1)
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()

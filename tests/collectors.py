@@ -1,0 +1,47 @@
+"""Collectors over environments and policies that a test chooses."""
+
+from unittest import mock
+
+import numpy as np
+
+from daedalus.actor.collecting import environment_collector
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
+
+IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
+
+
+def started_collector(
+    spec: EnvironmentSpec,
+    runtime: PolicyRuntime,
+    *,
+    count: int = 1,
+    rollout_length: int,
+    seed: int = 1,
+    weights: dict[str, np.ndarray] | None = None,
+    environments: VectorEnvironment | None = None,
+) -> EnvironmentCollector:
+    """A collector at the start of its first rollout; it steps `environments` instead of its own if they are given."""
+    run = RunSpec(environment=spec, collection=CollectionSpec(envs_per_actor=count, rollout_length=rollout_length))
+    collector = EnvironmentCollector()
+    if environments is None:
+        collector.prepare(run)
+    else:
+        with mock.patch.object(environment_collector, "make_environments", return_value=environments):
+            collector.prepare(run)
+    collector.begin(runtime, run, seed)
+    collector.load(snapshot(0, weights or {}))
+    return collector
+
+
+def snapshot(policy_version: int, weights: dict[str, np.ndarray]) -> Snapshot:
+    """A snapshot of learner epoch 1."""
+    return Snapshot(learner_epoch=1, policy_version=policy_version, program="", weights=weights)
+
+
+def collect(collector: EnvironmentCollector) -> Rollout:
+    """The collector's next rollout; its arrays are valid until the one after it."""
+    return collector.collect(IDENTITY)

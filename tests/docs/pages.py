@@ -1,0 +1,43 @@
+"""The documentation as text, for the tests that check what it says against the code."""
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(
+    [
+        *DOCS.rglob("*.md"),
+        *ROOT.glob("*.md"),
+        ROOT / "examples" / "node" / "README.md",
+        ROOT / "policy" / "pretrained" / "car_racing" / "README.md",
+    ]
+)
+
+
+def name_of(page: Path) -> str:
+    """Return a page's path from the repository's root, as a test's id."""
+    return page.relative_to(ROOT).as_posix()
+
+
+def code_blocks(text: str, language: str = "") -> list[str]:
+    """Return the contents of the fenced blocks of one language, or of those without one."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def inline_code(text: str) -> list[str]:
+    """Return what stands in single backticks, line breaks as spaces."""
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    return [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
+
+
+def hook(name: str) -> ModuleType:
+    """Return a module of docs/hooks, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / "hooks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

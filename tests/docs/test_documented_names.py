@@ -1,0 +1,86 @@
+"""Links, files, settings and functions that the documentation names exist."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from pages import DOCS, PAGES, ROOT, code_blocks, inline_code, name_of
+from pydantic import BaseModel
+
+from daedalus.protocol.spec import RunSpec
+from daedalus.transport.credentials import CERTIFICATE, KEY
+
+FOLDERS = "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|learner|policy|protocol|tests|transport"
+ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
+FILE_ENDINGS = {"py", "ts", "md", "toml"}
+
+
+def anchor(heading: str) -> str:
+    """Return the anchor of a heading, as Markdown renderers make it."""
+    return re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8")):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, part = link.partition("#")
+        target = (page.parent / path) if path else page
+        assert target.exists(), link
+        if part and target.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
+            assert part in {anchor(heading) for heading in headings}, link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_exist(page: Path) -> None:
+    for code in inline_code(page.read_text("utf-8")):
+        for path in re.findall(rf"(?:^|\s)((?:{FOLDERS})/[\w./@-]*)", code):
+            if "NAME" not in path and not path.startswith(ZENOH_SETTINGS):
+                assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_settings_exist(page: Path) -> None:
+    text = page.read_text("utf-8")
+    codes = [*inline_code(text), *code_blocks(text)]
+    sections = "|".join(RunSpec.model_fields)
+    for section, key in re.findall(rf"(?<![\w./:-])({sections})\.([a-z_]+)", "\n".join(codes)):
+        model = RunSpec.model_fields[section].annotation
+        assert isinstance(model, type)
+        assert issubclass(model, BaseModel)
+        assert key in model.model_fields or key in FILE_ENDINGS, f"{section}.{key}"
+
+
+def test_the_messages_about_certificates_are_those_of_the_code() -> None:
+    table = (DOCS / "security.md").read_text("utf-8").partition("| message |")[2]
+    sources = "".join(path.read_text("utf-8") for path in (ROOT / "transport").glob("*.py"))
+    sources = sources.replace("{KEY}", KEY).replace("{CERTIFICATE}", CERTIFICATE)
+    messages = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
+    assert len(messages) > 4
+    for message in messages:
+        for words in filter(None, (part.strip() for part in message.split("..."))):
+            assert words in sources, message
+
+
+def test_the_way_of_a_rollout_names_functions_that_exist() -> None:
+    """At most 20 functions; `file.py` `Class.function` or `function`, each defined in that file."""
+    section = (DOCS / "architecture.md").read_text("utf-8").split("## A rollout's way")[1].split("\n## ")[0]
+    steps = re.findall(r"^(\d+)\. `([\w/]+\.py)` `([\w.]+)`: ", section, re.MULTILINE)
+    assert [int(number) for number, _, _ in steps] == list(range(1, len(steps) + 1))
+    assert len(re.findall(r"^\d+\. ", section, re.MULTILINE)) == len(steps)
+    assert 10 <= len(steps) <= 20
+    for _, path, name in steps:
+        assert name in defined(ROOT / path), f"{path} {name}"
+
+
+def defined(path: Path) -> set[str]:
+    """Return the functions of a file, methods as `Class.method`."""
+    body = ast.parse(path.read_text("utf-8")).body
+    classes = [node for node in body if isinstance(node, ast.ClassDef)]
+    functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
+    return functions | {
+        f"{owner.name}.{node.name}" for owner in classes for node in owner.body if isinstance(node, ast.FunctionDef)
+    }

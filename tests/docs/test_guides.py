@@ -1,0 +1,70 @@
+"""The examples of the guides work as they are printed."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pages import DOCS, code_blocks
+
+from daedalus.actor.environments.make import make_environments
+from daedalus.learner.reporting.metrics import Details, MetricsWriter
+from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A reader's working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return tmp_path
+
+
+def example(guide: str, language: str = "python", number: int = 0) -> str:
+    return code_blocks((DOCS / "guides" / guide).read_text("utf-8"), language)[number]
+
+
+def test_the_environment_can_be_played(folder: Path) -> None:
+    (folder / "corridor.py").write_text(example("environment.md"))
+    (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
+    spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8})
+    environments = make_environments(spec, 2, wrap="corridor_wrappers:step_costs")
+    assert environments.spaces.action.count == 2
+    environments.reset(0)
+    steps = [environments.step(np.array([1, 0])) for _ in range(8)]
+    assert steps[-1][1].tolist() == [0.99, -0.01]
+    assert steps[-1][2].tolist() == [True, False]
+    environments.close()
+
+
+def test_the_preset_is_a_run(folder: Path) -> None:
+    (folder / "corridor.toml").write_text(example("environment.md", "toml"))
+    settings = read_file(folder / "corridor.toml")
+    choose_algorithm(settings, "a3c")
+    assert run_spec(settings).training.learning_rate == 3e-4
+
+
+def test_the_network_becomes_a_program(folder: Path) -> None:
+    (folder / "my_network.py").write_text(example("network.md"))
+    space = ArraySpace(shape=(12, 12), dtype="uint8", frames=3)
+    spaces = Spaces(observation=space, action=DiscreteSpace(count=4))
+    learner = Learner(TrainingSpec(), PolicySpec(encoder="my_network:Encoder"), spaces)
+    runtime = OnnxRuntime(learner.program())
+    runtime.load(learner.weights())
+    observations = np.full((5, 3, 12, 12), 255, np.uint8)
+    actions = runtime.act(observations, np.zeros((5, 0), np.float32), np.random.default_rng(0))[0]
+    assert actions.shape == (5,)
+
+
+def test_the_metrics_writer_writes(folder: Path) -> None:
+    (folder / "json_lines.py").write_text(example("metrics_writer.md"))
+    sys.path.append(str(folder))
+    writer: MetricsWriter = importlib.import_module("json_lines").JsonLinesWriter(folder / "metrics.jsonl")
+    writer.write({"env_steps": 1.0}, Details())
+    writer.close()
+    assert (folder / "metrics.jsonl").read_text() == '{"env_steps": 1.0}\n'

@@ -1,0 +1,83 @@
+"""An exception in any thread of a service ends its process: traceback, status 1, so that a supervisor restarts it."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from processes import LIMIT, Running
+
+Start = Callable[..., Running]
+
+# A module, and an assignment in it that makes the named thread raise the next time it works.
+LEARNER_FAULTS = {
+    "intake": "daedalus.learner.serving.intake:Intake.read",
+    "compact snapshots": "daedalus.learner.serving.compact_snapshot_cache:CompactSnapshotCache.answer",
+    "recorder": "daedalus.learner.reporting.csv_writer:CsvWriter.write",
+    "session watchdog": "daedalus.learner.serving.session_watchdog:SessionWatchdog._watch",
+    "a Zenoh thread that reports presence": "daedalus.learner.serving.fleet:Fleet.set_present",
+    "a Zenoh thread that answers a join": "daedalus.learner.serving.query_responses:QueryResponses.join",
+}
+
+
+class Faulty:
+    """A command in which one function raises."""
+
+    def __init__(self, directory: Path, command: str, fault: str, *arguments: object) -> None:
+        module, _, target = fault.partition(":")
+        program = "\n".join(
+            [
+                "import importlib, runpy, sys",
+                f"module = importlib.import_module({module!r})",
+                "def fail(*arguments, **options): raise RuntimeError('a fault of ours')",
+                f"module.{target} = fail",
+                f"sys.argv = [{command!r}, *{[str(argument) for argument in arguments]!r}]",
+                f"runpy.run_module('daedalus.cli.commands.{command}', run_name='__main__', alter_sys=True)",
+            ]
+        )
+        self._running = Running([sys.executable, "-P", "-c", program], directory)
+
+    def assert_crashes(self) -> None:
+        """Its process ends with status 1 and a traceback."""
+        try:
+            assert self._running.wait() == 1
+            assert "Traceback" in self._running.output
+            assert "RuntimeError: a fault of ours" in self._running.output
+        finally:
+            self._running.end()
+
+
+@pytest.mark.parametrize("thread", LEARNER_FAULTS)
+def test_an_exception_in_a_thread_of_the_learner_ends_it(
+    thread: str, start: Start, address: str, tmp_path: Path
+) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**12)
+    learner = Faulty(
+        tmp_path, "learner", LEARNER_FAULTS[thread], "cartpole", "--listen", address, "--run-dir", "run", *endless
+    )
+    actor = start("actor", "--connect", address, "--link", "wan" if thread == "compact snapshots" else "lan")
+    learner.assert_crashes()
+    assert actor.process.poll() is None  # it looks for the learner that a supervisor would restart
+
+
+def test_a_command_of_one_process_has_the_hook_too(tmp_path: Path) -> None:
+    """`router`, `exporter` and `train` run in the process of `daedalus` itself."""
+    program = "\n".join(
+        [
+            "import sys, threading",
+            "from daedalus.cli.commands import router",
+            "def fail(): raise RuntimeError('a fault of ours')",
+            "def run(arguments):",
+            "    threading.Thread(target=fail).start()",
+            "    threading.Event().wait(600)",
+            "router.router = run",
+            "sys.argv = ['daedalus', 'router']",
+            "from daedalus.cli.main import main",
+            "sys.exit(main())",
+        ]
+    )
+    command = [sys.executable, "-P", "-c", program]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert ended.returncode == 1
+    assert "RuntimeError: a fault of ours" in ended.stderr

@@ -1,0 +1,136 @@
+"""A learner for tests of actors, which answers as the test says, and an actor on a thread of its own."""
+
+import queue
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+from processes import LIMIT
+
+from daedalus.actor.collecting.collector import Collector
+from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
+from daedalus.learner.serving.compact_snapshot_cache import CompactSnapshotCache
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    Join,
+    Message,
+    Program,
+    Refusal,
+    Rollout,
+    Snapshot,
+    SnapshotRequest,
+    Welcome,
+)
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.transport.interface import Request
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+SPEC = RunSpec.model_validate(
+    {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
+)
+SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A network and the program that a learner would send."""
+
+    network: ActorCritic
+    model: bytes
+
+    @classmethod
+    def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
+        network = ActorCritic(spec, spaces)
+        return cls(network, export_program(network, spaces.observation))
+
+
+POLICY = Policy.of(PolicySpec(), SPACES)
+
+
+class ScriptedLearner:
+    """A learner that answers joins and programs, and leaves every rollout to the test to acknowledge."""
+
+    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY) -> None:
+        self.transport = MemoryTransport(network)
+        self.epoch, self.spec, self.policy = epoch, spec, policy
+        self.joins: queue.Queue[Join] = queue.Queue()
+        self.rollouts: queue.Queue[Request] = queue.Queue()
+        self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
+        self.refusal: Refusal | None = None
+        self.transport.declare_presence(keys.learner("r"))
+        self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
+        self.transport.serve(keys.snapshots("r"), self._newest)
+        self.transport.serve(keys.program("r", "*"), self._program)
+        self.transport.serve(keys.join("r"), self._join)
+
+    def _join(self, request: Request) -> None:
+        message = decode(request.payload, Limits())
+        assert isinstance(message, Join)
+        self.joins.put(message)
+        answer: Message = Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)
+        request.reply(encode(self.refusal or answer))
+
+    def _newest(self, request: Request) -> None:
+        if not request.size:
+            request.reply(self.snapshot)
+            return
+        message = decode(request.payload, Limits())
+        assert isinstance(message, SnapshotRequest)
+        request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+
+    def _program(self, request: Request) -> None:
+        model = self.policy.model
+        request.reply(encode(Program(hash=program_hash(model), model=np.frombuffer(model, np.uint8))))
+
+    def publish(self, version: int, *, push: bool = True) -> None:
+        weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}
+        name = program_hash(self.policy.model)
+        self.snapshot = encode(
+            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights)
+        )
+        if push:
+            self.transport.publish(keys.snapshots("r"), self.snapshot)
+
+    def receive(self) -> tuple[Rollout, Request]:
+        request = self.rollouts.get(timeout=LIMIT)
+        rollout = decode(request.payload, Limits())
+        assert isinstance(rollout, Rollout)
+        return rollout, request
+
+
+def acknowledge(request: Request, verdict: str, version: int = 0) -> None:
+    request.reply(encode(Acknowledgement(verdict=verdict, policy_version=version)))  # type: ignore[arg-type] - one of its literals
+
+
+class RunningActor:
+    def __init__(
+        self,
+        network: MemoryNetwork,
+        timeout: float | None = None,
+        link: LinkChoice = "auto",
+        collector: Collector | None = None,
+    ) -> None:
+        self.stop = threading.Event()
+        self.error: Exception | None = None
+        self.transport = MemoryTransport(network)
+        config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
+        self._service = ActorService(config, self.transport, self.stop, collector)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._service.run()
+        except Exception as error:
+            self.error = error
+
+    def join(self) -> None:
+        self._thread.join(LIMIT)
+        assert not self._thread.is_alive()

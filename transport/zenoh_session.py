@@ -1,0 +1,57 @@
+"""Opening Zenoh sessions, and describing why that failed.
+
+A session either embeds a full router that listens (the learner, by default) or is a client of a router.
+"""
+
+import json
+from collections.abc import Callable
+from typing import Literal
+
+import zenoh
+
+from daedalus.transport.credentials import Credentials, diagnose_connection
+from daedalus.transport.interface import AddressInUseError, RefusedError, TransportError
+from daedalus.transport.zenoh_settings import session_settings
+
+OpenSession = Callable[[], zenoh.Session]
+
+
+def session_opener(
+    mode: Literal["router", "client"],
+    listen_on: list[str],
+    connect_to: list[str],
+    credentials: Credentials | None,
+) -> OpenSession:
+    """Return a function that opens a session with these settings, each time a new one.
+
+    The function raises AddressInUseError, RefusedError or TransportError. Raises CredentialsError if the folder of
+    `credentials` does not list the authorised names and the session listens.
+    """
+    config = zenoh.Config()
+    security = credentials.settings(listens=bool(listen_on)) if credentials else {}
+    settings = session_settings(mode, listen_on, connect_to, security)
+
+    def open_session() -> zenoh.Session:
+        try:
+            for name, value in settings.items():
+                config.insert_json5(name, json.dumps(value))
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise _opening_error(str(error), listen_on, connect_to, credentials) from None
+
+    return open_session
+
+
+def _opening_error(
+    text: str, listen_on: list[str], connect_to: list[str], credentials: Credentials | None
+) -> TransportError:
+    if "in use" in text:
+        return AddressInUseError(
+            f"address {', '.join(listen_on)} is already in use: "
+            "stop the process that listens there, or choose another address with --listen"
+        )
+    if connect_to:
+        diagnoses = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]
+        is_final = all(diagnosis.is_final for diagnosis in diagnoses)
+        return (RefusedError if is_final else TransportError)("; ".join(diagnosis.reason for diagnosis in diagnoses))
+    return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
