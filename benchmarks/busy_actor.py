@@ -1,6 +1,6 @@
-"""An actor without a learner: collects rollouts of Pong and encodes them, one thread, until its standard input ends.
+"""Actor without a learner: collects and encodes rollouts of Pong in one thread until its standard input ends.
 
-Says "busy" once it is. Part of learner_speed.py.
+Prints "busy" when it starts to play. Part of learner_speed.py.
 """
 
 import threading

@@ -1,4 +1,4 @@
-"""env_steps a CPU-second of CarRacing's and Pong's environments, transforms included, with random actions.
+"""Measure env_steps per CPU second of CarRacing and Pong, with transforms and random actions.
 
 python benchmarks/environment_speed.py
 """
@@ -23,7 +23,7 @@ _ENVIRONMENTS = 8
 
 
 def rate(preset: str, backend: str, seconds: float) -> float:
-    """env_steps a CPU-second of eight environments in this process."""
+    """Return env_steps per CPU second of eight environments in this process."""
     spec = run_spec(read_preset(preset)).environment.model_copy(update={"backend": backend, "processes": False})
     environments = make_environments(spec, _ENVIRONMENTS)
     try:
@@ -40,11 +40,13 @@ def rate(preset: str, backend: str, seconds: float) -> float:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--seconds", type=float, default=6.0, help="for each")
+    options.add_argument(
+        "--seconds", type=float, default=6.0, help="duration of each measurement (default: %(default)g)"
+    )
     parsed = options.parse_args()
     rows = [(preset, backend, f"{rate(preset, backend, parsed.seconds):,.0f}") for preset, backend in CASES]
     print(machine())
-    print(table(("preset", "backend", "env_steps a CPU-second"), rows))
+    print(table(("preset", "backend", "env_steps per CPU second"), rows))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""The decoder under a coverage-guided fuzzer, for as long as one likes; every finding is a bug.
+"""Fuzz the decoder, guided by coverage. Every exception that it finds is a bug.
 
     pip install -c constraints.txt ".[fuzz]"
     python benchmarks/fuzz_decoder.py CORPUS [-max_total_time=600] [-jobs=2] ...
 
-CORPUS is a folder that grows with every input that reaches something new; it begins with the golden messages of
-tests/protocol. What follows is libFuzzer's. What is read by nobody but us is read too: a rollout that decodes is held
-against a run's specification, as the learner's intake does; compact weights are unfolded, as an actor does.
+CORPUS is a folder: it starts with the golden messages of tests/protocol and grows with each input that reaches new
+code. The other options are those of libFuzzer. A decoded rollout is also checked against the specification of a run, as
+in the learner. The weights of a decoded compact snapshot are also unpacked, as in an actor.
 """
 
 import contextlib
@@ -15,9 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-atheris: Any = importlib.import_module("atheris")  # an extra of its own, which makes its names when it is loaded
+atheris: Any = importlib.import_module("atheris")  # from the extra `fuzz`; its names exist only at run time
 
-with atheris.instrument_imports(include=["protocol", "learner", "msgpack"]):
+with atheris.instrument_imports(include=["daedalus", "msgpack"]):
     from daedalus.learner.serving.fleet import Fleet
     from daedalus.learner.serving.intake import Intake
     from daedalus.protocol.codec import ProtocolError, decode
@@ -32,7 +32,7 @@ _LIMITS = Limits(max_bytes=1 << 20)
 
 
 def _intake() -> Intake:
-    """One that takes the golden rollout of numbers."""
+    """Return an intake that accepts the golden rollout of arrays."""
     spec = RunSpec.model_validate(
         {"environment": {"id": "CartPole-v1"}, "collection": {"rollout_length": 3, "envs_per_actor": 2}}
     )
@@ -48,7 +48,7 @@ _INTAKE = _intake()
 
 
 def one_input(data: bytes) -> None:
-    """What libFuzzer calls."""
+    """Decode one input of libFuzzer."""
     try:
         message = decode(data, _LIMITS)
     except ProtocolError:

@@ -1,4 +1,6 @@
-"""The peer: stable-baselines3's A2C on CartPole-v1 (its own defaults, eight environments) or Pong. Prints env_steps/s.
+"""Peer for comparison: A2C of stable-baselines3 on CartPole-v1 (its defaults, eight environments) or Pong.
+
+Prints env_steps/s.
 
 pip install "daedalus-rl[benchmark]"
 python benchmarks/peer_a2c.py --env-steps 100000
@@ -8,19 +10,19 @@ python benchmarks/peer_a2c.py --pong --env-steps 10000
 import argparse
 import time
 
-# An extra, for this file only.
+# The extra `benchmark` installs it.
 from stable_baselines3 import A2C  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.env_util import make_atari_env, make_vec_env  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.vec_env import VecFrameStack  # pyright: ignore[reportMissingImports]
 
 
 def cartpole() -> A2C:
-    """Its defaults: eight environments, five steps an update."""
+    """Return a model with the defaults: eight environments, five steps per update."""
     return A2C("MlpPolicy", make_vec_env("CartPole-v1", n_envs=8), device="cpu", seed=1)
 
 
 def pong() -> A2C:
-    """84 x 84 grey, skip 4, stack 4, Nature CNN; 256 rows an update, of 16 environments."""
+    """Return a model for 84 x 84 grey frames, skip 4, stack 4, Nature CNN; 256 rows per update, 16 environments."""
     import ale_py  # pyright: ignore[reportMissingImports]
     import gymnasium
 
@@ -35,7 +37,7 @@ def main() -> None:
     options.add_argument("--pong", action="store_true")
     parsed = options.parse_args()
     model = pong() if parsed.pong else cartpole()
-    model.learn(2_000)  # what is made once is not counted
+    model.learn(2_000)  # warm-up, not measured
     began = time.monotonic()
     model.learn(parsed.env_steps)
     print(parsed.env_steps / (time.monotonic() - began))

@@ -1,7 +1,9 @@
-"""Another peer: Minibatch Factory's APPO on Pong, asynchronous, its own Atari environment. Prints env_steps/s.
+"""Peer for comparison: asynchronous APPO of Sample Factory on Pong, with its own Atari environment.
 
-What it requires fits nobody else's, so it has an environment of its own. ale-py 0.10 brings the games along, and still
-works with the gymnasium that it wants:
+Prints env_steps/s.
+
+Its requirements conflict with those of this project, so it needs a virtual environment of its own. ale-py 0.10 includes
+the games and works with the gymnasium version of Sample Factory:
 
     python -m venv PLACE
     PLACE/bin/pip install torch sample-factory==2.1.1 ale-py==0.10.2
@@ -12,7 +14,7 @@ import argparse
 import tempfile
 import time
 
-# None of it is installed beside the project. ale_py registers its games as it is imported.
+# Not installed with this project. Importing ale_py registers its games.
 import ale_py  # noqa: F401  # pyright: ignore[reportMissingImports]
 from sample_factory.algo.runners.runner import AlgoObserver, Runner  # pyright: ignore[reportMissingImports]
 from sample_factory.train import make_runner  # pyright: ignore[reportMissingImports]
@@ -23,7 +25,7 @@ from sf_examples.atari.train_atari import (  # pyright: ignore[reportMissingImpo
 
 _WARM_STEPS = 4_000
 
-# 84 x 84 grey, skip 4, stack 4, Nature CNN; 256 rows an update and one pass, of 16 environments in two workers.
+# 84 x 84 grey, skip 4, stack 4, Nature CNN; 256 rows per update, one pass, 16 environments in two workers.
 SETTINGS = {
     "env": "atari_pong",
     "async_rl": True,
@@ -45,13 +47,13 @@ SETTINGS = {
 
 
 class Watch(AlgoObserver):
-    """Notes when how many steps were trained on."""
+    """Observer that records the number of steps after each update."""
 
     def __init__(self) -> None:
         self.points: list[tuple[float, int]] = []
 
     def on_training_step(self, runner: Runner, training_iteration_since_resume: int) -> None:
-        """Called after each update."""
+        """Record the time and the steps, after each update."""
         self.points.append((time.monotonic(), sum(runner.env_steps.values())))
 
 

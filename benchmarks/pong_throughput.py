@@ -1,12 +1,12 @@
-"""Agent steps a second on Pong at full learning: beside its peers, and beside what computing alone takes.
+"""Measure env_steps/s on Pong with learning: Daedalus, its peers, and the limit of the pure computations.
 
     python benchmarks/pong_throughput.py --rounds 3
-    python benchmarks/pong_throughput.py --sample-factory PLACE/bin/python       (peer_appo.py says how to make PLACE)
+    python benchmarks/pong_throughput.py --sample-factory PLACE/bin/python       (peer_appo.py describes PLACE)
 
-Peers are stable-baselines3's A2C and, if asked for, Minibatch Factory's APPO; the ratio is that to the better of them.
-84 x 84 grey, skip 4, stack 4, Nature CNN, 256 rows an update and one pass over them, for all. The limit is of this
-machine's cores, were there nothing to do but step the environments, run the policy and update: each measured alone, on
-one core. All take turns, round by round; ratios are those of each round.
+Peers are A2C of stable-baselines3 and, with --sample-factory, APPO of Sample Factory. The ratio is to the faster peer.
+All use 84 x 84 grey frames, skip 4, stack 4, Nature CNN, 256 rows per update and one pass. The limit is the speed of
+this machine's cores if they only stepped the environments, ran the policy and made updates; each part is measured
+alone, on one core. All programs run in turn in each round, and the ratios are computed per round.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 
-ENVIRONMENTS, ROWS = 16, 16  # of an actor; a rollout is one update's batch
+ENVIRONMENTS, ROWS = 16, 16  # of an actor; one rollout is the batch of one update
 SETTINGS = {
     "policy.encoder": "nature",
     "collection.envs_per_actor": ENVIRONMENTS,
@@ -46,11 +46,11 @@ SETTINGS = {
     "evaluation.seconds": 1e6,
     "evaluation.final_episodes": 1,
 }
-_WARM_SECONDS = 10.0  # from the first row of the metrics: processes start, pages are touched
+_WARM_SECONDS = 10.0  # after the first row of the metrics: start of the processes
 
 
 def ours(backend: str, env_steps: int) -> float:
-    """env_steps/s of `daedalus train pong` once it is warm."""
+    """Measure env_steps/s of `daedalus train pong` after the warm-up."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
         settings = {"environment.backend": backend, **SETTINGS}
@@ -66,13 +66,13 @@ def ours(backend: str, env_steps: int) -> float:
 
 
 def peer(python: str, script: str, *options: str) -> float:
-    """env_steps/s of another trainer."""
+    """Measure env_steps/s of a peer."""
     command = [python, str(Path(__file__).parent / script), *options]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
 
 
 def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
-    """env_steps/s of all cores if only computing counted; and microseconds an env_step of each part of it."""
+    """Return the env_steps/s of all cores for the computations alone, and microseconds per env_step of each part."""
     spec = run_spec(read_preset("pong")).environment.model_copy(update={"backend": backend})
     environments = make_environments(spec, ENVIRONMENTS)
     try:
@@ -98,7 +98,7 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
 
 
 def _per_call(call: Callable[[int], object], seconds: float) -> float:
-    """Seconds of CPU time a call, the first ones left out."""
+    """Return the CPU seconds per call, without the first calls."""
     for index in range(20):
         call(index)
     calls, began, ends = 0, time.process_time(), time.monotonic() + seconds
@@ -114,14 +114,16 @@ def main() -> None:
     options.add_argument("--env-steps", type=int, default=120_000)
     options.add_argument("--peer-env-steps", type=int, default=20_000)
     options.add_argument("--backend", choices=("envpool", "ale"), default="envpool")
-    options.add_argument("--seconds", type=float, default=5.0, help="for each part of the limit")
-    options.add_argument("--sample-factory", metavar="PYTHON", help="the interpreter that has it: see peer_appo.py")
+    options.add_argument(
+        "--seconds", type=float, default=5.0, help="duration of the measurement of each part of the limit"
+    )
+    options.add_argument("--sample-factory", metavar="PYTHON", help="Python with Sample Factory, see peer_appo.py")
     parsed = options.parse_args()
     keep_freed_memory()
     steps = ("--env-steps", str(parsed.peer_env_steps))
     peers = {"stable-baselines3 A2C": [sys.executable, "peer_a2c.py", "--pong", *steps]}
     if parsed.sample_factory:
-        peers["Minibatch Factory APPO"] = [parsed.sample_factory, "peer_appo.py", *steps]
+        peers["Sample Factory APPO"] = [parsed.sample_factory, "peer_appo.py", *steps]
     rows, ratios, shares = [], [], []
     for index in range(parsed.rounds):
         most, parts = limit(parsed.backend, parsed.seconds)
@@ -132,10 +134,10 @@ def main() -> None:
         spent = " + ".join(f"{part:.0f}" for part in parts.values())
         rows.append((index + 1, *rates, f"{ratios[-1]:.1f}", spent, f"{most:,.0f}", f"{shares[-1]:.0%}"))
     print(machine())
-    header = ("round", "env_steps/s", *peers, "ratio to the better")
+    header = ("round", "env_steps/s", *peers, "ratio to the faster peer")
     header += ("environment + forward + update, us", "limit, env_steps/s", "share")
     print(table(header, rows))
-    print(f"median {statistics.median(ratios):.1f} x the better peer, {statistics.median(shares):.0%} of the limit")
+    print(f"median {statistics.median(ratios):.1f} x the faster peer, {statistics.median(shares):.0%} of the limit")
 
 
 if __name__ == "__main__":

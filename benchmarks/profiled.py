@@ -1,9 +1,9 @@
-"""Runs the learner or an actor with its codec and transport timed; writes the CPU seconds as JSON when it ends.
+"""Run a learner or an actor and measure the CPU time of codec and transport; write the CPU seconds as JSON.
 
-    PROFILE=out.json python -P benchmarks/profiled.py actor --connect tcp/127.0.0.1:7447
+    PROFILE=out.json python -P benchmarks/profiled.py daedalus.cli.commands.actor --connect tcp/127.0.0.1:7447
 
-Counted as codec: `encode` and `decode`. Counted as transport: what our own threads spend in calls to it, and
-everything that threads which are not ours spend: Zenoh's own, and those on which it calls us back.
+Codec is the time in `encode` and `decode`. Transport is the time of our threads in calls of the transport, and all time
+of the threads of Zenoh, including our callbacks.
 """
 
 import functools
@@ -26,12 +26,12 @@ ACTIVE = threading.local()
 
 
 def is_ours() -> bool:
-    """Whether this thread was started by our own code, and not by Zenoh to call us back."""
+    """Return whether our own code started this thread, and not Zenoh for a callback."""
     return not isinstance(threading.current_thread(), threading._DummyThread)
 
 
 def timed(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, its CPU time on this thread added to `kind`; calls within such calls are not added twice."""
+    """Return the function with its CPU time added to `kind`. Nested calls are counted once."""
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -49,7 +49,7 @@ def timed(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def foreign_seconds() -> float:
-    """CPU seconds of all threads of this process that are not ours."""
+    """Return the CPU seconds of all threads of this process that our code did not start."""
     ours = {thread.native_id for thread in threading.enumerate() if not isinstance(thread, threading._DummyThread)}
     ticks = 0
     for task in Path("/proc/self/task").iterdir():
@@ -72,7 +72,7 @@ def main() -> None:
     close = zenoh_transport.ZenohTransport.close
 
     def close_and_report(self: zenoh_transport.ZenohTransport) -> None:
-        # Before the session closes: its threads, and the time they took, vanish with it.
+        # Before the session closes: its threads end then, and their times are lost.
         SPENT["transport"] += foreign_seconds()
         report = {**SPENT, "total": time.process_time()}
         Path(os.environ["PROFILE"]).write_text(json.dumps(report))

@@ -1,4 +1,4 @@
-"""What the benchmarks share: running commands of this checkout, and printing tables."""
+"""Shared parts of the benchmarks: run commands of this checkout, and print tables."""
 
 import json
 import os
@@ -14,7 +14,7 @@ COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; rais
 
 
 def train(*arguments: object) -> dict[str, Any]:
-    """Runs `daedalus train ARGUMENTS` in a folder of its own; its summary, with `exit_status` added."""
+    """Run `daedalus train ARGUMENTS` in a temporary folder; return its summary with `exit_status`."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
         words = [str(argument) for argument in arguments]
@@ -28,13 +28,13 @@ def train(*arguments: object) -> dict[str, Any]:
 
 
 def machine() -> str:
-    """One line on what the figures were measured on."""
+    """Return one line that describes this machine."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     return f"{os.cpu_count()} x {model}, Python {platform.python_version()}"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

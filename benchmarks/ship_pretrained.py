@@ -1,7 +1,7 @@
-"""`python -m benchmarks.ship_pretrained RUN_DIR NAME`: makes a run's best policy one that ships with the package.
+"""`python -m benchmarks.ship_pretrained RUN_DIR NAME`: add the best policy of a run to the package.
 
-Writes policy/pretrained/NAME: the policy without the learner's state, and how it came about (config.toml, the
-learning curve, a README with the command). Commit it, and `daedalus evaluate --pretrained NAME` plays it.
+Writes policy/pretrained/NAME: the policy without the state of the learner, config.toml, the learning curve and a README
+with the commands. Commit the folder; then `daedalus evaluate --pretrained NAME` plays the policy.
 """
 
 import argparse
@@ -45,14 +45,14 @@ def main() -> int:
 
 
 def ship(run: Path, target: Path) -> Path:
-    """Writes the best policy of `run`, or its newest, as `target`, with how it came about; returns `target`."""
+    """Write the best or newest policy of `run` with its settings and learning curve to `target`; return `target`."""
     policy = find_policy(run)
     summary = read_json(run / SUMMARY)
     export_policy(policy.directory, target)
     shutil.copyfile(run / CONFIG, target / CONFIG)
     header, *rows = (run / METRICS).read_text("utf-8").splitlines()
     every = max(math.ceil(len(rows) / _MOST_ROWS), 1)
-    # Counted from the end: the last row is how it ended.
+    # Counted from the end, so that the last row is kept.
     (target / METRICS).write_text("\n".join([header, *rows[::-1][::every][::-1], ""]), "utf-8")
     (target / "README.md").write_text(
         _README.format(
@@ -70,7 +70,7 @@ def ship(run: Path, target: Path) -> Path:
 
 def _score(evaluation: dict | None, policy_version: int) -> str:
     if not evaluation or evaluation["policy_version"] != policy_version:
-        return "Not evaluated since."
+        return "Not evaluated."
     return (
         f"Return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} over {evaluation['episodes']} "
         f"{evaluation['actions']} episodes on {evaluation['backend']}'s {evaluation['environment']}."

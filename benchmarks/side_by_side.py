@@ -1,9 +1,9 @@
-"""The sketch of CarRacing-v3 beside gymnasium's own, frame by frame, through one drive.
+"""Compare the fast backend of CarRacing-v3 with gymnasium's, frame by frame, in one episode.
 
     python benchmarks/side_by_side.py --output docs/car_racing_frames.png
 
-Both get the same seed and the same actions. Prints how far the frames are apart, in grey values, and whether rewards
-and ends are the same; the picture shows moments of the drive: gymnasium's, the sketch's, and ten times the difference.
+Both get the same seed and the same actions. Prints the difference of the frames in grey values, and whether rewards and
+ends are equal. The picture shows frames of gymnasium, frames of the fast backend, and ten times the difference.
 """
 
 import argparse
@@ -21,7 +21,7 @@ _ENLARGED = 3
 
 
 def drive(environments: VectorEnvironment, seed: int, actions: list[int]) -> tuple[np.ndarray, list[tuple]]:
-    """Frames [T, H, W] and what came with each."""
+    """Return frames [T, H, W], and reward, terminated and truncated of each step."""
     frames, rest = [environments.reset(seed)[0].copy()], []
     for action in actions:
         shown, rewards, terminated, truncated = environments.step(np.array([action]))
@@ -48,14 +48,14 @@ def main() -> None:
             drives.append(drive(environments, parsed.seed, actions))
         finally:
             environments.close()
-    (original, expected), (sketch, found) = drives
-    apart = np.abs(original.astype(int) - sketch)  # [T, H, W]
+    (original, expected), (fast, found) = drives
+    apart = np.abs(original.astype(int) - fast)  # [T, H, W]
     worst = apart.mean((1, 2)).max()
     print(f"{len(apart)} frames: mean difference {apart.mean():.2f} of 255, {worst:.2f} in the worst frame")
     print(f"between one frame and the next: {np.abs(np.diff(original.astype(int), axis=0)).mean():.2f}")
-    print("rewards and ends are", "the same" if expected == found else "NOT the same")
+    print("rewards and ends are", "equal" if expected == found else "NOT equal")
     moments = np.linspace(0, len(apart) - 1, 6).astype(int)
-    columns = [np.concatenate([original[m], sketch[m], np.minimum(10 * apart[m], 255)]) for m in moments]
+    columns = [np.concatenate([original[m], fast[m], np.minimum(10 * apart[m], 255)]) for m in moments]
     picture = np.concatenate(columns, axis=1).astype(np.uint8)
     Image.fromarray(picture).resize(np.array(picture.shape[::-1]) * _ENLARGED, Image.Resampling.NEAREST).save(
         parsed.output

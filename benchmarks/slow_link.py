@@ -1,10 +1,10 @@
-"""Pong with one actor far away: what training loses over a slow link, and what compact snapshots buy there.
+"""Measure Pong with one actor on a slow link, with and without compact snapshots.
 
     python -m benchmarks.slow_link --rounds 2
 
-1 Mbit/s up, 4 Mbit/s down, 100 ms each way, beside loopback: one after the other, each with a learner and an actor of
-its own. Over the slow link twice: as an actor does it that has measured its link, and as one that is told that the link
-is fast and has every snapshot pushed to it whole.
+The slow link has 1 Mbit/s up, 4 Mbit/s down and 100 ms in each direction. Three cases run in turn, each with a learner
+and an actor of its own: loopback; the slow link as the actor measures it; and the slow link with --link lan, so that
+the actor receives every snapshot in full.
 """
 
 import argparse
@@ -29,8 +29,8 @@ from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect
 
-UP, DOWN, DELAY = 125e3, 500e3, 0.1  # bytes a second each way, and seconds
-# The preset's window of 1 is for loopback only: nothing is played there while the learner takes a rollout in.
+UP, DOWN, DELAY = 125e3, 500e3, 0.1  # bytes per second, and seconds in each direction
+# The window of 1 in the preset is for loopback only: the actor waits for each answer.
 _SETTINGS = ("environment.backend=ale", "collection.actors=1", "collection.window=2", "service.log_seconds=1")
 _CASES: dict[str, tuple[bool, LinkChoice]] = {
     "loopback": (False, "auto"),
@@ -44,22 +44,22 @@ _UPDATES = run_spec(read_preset("pong")).training.updates_per_batch
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """One case's figures, of the time after its warm-up."""
+    """Results of one case, after the warm-up."""
 
-    env_steps: float  # a second
+    env_steps: float  # per second
     accepted: float
     rejected: float
-    up: float  # bytes an hour, as the status tells them
+    up: float  # bytes per hour, from the status
     down: float
-    carried_up: float  # bytes an hour, as the link carried them; 0 where there was none
+    carried_up: float  # bytes per hour, counted by the link; 0 on loopback
     carried_down: float
     lag: float  # updates
-    versions: float  # that the actor played with, a minute
-    published: float  # a minute
+    versions: float  # that the actor played with, per minute
+    published: float  # per minute
 
 
 class ReportingCollector(EnvironmentCollector):
-    """Prints the policy version that it collects with."""
+    """Collector that prints the policy version of its weights."""
 
     def load(self, snapshot: Snapshot) -> None:
         """See Collector."""
@@ -68,7 +68,7 @@ class ReportingCollector(EnvironmentCollector):
 
 
 def play(address: str, link: LinkChoice) -> int:
-    """The actor's process."""
+    """Run the process of the actor."""
     transport, stop = connect([address]), stop_on_signals()
     config = ActorConfig(name="far", incarnation=time.monotonic_ns(), link=link)
     try:
@@ -80,11 +80,11 @@ def play(address: str, link: LinkChoice) -> int:
 
 @contextlib.contextmanager
 def link_to(here: Scene, slow: bool) -> Iterator[tuple[str, dict[str, int]]]:
-    """Where the actor connects to, and what the link carries meanwhile."""
+    """Yield the address for the actor and the bytes that the link carries."""
     if not slow:
         yield here.address, {"up": 0, "down": 0}
         return
-    from faults import SlowProxy  # the tests' own: benchmarks.chaos has them found
+    from faults import SlowProxy  # a module of the tests: benchmarks.chaos adds its folder to the path
 
     proxy = SlowProxy(here.address, up=UP, down=DOWN, delay=DELAY)
     try:
@@ -94,7 +94,7 @@ def link_to(here: Scene, slow: bool) -> Iterator[tuple[str, dict[str, int]]]:
 
 
 def measure(slow: bool, link: LinkChoice, warm_up: float, duration: float) -> tuple[Measured, list[tuple[str, str]]]:
-    """One case; and the sizes of snapshots, which the link has no part in, where it is loopback."""
+    """Measure one case; on loopback also the sizes of snapshots."""
     with scene() as here:
         settings = [word for setting in _SETTINGS for word in ("--set", setting)]
         here.start("learner", "pong", "--listen", here.address, "--run-dir", "run", *settings, *ENDLESS)
@@ -104,27 +104,27 @@ def measure(slow: bool, link: LinkChoice, warm_up: float, duration: float) -> tu
             here.wait_for_training("far")
             time.sleep(warm_up)
             first, carried_before, lines = _status(here), dict(carried), len(actor.lines)
-            began, told = time.monotonic(), []
+            began, statuses = time.monotonic(), []
             while time.monotonic() < began + duration:
                 time.sleep(1.0)
-                told.append(_status(here))
+                statuses.append(_status(here))
             seconds, played = time.monotonic() - began, actor.lines[lines:]
             hourly = {way: 3600 * (carried[way] - carried_before[way]) / seconds for way in carried}
-            sizes = [] if slow else _sizes(here)  # while there is somebody to learn from
+            sizes = [] if slow else _sizes(here)  # while the learner still makes updates
         say("\n".join(f"  actor: {line}" for line in actor.lines if not line.startswith(_PLAYS)))
-    before, after = first.actors[0], told[-1].actors[0]
+    before, after = first.actors[0], statuses[-1].actors[0]
     rejected = sum(after.rollouts_rejected.values()) - sum(before.rollouts_rejected.values())
     return Measured(
         env_steps=(after.env_steps - before.env_steps) / seconds,
         accepted=after.rollouts_accepted - before.rollouts_accepted,
         rejected=rejected,
-        up=statistics.fmean(status.actors[0].bytes_up_per_hour for status in told),
-        down=statistics.fmean(status.actors[0].bytes_down_per_hour for status in told),
+        up=statistics.fmean(status.actors[0].bytes_up_per_hour for status in statuses),
+        down=statistics.fmean(status.actors[0].bytes_down_per_hour for status in statuses),
         carried_up=hourly["up"],
         carried_down=hourly["down"],
-        lag=statistics.fmean(status.policy_lag_mean for status in told),
+        lag=statistics.fmean(status.policy_lag_mean for status in statuses),
         versions=60 * sum(line.startswith(_PLAYS) for line in played) / seconds,
-        published=60 * (told[-1].updates - first.updates) / _UPDATES / seconds,
+        published=60 * (statuses[-1].updates - first.updates) / _UPDATES / seconds,
     ), sizes
 
 
@@ -135,7 +135,7 @@ def _status(here: Scene) -> RunStatus:
 
 
 def _sizes(here: Scene) -> list[tuple[str, str]]:
-    """Bytes of the newest snapshot, whole and compact, and of the differences to it of later ones."""
+    """Return the bytes of the newest snapshot, full and compact, and of later differences to it."""
     transport = connect([here.address])
     try:
         (answer,) = transport.query(keys.snapshots("run"), timeout=30.0)
@@ -157,7 +157,7 @@ def _sizes(here: Scene) -> list[tuple[str, str]]:
 
 
 def _fetched(transport: Transport, held: int | None) -> tuple[int, int]:
-    """The newest version and its bytes, as for an actor that holds another."""
+    """Return the newest version and its bytes for an actor that holds another version."""
     size, part, version = 0, 0, None
     while True:
         request = SnapshotRequest(actor="sizes", held_version=held, policy_version=version, part=part)
@@ -175,8 +175,8 @@ def _mean(rounds: list[Measured]) -> Measured:
 
 
 def _column(found: Measured, alone: Measured) -> tuple[str, ...]:
-    def megabytes(told: float, carried: float) -> str:
-        return f"{told / 1e6:,.0f}" + (f" ({carried / 1e6:,.0f})" if carried else "")
+    def megabytes(reported: float, carried: float) -> str:
+        return f"{reported / 1e6:,.0f}" + (f" ({carried / 1e6:,.0f})" if carried else "")
 
     return (
         f"{found.env_steps:,.0f} ({found.env_steps / alone.env_steps:.0%})",
@@ -190,21 +190,27 @@ def _column(found: Measured, alone: Measured) -> tuple[str, ...]:
 
 
 _ROWS = (
-    "env_steps/s (of loopback's)",
+    "env_steps/s (relative to loopback)",
     "rollouts accepted",
-    "rejected, as stale",
+    "rollouts rejected as stale",
     "policy lag, updates (batches)",
-    "policy versions a minute that the actor played with, of those published",
-    "MB an hour up, as `status` has it (as the link carried it)",
-    "MB an hour down",
+    "policy versions per minute that the actor played with, of those published",
+    "MB per hour up, from `status` (counted by the link)",
+    "MB per hour down",
 )
 
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--rounds", type=int, default=1, help="of all cases in turn (default: %(default)s)")
-    options.add_argument("--minutes", type=float, default=1.0, help="of each case (default: %(default)g)")
-    options.add_argument("--warm-up", type=float, default=20.0, metavar="SECONDS", help="before (default: %(default)g)")
+    options.add_argument("--rounds", type=int, default=1, help="rounds of all cases in turn (default: %(default)s)")
+    options.add_argument("--minutes", type=float, default=1.0, help="duration of each case (default: %(default)g)")
+    options.add_argument(
+        "--warm-up",
+        type=float,
+        default=20.0,
+        metavar="SECONDS",
+        help="time before each measurement (default: %(default)g)",
+    )
     options.add_argument("--play", metavar="ADDRESS", help=argparse.SUPPRESS)
     options.add_argument("--link", choices=("auto", "lan"), default="auto", help=argparse.SUPPRESS)
     parsed = options.parse_args()

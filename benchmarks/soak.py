@@ -1,9 +1,9 @@
-"""Hours of CartPole while actors are killed: is the memory of every process flat?
+"""Run CartPole for hours while actors are killed, and check that the memory of every process stays constant.
 
     python -m benchmarks.soak --minutes 120
 
-Two of four actors are killed in turn, one every 20 s; the learner, the launcher and the other two live through all of
-it. Their memory, threads and open files are sampled; the slopes leave out the first tenth, in which all warms up.
+Two of four actors are killed in turn, one every 20 s. Memory, threads and open files of the learner, the launcher and
+the other two actors are sampled. The slopes leave out the first tenth, the warm-up.
 """
 
 import argparse
@@ -25,12 +25,12 @@ _SAMPLE_SECONDS = 5.0
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--minutes", type=float, default=120.0, help="how long (default: %(default)g)")
+    options.add_argument("--minutes", type=float, default=120.0, help="duration (default: %(default)g)")
     minutes = options.parse_args().minutes
     with scene() as here:
         rows = _soak(here, 60.0 * minutes)
     print(f"{machine()}; {minutes:g} minutes\n")
-    print(table(("process", "MiB, first and last", "slope, MiB an hour", "threads", "open files"), rows))
+    print(table(("process", "MiB, first and last", "slope, MiB per hour", "threads", "open files"), rows))
     return 0
 
 

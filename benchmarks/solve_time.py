@@ -1,10 +1,10 @@
-"""Seconds from the command to solved: `daedalus train cartpole`, one run a seed.
+"""Measure the seconds from the start of `daedalus train cartpole` until it is solved, one run per seed.
 
     python benchmarks/solve_time.py --seeds 1 2 3 4 5
 
-Solved means what the program means by it: the mean of the last 100 training episodes is at least 475. Counted
-from the start of the `daedalus` process; the evaluation that follows is not in it. One run that is not counted
-comes first and warms the disk cache.
+Solved means that the mean of the last 100 training episodes is at least 475, as in the preset. The time starts with the
+`daedalus` process and does not include the final evaluation. One run before the others warms the disk cache; it is not
+counted.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""How soon an actor contributes, and what it holds: from its start to its first rollout taken in, over loopback.
+"""Measure the time from the start of an actor to its first accepted rollout, and its memory, over loopback.
 
 python -m benchmarks.thin_actor --times 10
 """
@@ -15,8 +15,10 @@ from benchmarks.running import machine, table
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--times", type=int, default=10, help="actors, one after the other (default: %(default)s)")
-    options.add_argument("--preset", default="cartpole", help="default: %(default)s")
+    options.add_argument(
+        "--times", type=int, default=10, help="number of actors, one after the other (default: %(default)s)"
+    )
+    options.add_argument("--preset", default="cartpole", help="preset of the run (default: %(default)s)")
     parsed = options.parse_args()
     with scene() as here:
         here.start("learner", parsed.preset, "--listen", here.address, "--run-dir", "run", "--actors", 1, *ENDLESS)
@@ -25,16 +27,16 @@ def main() -> int:
         measured = [_one(here, f"thin-{number}") for number in range(parsed.times)]
     seconds, mib = np.array(measured).T
     rows = [
-        ("start to first rollout, s", f"{np.median(seconds):.2f}", f"{seconds.max():.2f}"),
+        ("start to first accepted rollout, s", f"{np.median(seconds):.2f}", f"{seconds.max():.2f}"),
         ("resident, MiB", f"{np.median(mib):.0f}", f"{mib.max():.0f}"),
     ]
-    print(f"{machine()}; {parsed.preset}, {parsed.times} actors one after the other, another plays\n")
+    print(f"{machine()}; {parsed.preset}, {parsed.times} actors one after the other, while another plays\n")
     print(table(("", "median", "worst"), rows))
     return 0
 
 
 def _one(here: Scene, name: str) -> tuple[float, float]:
-    """Seconds until the learner has taken in a rollout of a new actor, and that one's memory a second later."""
+    """Return the seconds until the first accepted rollout of a new actor, and its memory one second later."""
     began = time.monotonic()
     running = here.start("actor", "--connect", here.address, "--name", name)
 

@@ -1,8 +1,8 @@
-"""env_steps a second on CartPole, learning at full rate, beside stable-baselines3's A2C; and the memory of it.
+"""Measure env_steps/s on CartPole with learning, of Daedalus and of A2C of stable-baselines3, and the memory.
 
     python benchmarks/throughput.py --rounds 3
 
-Ours and the peer's take turns, each alone on the machine; the ratio is that of each round.
+Both run in turn, each alone on the machine. The ratio is computed per round.
 """
 
 import argparse
@@ -19,13 +19,13 @@ from running import COMMAND, machine, table
 
 
 def resident_megabytes(pid: int) -> float:
-    """Peak resident memory of a process, in MB."""
+    """Return the peak resident memory of a process, in MB."""
     text = Path(f"/proc/{pid}/status").read_text()
     return int(text.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def children(pid: int) -> dict[int, str]:
-    """Process ids of a process's children, with the module that each runs."""
+    """Return the ids of the child processes of a process, with the module that each runs."""
     found = {}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
@@ -34,7 +34,7 @@ def children(pid: int) -> dict[int, str]:
 
 
 def ours(env_steps: int) -> tuple[float, float, float]:
-    """env_steps/s, and the peak memory of the learner and of the larger actor."""
+    """Measure env_steps/s, and the peak memory of the learner and of the larger actor."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
         arguments = ["train", "cartpole", "--env-steps", str(env_steps), "--run-dir", str(directory)]
@@ -45,8 +45,9 @@ def ours(env_steps: int) -> tuple[float, float, float]:
         while process.poll() is None:
             time.sleep(0.5)
             for child, module in children(process.pid).items() if process.poll() is None else ():
-                if module in memory:
-                    memory[module] = max(memory[module], resident_megabytes(child))
+                role = module.rpartition(".")[2]
+                if role in memory:
+                    memory[role] = max(memory[role], resident_megabytes(child))
         if process.returncode != 0:
             raise SystemExit("daedalus train failed")
         rate = json.loads((directory / "summary.json").read_text())["env_steps_per_second"]
@@ -54,7 +55,7 @@ def ours(env_steps: int) -> tuple[float, float, float]:
 
 
 def peer(env_steps: int) -> float:
-    """env_steps/s of stable-baselines3's A2C."""
+    """Measure env_steps/s of A2C of stable-baselines3."""
     script = os.path.join(os.path.dirname(__file__), "peer_a2c.py")
     command = [sys.executable, script, "--env-steps", str(env_steps)]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])

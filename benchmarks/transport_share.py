@@ -1,8 +1,8 @@
-"""The share of CPU time that codec and transport take, learner and actors together, on CartPole at full rate.
+"""Measure the share of codec and transport in the CPU time of learner and actors, on CartPole.
 
     python benchmarks/transport_share.py --env-steps 8000000
 
-Process start, imports and everything else of the run is in the total; benchmarks/profiled.py says what is counted.
+The total includes the start of the processes and imports. benchmarks/profiled.py describes what is counted.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from running import machine, table
 
 
 def free_address() -> str:
-    """A loopback address that nobody listens on."""
+    """Return a loopback address that no process listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -33,10 +33,11 @@ def main() -> None:
     address = free_address()
     script = str(Path(__file__).with_name("profiled.py"))
     with tempfile.TemporaryDirectory() as folder:
-        learner = ["learner", parsed.preset, "--env-steps", parsed.env_steps, "--listen", address]
+        learner = ["daedalus.cli.commands.learner", parsed.preset, "--env-steps", parsed.env_steps, "--listen", address]
         learner += ["--run-dir", f"{folder}/run", "--set", "training.stop_when_solved=false"]
         learner += [word for setting in parsed.set for word in ("--set", setting)]
-        actors = [["actor", "--connect", address, "--name", f"actor-{index}", "--quiet"] for index in range(2)]
+        actor = ["daedalus.cli.commands.actor", "--connect", address, "--log-level", "warning", "--name"]
+        actors = [[*actor, f"actor-{index}"] for index in range(2)]
         processes = []
         for index, words in enumerate([learner, *actors]):
             environment = {**os.environ, "PROFILE": f"{folder}/{index}.json", "OMP_NUM_THREADS": "1"}

@@ -1,1 +1,1 @@
-"""The commands that a person types, and the processes that they start."""
+"""The command line: the commands of `daedalus`, and the processes that they start."""

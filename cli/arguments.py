@@ -1,11 +1,11 @@
-"""What the command lines of all commands share: how help reads, and the words for who may be talked to."""
+"""Shared parts of the command lines: the layout of help, and the options --connect, --tls and --insecure."""
 
 import argparse
 from pathlib import Path
 
 
 def command_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
-    """Parses `daedalus NAME`; its help ends with examples, laid out as they are."""
+    """Return the parser of `daedalus NAME`. Its help ends with the examples, printed as they are written."""
     return argparse.ArgumentParser(
         prog=f"daedalus {name}",
         description=description,
@@ -15,24 +15,25 @@ def command_parser(name: str, description: str, examples: str) -> argparse.Argum
 
 
 def add_connect(options: argparse._ActionsContainer, help: str) -> None:
-    """Adds --connect, which must be given and may be several times."""
+    """Add --connect, which is required and may be given several times."""
     options.add_argument("--connect", required=True, action="append", metavar="tcp/HOST:PORT", help=help)
 
 
 def add_tls(options: argparse._ActionsContainer) -> None:
-    """Adds --tls."""
+    """Add --tls."""
     options.add_argument(
         "--tls",
         type=Path,
         metavar="DIR",
-        help="this one's certificate, for addresses that begin with tls/ (daedalus certs makes them)",
+        help="folder with the certificate of this process, for tls/ addresses (see daedalus certs --help)",
     )
 
 
 def add_insecure(options: argparse._ActionsContainer) -> None:
-    """Adds --insecure, for those that listen."""
+    """Add --insecure, for commands that listen."""
     options.add_argument(
         "--insecure",
         action="store_true",
-        help="listen beyond this machine although whoever reaches the address may take part, unseen and unchecked",
+        help="allow an address that other hosts can reach without TLS. Every host that reaches it may take part, and "
+        "traffic is not encrypted",
     )

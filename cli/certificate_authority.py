@@ -1,4 +1,7 @@
-"""A CA in a folder: makes keys, signs certificates (X.509, P-256). The only file that imports `cryptography`."""
+"""A certificate authority in a folder: creates keys and signs certificates (X.509, P-256).
+
+No other file imports `cryptography`.
+"""
 
 import datetime
 import ipaddress
@@ -13,28 +16,30 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from daedalus.transport.credentials import CA, CERTIFICATE, KEY, CredentialsError
 
-_CLOCKS_DIFFER = datetime.timedelta(hours=1)  # between hosts
+_CLOCK_SKEW = datetime.timedelta(hours=1)  # allowed between the clocks of two hosts
 
 
 class CertificateAuthority:
-    """The CA of one folder."""
+    """Certificate authority (CA) whose certificate and key are in one folder."""
 
     def __init__(self, directory: Path) -> None:
-        """Reads it. Raises CredentialsError if there is none."""
+        """Read the CA. Raises CredentialsError if the folder holds none."""
         try:
             self._certificate = x509.load_pem_x509_certificate((directory / CA).read_bytes())
             key = serialization.load_pem_private_key((directory / KEY).read_bytes(), None)
         except (OSError, ValueError):
-            raise CredentialsError(f"{directory} holds no CA: `daedalus certs init` makes one") from None
+            raise CredentialsError(f"{directory} holds no CA: create one with `daedalus certs init`") from None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise CredentialsError(f"{directory / KEY} is not a key of ours")
+            raise CredentialsError(
+                f"{directory / KEY} is not an elliptic-curve key: create a CA with `daedalus certs init`"
+            )
         self._directory, self._key = directory, key
 
     @classmethod
     def create(cls, directory: Path, lifetime: datetime.timedelta) -> "CertificateAuthority":
-        """A new CA in a folder that is not there yet."""
+        """Create a CA in a folder that does not exist yet."""
         key = ec.generate_private_key(ec.SECP256R1())
-        name = _named("Daedalus CA")
+        name = _x509_name("Daedalus CA")
         builder = _builder(name, name, key, lifetime).add_extension(x509.BasicConstraints(True, 0), critical=True)
         builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
         directory.mkdir(parents=True)
@@ -43,10 +48,10 @@ class CertificateAuthority:
         return cls(directory)
 
     def issue(self, folder: Path, common_name: str, hosts: list[str], lifetime: datetime.timedelta) -> None:
-        """Writes certificate, key and ca.pem into a folder; with `hosts` it may also listen, under those names."""
+        """Write certificate, key and ca.pem into a folder. With `hosts`, it is also for listening."""
         key = ec.generate_private_key(ec.SECP256R1())
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
-        builder = _builder(_named(common_name), self._certificate.subject, key, lifetime)
+        builder = _builder(_x509_name(common_name), self._certificate.subject, key, lifetime)
         builder = builder.add_extension(x509.BasicConstraints(False, None), critical=True)
         builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
@@ -54,7 +59,7 @@ class CertificateAuthority:
             x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
         )
         if hosts:
-            builder = builder.add_extension(x509.SubjectAlternativeName([_alternative(h) for h in hosts]), False)
+            builder = builder.add_extension(x509.SubjectAlternativeName([_alternative_name(h) for h in hosts]), False)
         certificate = builder.sign(self._key, hashes.SHA256())
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder / KEY, _pem(key))
@@ -72,17 +77,17 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, now + lifetime) - _CLOCKS_DIFFER)
+        .not_valid_before(min(now, now + lifetime) - _CLOCK_SKEW)
         .not_valid_after(now + lifetime)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
 
 
-def _named(common_name: str) -> x509.Name:
+def _x509_name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
-def _alternative(host: str) -> x509.GeneralName:
+def _alternative_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
@@ -110,7 +115,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Writes a file that nobody else may read."""
+    """Write a file that only its owner may read."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with open(descriptor, "wb") as file:
         file.write(data)

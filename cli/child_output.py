@@ -1,4 +1,4 @@
-"""Where child processes write: to this process's own streams, or through it line by line."""
+"""Output of child processes: written to this process's own streams, or passed on line by line."""
 
 import os
 import threading
@@ -23,13 +23,13 @@ INHERITED = Streams()
 
 
 class CollectedOutput:
-    """A pipe for the output of child processes that passes each line to a function and keeps the newest lines.
+    """Pipe for the output of child processes. It passes each line to a function and keeps the newest lines.
 
     A notebook shows only what its own process prints, so children cannot write to its streams themselves.
     """
 
     def __init__(self, pass_on: Callable[[str], None]) -> None:
-        """`pass_on` is called with each line, from a thread of this object."""
+        """Start a thread that reads the pipe and calls `pass_on` with each line."""
         reading, self.descriptor = os.pipe()
         self._pass_on = pass_on
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)

@@ -1,4 +1,4 @@
-"""One run on this machine: a learner and actors as child processes, supervised to their end, then the evaluation.
+"""One run on this machine: a learner and actors as supervised child processes, then the evaluation of the result.
 
 `daedalus train`, `daedalus resume` and `daedalus.train` share this file.
 """
@@ -26,7 +26,7 @@ _FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
 
 
 class RunFailedError(Exception):
-    """A run that did not finish; the message is empty where a child process has printed the reason."""
+    """Error of a run that did not finish. The message is empty if a child process has printed the reason."""
 
     def __init__(self, message: str = "", status: int = 1) -> None:
         super().__init__(message)
@@ -34,28 +34,30 @@ class RunFailedError(Exception):
 
 
 class RunStoppedError(Exception):
-    """A run that was stopped before its end."""
+    """Error of a run that was stopped before its end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalRun:
-    """A run whose directory and config.toml exist already, and where more actors may join."""
+    """Settings of one run on this machine. Its directory and config.toml exist already."""
 
     directory: Path
     spec: RunSpec
-    started: float  # monotonic clock; the run's seconds count from there
+    started: float  # on the monotonic clock; the seconds of the run count from this time
     resume: bool = False
-    listen: str | None = None  # beside a free port of this machine
+    listen: str | None = None  # address for actors of other hosts, in addition to a free port of this machine
     tls: Path | None = None
     insecure: bool = False
-    wrap: str | None = None  # module:function, for this machine's environments
+    wrap: str | None = None  # module:function that wraps each environment of this machine's actors
+    log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
+    log_json: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnd:
-    """How a run ended."""
+    """End of a run: exit status and summary."""
 
-    status: int  # 0 the target was reached or the asked-for steps were done, 3 the budget ended without the target
+    status: int  # 0: target reached, or all steps done without a target to stop at; 3: budget used up before the target
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 
@@ -86,7 +88,7 @@ def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INH
 
 def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
-    spec, options = run.spec, ("--wrap", run.wrap) if run.wrap else ()
+    spec, options = run.spec, _actor_options(run)
     listening, address = _addresses(run)
     learner = _supervised_learner(run, listening, streams)
     actors: list[Supervised] = []
@@ -95,14 +97,31 @@ def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
         actors += [supervised_actor(name, address, options, streams) for name in names]
         training = spec.training
         _logger.info(
-            f"{spec.environment.id}: {training.algorithm}, seed {training.seed}, {len(actors)} actors"
-            f" x {spec.collection.envs_per_actor} environments at {address}; run directory {run.directory}"
+            "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
+            spec.environment.id,
+            training.algorithm,
+            training.seed,
+            len(actors),
+            spec.collection.envs_per_actor,
+            address,
+            run.directory,
         )
         if spec.evaluation.seconds is not None:
             actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), streams))
         return watch(learner, actors, spec, stopping)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
+
+
+def _logging_options(level: str, as_json: bool) -> tuple[str, ...]:
+    return "--log-level", level, *(["--log-json"] if as_json else [])
+
+
+def _actor_options(run: LocalRun) -> tuple[str, ...]:
+    """Return the options of this machine's actors and of the evaluator."""
+    # The learner reports the progress of all actors: the records of each one are for debugging.
+    level = "debug" if run.log_level == "debug" else "warning"
+    return *_logging_options(level, run.log_json), *(["--wrap", run.wrap] if run.wrap else [])
 
 
 def _addresses(run: LocalRun) -> tuple[list[str], str]:
@@ -116,21 +135,23 @@ def _addresses(run: LocalRun) -> tuple[list[str], str]:
 
 
 def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -> Supervised:
-    """Start a learner that resumes from its newest checkpoint if it is killed."""
+    """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         since = run.started if first else time.monotonic()
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
-        resume = ["--resume"] if run.resume or not first else []
-        return start("daedalus.cli.commands.learner", *arguments, *resume, streams=streams)
+        arguments += _logging_options(run.log_level, run.log_json)
+        if run.resume or not first:
+            arguments.append("--resume")
+        return start("daedalus.cli.commands.learner", *arguments, streams=streams)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 
 
 def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping: threading.Event) -> int:
-    """Wait for the learner's end, restarting processes that die; return the learner's exit status.
+    """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
-    Raises FailedError if the learner failed for good, or too few actors are left.
+    Raises FailedError if the learner failed too often, or if too few actors are left.
     """
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
@@ -144,16 +165,18 @@ def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping
                 actors.remove(actor)
                 stop([actor.process])
                 playing = sum(other.name != _EVALUATOR for other in actors)
-                needed = not playing or spec.algorithm.synchronous  # a2c waits for all at its start
+                needed = (
+                    not playing or spec.algorithm.synchronous
+                )  # a synchronous algorithm waits for all actors at its start
                 if needed and actor.name != _EVALUATOR:
                     raise
-                _warn(f"{error}; going on without it")
+                _warn(f"{error}; training continues without this process")
     return 1
 
 
-def _warn(news: str | None) -> None:
-    if news:
-        _logger.warning(news)
+def _warn(message: str | None) -> None:
+    if message:
+        _logger.warning("%s", message)
 
 
 def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> dict[str, Any]:
@@ -162,7 +185,8 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = IN
     Raises EvaluationFailedError.
     """
     began = time.monotonic()
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *(["--wrap", run.wrap] if run.wrap else [])]
+    options = ["--episodes", str(run.spec.evaluation.final_episodes), *_logging_options(run.log_level, run.log_json)]
+    options += ["--wrap", run.wrap] if run.wrap else []
     chosen = select_best(run.directory, run.spec, options, stopping, streams)
     (evaluation,) = play([[str(run.directory), *options]], stopping, streams)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)

@@ -1,4 +1,4 @@
-"""Where log records go: plain lines for a person, or one JSON object a line for a log collector."""
+"""Configuration of logging: plain lines for a person, or one JSON object per line for a log collector."""
 
 import argparse
 import json
@@ -12,9 +12,12 @@ LEVELS = ("debug", "info", "warning", "error")
 def add_logging(options: argparse._ActionsContainer) -> None:
     """Add --log-level and --log-json."""
     options.add_argument(
-        "--log-level", choices=LEVELS, default="info", help="least severity that is shown (default: %(default)s)"
+        "--log-level",
+        choices=LEVELS,
+        default="info",
+        help="lowest severity of log records shown (default: %(default)s)",
     )
-    options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object a line")
+    options.add_argument("--log-json", action="store_true", help="write log records as JSON, one object per line")
 
 
 def configure_logging(
@@ -23,10 +26,10 @@ def configure_logging(
     """Send the records of all daedalus loggers to the terminal.
 
     Args:
-      level: least severity that is shown, one of LEVELS.
-      as_json: one JSON object a line, for a log collector, instead of plain messages.
-      prefix: put before each plain message, such as the name of the process.
-      write: takes a whole line, where a progress line shares the terminal; default: standard output.
+      level: lowest severity of the records shown, one of LEVELS.
+      as_json: write one JSON object per line, for a log collector, instead of plain messages.
+      prefix: text before each plain message, such as the name of the process.
+      write: called with each line, if a progress line shares the terminal (default: print to standard output).
     """
     handler = _LineHandler(write or _print)
     plain = logging.Formatter(prefix.replace("%", "%%") + "%(message)s")
@@ -41,7 +44,7 @@ def _print(line: str) -> None:
 
 
 class _LineHandler(logging.Handler):
-    """Writes each record as one line; a terminal that is gone is nobody's fault."""
+    """Handler that writes each record as one line. It ignores a closed terminal."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
         super().__init__()
@@ -58,7 +61,7 @@ class _LineHandler(logging.Handler):
 
 
 class _JsonFormatter(logging.Formatter):
-    """The fields of a record that a log collector indexes."""
+    """Formatter that writes a record as one JSON object."""
 
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""

@@ -1,4 +1,4 @@
-"""`daedalus COMMAND`: finds the command and hands over. Imports nothing that the command does not need."""
+"""`daedalus COMMAND`: finds the command and runs it. Imports nothing that the command does not need."""
 
 import os
 import sys
@@ -7,46 +7,46 @@ from collections.abc import Callable
 USAGE = """\
 usage: daedalus COMMAND ...
 
-Actor-critic reinforcement learning with one learner and any number of actors, anywhere.
+Actor-critic reinforcement learning with one learner and any number of actors, on any machines.
 
 on this machine:
-  train      start a learner and actors, watch them learn, evaluate the result
+  train      start a learner and actors, show their progress, evaluate the result
   resume     continue a run from its newest checkpoint
 
-by hand, on any machines:
-  learner    own the weights, learn from what actors send
-  actor      play for a learner; needs nothing but its address
-  router     stand between them, so that neither has to know the other's host
-  status     show the fleet as the learner sees it
-  bridge     let actors in that are written in other languages
-  exporter   tell Prometheus what status tells
-  certs      make the certificates for actors on machines that others reach too
+on several machines, one process at a time:
+  learner    own the weights, and train them on the rollouts of actors
+  actor      play environments for a learner; needs only its address
+  router     connect learner and actors at a fixed address
+  status     show the state of a learner and its actors
+  bridge     connect actors that are written in other languages
+  exporter   export the status as Prometheus metrics
+  certs      create certificates for encrypted connections
 
-afterwards:
-  evaluate   play episodes with what a run has learned, or film them
-  plot       draw the curves of one or more runs
+after training:
+  evaluate   play episodes with the policy of a run, or record a video
+  plot       draw the learning curves of one or more runs
 
 for the shell:
   completion print a script that completes commands, options and presets
 
-`daedalus COMMAND --help` tells more. To begin: daedalus train cartpole"""
+`daedalus COMMAND --help` describes a command. To start: daedalus train cartpole"""
 
 
 def main() -> int:
-    """The entry point of the console script."""
+    """Run the command that the command line names, and return its exit status."""
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
         return 0 if arguments else 2
     command, rest = arguments[0], arguments[1:]
     if command in _MODULES:
-        # The same process becomes the other program: its signals and exit status are its own.
+        # The command replaces this process, so signals reach it and its exit status is returned.
         os.execv(sys.executable, [sys.executable, "-P", "-m", _MODULES[command], *rest])
     if command not in _COMMANDS:
         import difflib
 
         near = difflib.get_close_matches(command, [*_MODULES, *_COMMANDS], 1, 0.5)
-        hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists them"
+        hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
         print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
         return 2
     from daedalus.cli.processes import exit_on_thread_exceptions

@@ -27,7 +27,7 @@ def stop_on_signals() -> threading.Event:
 
 
 def exit_with_parent(stop: threading.Event) -> None:
-    """Set `stop` when standard input ends: the parent holds it open as long as it lives."""
+    """Set `stop` when standard input ends: the parent holds it open while it runs."""
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -53,14 +53,14 @@ def exit_on_thread_exceptions() -> None:
             _logger.critical("exception in thread %s: %s: the process ends", name, arguments.exc_type.__name__)
             sys.stdout.flush()
         finally:
-            # Not sys.exit, which would end only this thread, nor an orderly end, which could wait for it for ever.
+            # sys.exit would end only this thread, and an orderly end could wait for the failed thread without end.
             os._exit(1)
 
     threading.excepthook = end_process
 
 
 def process_started() -> float:
-    """Return the start of this process on the monotonic clock, or the present time where the system does not tell."""
+    """Return the start of this process on the monotonic clock, or the present time where it is not known."""
     now = time.monotonic()
     try:
         with (

@@ -1,7 +1,7 @@
-"""What a learner tells, in Prometheus' words. Pure functions.
+"""Conversion of a learner's status to Prometheus metrics. Pure functions.
 
-A counter that a learner restored from a checkpoint goes back a little, which Prometheus takes for a restart from 0:
-its `rate` then shows a peak of all that was ever counted. So what is drawn as a rate is exported as a gauge too.
+A counter that a learner restores from a checkpoint goes back a little. Prometheus interprets this as a restart from 0,
+so `rate` shows a peak of the whole count. Rates that the dashboard draws are therefore also exported as gauges.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,53 +13,93 @@ from daedalus.protocol.status import ActorStatus, RunStatus
 _Family = type[CounterMetricFamily] | type[GaugeMetricFamily]
 
 _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], ...] = (
-    (GaugeMetricFamily, "healthy", "1: nothing keeps the service from its work.", lambda run: not run.problems),
+    (GaugeMetricFamily, "healthy", "1 if the learner reports no problem, else 0.", lambda run: not run.problems),
     (GaugeMetricFamily, "uptime_seconds", "Age of the learner process.", lambda run: run.uptime_seconds),
-    (CounterMetricFamily, "env_steps", "Environment steps trained on.", lambda run: run.env_steps),
+    (CounterMetricFamily, "env_steps", "Environment steps that were trained on.", lambda run: run.env_steps),
     (
         GaugeMetricFamily,
         "env_steps_budget",
-        "Environment steps that the run may take.",
+        "Budget of environment steps of the run.",
         lambda run: run.env_steps_budget,
     ),
-    (GaugeMetricFamily, "env_steps_per_second", "Trained on, lately.", lambda run: run.env_steps_per_second),
+    (
+        GaugeMetricFamily,
+        "env_steps_per_second",
+        "Recent environment steps per second.",
+        lambda run: run.env_steps_per_second,
+    ),
     (CounterMetricFamily, "updates", "Optimiser steps.", lambda run: run.updates),
-    (GaugeMetricFamily, "updates_per_second", "Optimiser steps a second, lately.", lambda run: run.updates_per_second),
-    (CounterMetricFamily, "updates_skipped", "Updates without a finite gradient.", lambda run: run.updates_skipped),
-    (GaugeMetricFamily, "episode_return_mean", "Of the newest episodes.", lambda run: run.episode_return_mean),
-    (GaugeMetricFamily, "policy_lag_updates", "Mean policy lag, lately.", lambda run: run.policy_lag_mean),
-    (GaugeMetricFamily, "queue_bytes", "Rollouts that wait to be judged.", lambda run: run.queue_bytes),
-    (GaugeMetricFamily, "queue_limit_bytes", "Beyond it actors are told busy.", lambda run: run.queue_bytes_limit),
-    (GaugeMetricFamily, "checkpoint_age_seconds", "Of the newest one.", lambda run: run.checkpoint_age_seconds),
+    (GaugeMetricFamily, "updates_per_second", "Recent optimiser steps per second.", lambda run: run.updates_per_second),
+    (CounterMetricFamily, "updates_skipped", "Updates skipped: gradient not finite.", lambda run: run.updates_skipped),
+    (
+        GaugeMetricFamily,
+        "episode_return_mean",
+        "Mean return of the newest episodes.",
+        lambda run: run.episode_return_mean,
+    ),
+    (GaugeMetricFamily, "policy_lag_updates", "Recent mean policy lag.", lambda run: run.policy_lag_mean),
+    (GaugeMetricFamily, "queue_bytes", "Bytes of rollouts in the queue.", lambda run: run.queue_bytes),
+    (GaugeMetricFamily, "queue_limit_bytes", "Actors get the answer busy above it.", lambda run: run.queue_bytes_limit),
+    (
+        GaugeMetricFamily,
+        "checkpoint_age_seconds",
+        "Age of the newest checkpoint.",
+        lambda run: run.checkpoint_age_seconds,
+    ),
 )
 
 _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ...] = (
     (CounterMetricFamily, "actor_lives", "Processes that joined under this name.", lambda actor: actor.lives),
-    (GaugeMetricFamily, "actor_silence_seconds", "Since it was heard of.", lambda actor: actor.seconds_since_seen),
-    (GaugeMetricFamily, "actor_environments", "Environments it plays.", lambda actor: actor.environments),
-    (CounterMetricFamily, "actor_env_steps", "Its env_steps trained on.", lambda actor: actor.env_steps),
-    (GaugeMetricFamily, "actor_env_steps_per_second", "The same, lately.", lambda actor: actor.env_steps_per_second),
-    (CounterMetricFamily, "actor_rollouts_accepted", "Rollouts taken in.", lambda actor: actor.rollouts_accepted),
-    (CounterMetricFamily, "actor_rollouts_missed", "Numbered, never came.", lambda actor: actor.rollouts_missed),
-    (CounterMetricFamily, "actor_busy_answers", "Told to come again later.", lambda actor: actor.busy_answers),
-    (GaugeMetricFamily, "actor_up_bytes_per_second", "Its rollouts.", lambda actor: actor.bytes_up_per_hour / 3600),
-    (GaugeMetricFamily, "actor_down_bytes_per_second", "Snapshots.", lambda actor: actor.bytes_down_per_hour / 3600),
-    (GaugeMetricFamily, "actor_policy_lag_updates", "Of its newest rollout.", lambda actor: actor.policy_lag),
+    (
+        GaugeMetricFamily,
+        "actor_silence_seconds",
+        "Time since the last sign of it.",
+        lambda actor: actor.seconds_since_seen,
+    ),
+    (GaugeMetricFamily, "actor_environments", "Environments of the actor.", lambda actor: actor.environments),
+    (CounterMetricFamily, "actor_env_steps", "Its env_steps that were trained on.", lambda actor: actor.env_steps),
+    (
+        GaugeMetricFamily,
+        "actor_env_steps_per_second",
+        "Recent env_steps per second.",
+        lambda actor: actor.env_steps_per_second,
+    ),
+    (CounterMetricFamily, "actor_rollouts_accepted", "Rollouts accepted.", lambda actor: actor.rollouts_accepted),
+    (CounterMetricFamily, "actor_rollouts_missed", "Rollouts that never arrived.", lambda actor: actor.rollouts_missed),
+    (CounterMetricFamily, "actor_busy_answers", "Rollouts answered with busy.", lambda actor: actor.busy_answers),
+    (
+        GaugeMetricFamily,
+        "actor_up_bytes_per_second",
+        "Bytes of rollouts per second.",
+        lambda actor: actor.bytes_up_per_hour / 3600,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_down_bytes_per_second",
+        "Bytes of snapshots per second.",
+        lambda actor: actor.bytes_down_per_hour / 3600,
+    ),
+    (
+        GaugeMetricFamily,
+        "actor_policy_lag_updates",
+        "Policy lag of its newest rollout.",
+        lambda actor: actor.policy_lag,
+    ),
 )
 
 
 def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
-    """All metrics of all runs that answered: none of them, but for `daedalus_up` 0, if none did.
+    """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
 
-    Actors that are gone have no series of their own any more; they are counted by their state.
+    Actors that are gone have no series of their own. They are only counted, by their state.
     """
     runs = list({status.run: status for status in statuses}.values())
-    yield GaugeMetricFamily("daedalus_up", "1: a learner answers.", value=bool(runs))
+    yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
     info = GaugeMetricFamily(
-        "daedalus_run_info", "What is learned, and how.", labels=["run", "environment", "algorithm"]
+        "daedalus_run_info", "Environment and algorithm of the run.", labels=["run", "environment", "algorithm"]
     )
     actors = GaugeMetricFamily("daedalus_actors", "Actors by state.", labels=["run", "state"])
-    rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rollouts by cause.", labels=["run", "cause"])
+    rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rejected rollouts by cause.", labels=["run", "cause"])
     for run in runs:
         info.add_metric([run.run, run.environment, run.algorithm], 1)
         states = [_state(actor) for actor in run.actors]

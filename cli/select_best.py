@@ -1,7 +1,6 @@
-"""Which checkpoint of a run is its best: those that scored highest, and the newest, play it out.
+"""Selection of a run's best checkpoint: the best-scored checkpoints and the newest are re-evaluated.
 
-The best of many scores over a few episodes was lucky; over fresh episodes, more of them and the same for all, it counts
-what each can do.
+The highest of many scores over a few episodes is partly luck. All candidates play the same number of new episodes.
 """
 
 import json
@@ -22,11 +21,11 @@ from daedalus.protocol.spec import RunSpec
 _logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
-_SEEDS = 2**33  # added to the run's: neither training nor the final episodes have these
+_SEEDS = 2**33  # added to the seed of the run, so that neither training nor the final evaluation uses these seeds
 
 
 class EvaluationFailedError(Exception):
-    """Episodes could not be played, or were stopped; the message is what the first evaluation did not print itself."""
+    """Error of an evaluation that failed or was stopped. The message holds output that was not printed yet."""
 
 
 def select_best(
@@ -36,45 +35,56 @@ def select_best(
     stopping: threading.Event,
     streams: Streams = INHERITED,
 ) -> list[dict[str, Any]]:
-    """Scores each candidate anew; what each got, the best first. Nothing, if there are not two to choose from.
+    """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
 
-    `options` are what `daedalus evaluate` takes. Raises EvaluationFailedError.
+    Args:
+      directory: the run directory.
+      spec: the specification of the run.
+      options: options for each `daedalus evaluate`.
+      stopping: ends the evaluations early when it is set.
+      streams: where the first evaluation writes its progress.
+
+    Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
+    Raises EvaluationFailedError.
     """
     finalists = candidates(directory)
     if len(finalists) < 2:
         return []
     backend, seed = spec.environment.backend, spec.training.seed + _SEEDS
     _logger.info(
-        f"{len(finalists)} checkpoints play for the best: {spec.evaluation.final_episodes} episodes each on {backend}"
+        "selecting the best of %d checkpoints: %d episodes each on %s",
+        len(finalists),
+        spec.evaluation.final_episodes,
+        backend,
     )
-    with_it = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *with_it] for each in finalists], stopping, streams)
+    options = [*options, "--backend", backend, "--seed", str(seed)]
+    results = play([[str(each.directory), *options] for each in finalists], stopping, streams)
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
         before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
-        _logger.info(f"  policy version {version}: {mean:.1f} +- {std:.1f}{before}")
+        _logger.info("  policy version %d: %.1f +- %.1f%s", version, mean, std, before)
         try:
             candidate.rescore(mean)
         except OSError as error:
-            _logger.info(f"  which could not be written down ({error.strerror})")
+            _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror)
         scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 
 
 def play(commands: list[list[str]], stopping: threading.Event, streams: Streams = INHERITED) -> list[dict[str, Any]]:
-    """Runs `daedalus evaluate`, once for each list of words, beside one another; their results.
+    """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
 
     Raises EvaluationFailedError.
     """
     with ExitStack() as stack:
         outputs = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
-        # The first tells how far it is, for all of them; what the others say is for when they fail.
+        # The first evaluation shows its progress. The output of the others is shown if they fail.
         others = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands[1:]]
         processes: list[subprocess.Popen[bytes]] = []
         try:
-            for words, output, error in zip(commands, outputs, [streams.stderr, *others], strict=True):
-                processes.append(_start_evaluation(words, output, error))
+            for arguments, output, error in zip(commands, outputs, [streams.stderr, *others], strict=True):
+                processes.append(_start_evaluation(arguments, output, error))
             while any(process.poll() is None for process in processes) and not stopping.wait(_POLL_SECONDS):
                 pass
         finally:
@@ -82,8 +92,8 @@ def play(commands: list[list[str]], stopping: threading.Event, streams: Streams 
         errors = [None, *others]
         failed = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
         if failed:
-            said = [] if stopping.is_set() else [_text(error) for error in failed if error is not None]
-            raise EvaluationFailedError("".join(said))
+            printed = [] if stopping.is_set() else [_text(error) for error in failed if error is not None]
+            raise EvaluationFailedError("".join(printed))
         for output in outputs:
             output.seek(0)
         results = [json.load(output) for output in outputs]
@@ -93,9 +103,11 @@ def play(commands: list[list[str]], stopping: threading.Event, streams: Streams 
     return results
 
 
-def _start_evaluation(words: list[str], output: IO[bytes], error: IO[bytes] | int | None) -> subprocess.Popen[bytes]:
+def _start_evaluation(
+    arguments: list[str], output: IO[bytes], error: IO[bytes] | int | None
+) -> subprocess.Popen[bytes]:
     program = [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate"]
-    command = [*program, *words, "--json", "--exit-with-parent"]
+    command = [*program, *arguments, "--json", "--exit-with-parent"]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=error)
 
 

@@ -1,4 +1,4 @@
-"""The settings half of a command line: what `daedalus train` and `daedalus learner` both take."""
+"""Options of a run's settings, which `daedalus train` and `daedalus learner` share, and the options of the learner."""
 
 import argparse
 from pathlib import Path
@@ -14,8 +14,8 @@ from daedalus.protocol.spec import RunSpec
 LISTEN = "tcp/127.0.0.1:7447"
 
 DESCRIPTION = """\
-Owns the weights: takes rollouts from actors, learns, publishes snapshots. Embeds a Zenoh router that actors
-connect to, unless told to use another."""
+Owns the weights of a run. Receives rollouts from actors, trains on them, and publishes snapshots of the weights. Actors
+connect to a Zenoh router inside this process. With --connect, the learner uses another router instead."""
 
 EXAMPLES = """\
 examples:
@@ -24,19 +24,22 @@ examples:
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
   daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
   daedalus learner cartpole --connect tcp/router:7447
-  daedalus learner cartpole --run-dir runs/mine --resume      (from systemd or Kubernetes: the same line each time)"""
+  daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
+
+exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
+before the target, 1 failed or stopped early, 2 bad usage"""
 
 
 def add_settings(options: argparse.ArgumentParser) -> None:
-    """Adds what decides the run: a preset or an environment, and what departs from it."""
+    """Add the options that define a run: a preset or an environment, and changes to its settings."""
     options.add_argument(
         "preset",
         nargs="?",
         metavar="PRESET",
-        help=f"{', '.join(preset_names())}, or a TOML file such as a run's config.toml",
+        help=f"{', '.join(preset_names())}, or a TOML file such as the config.toml of a run",
     )
     options.add_argument(
-        "--env", metavar="ID", help="any gymnasium environment with default settings; module:Id for your own"
+        "--env", metavar="ID", help="any gymnasium environment, with default settings. Write module:Id for your own"
     )
     options.add_argument(
         "--algorithm",
@@ -47,24 +50,22 @@ def add_settings(options: argparse.ArgumentParser) -> None:
         "--actors",
         type=int,
         metavar="N",
-        help="actor processes (the learner alone starts none, but a2c waits for as many)",
+        help="number of actor processes. `daedalus learner` starts none, but a2c waits for this number",
     )
-    options.add_argument("--seed", type=int, metavar="S", help="of the network, the environments and the actions")
-    options.add_argument("--env-steps", type=int, metavar="N", help="the budget, in environment steps over all actors")
-    options.add_argument(
-        "--run-dir", type=Path, metavar="DIR", help="where the run goes (default: a new folder in runs/)"
-    )
+    options.add_argument("--seed", type=int, metavar="S", help="seed of the network, the environments and the actions")
+    options.add_argument("--env-steps", type=int, metavar="N", help="budget: environment steps of all actors together")
+    options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     options.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="SECTION.KEY=VALUE",
-        help="any other setting, such as training.learning_rate=0.001; config.toml of a run lists them all",
+        help="any other setting, such as training.learning_rate=0.001. The config.toml of a run lists all settings",
     )
 
 
 def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
-    """The specification and the run directory that the arguments ask for. Raises SettingsError."""
+    """Return the specification and the run directory that the arguments define. Raises SettingsError."""
     settings = chosen_settings(
         arguments.preset,
         arguments.env,
@@ -104,45 +105,48 @@ def named_directory(preset: str | None, spec: RunSpec) -> Path:
     return run_directory.default_directory(Path(preset).stem if preset else spec.environment.id, spec)
 
 
-def resolve_again(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
-    """The same for `daedalus learner --resume`, and whether its run was begun before. Raises SettingsError."""
+def resolve_to_resume(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
+    """Return specification, run directory and whether the run exists already, for `daedalus learner --resume`.
+
+    Raises SettingsError.
+    """
     if arguments.run_dir is None:
-        raise SettingsError("--resume needs --run-dir: the folder of the run to begin or to go on with")
+        raise SettingsError("--resume needs --run-dir DIR: name the directory of the run to start or to continue")
     if not (arguments.run_dir / run_directory.CONFIG).exists():
         return *resolve(arguments), False
     spec = run_directory.read_config(arguments.run_dir)
     if (arguments.preset is not None or arguments.env is not None) and resolve(arguments)[0] != spec:
         raise SettingsError(
-            f"{arguments.run_dir} was begun with other settings: leave them out to go on with its own, "
-            "or name another --run-dir"
+            f"the run in {arguments.run_dir} has other settings: leave out PRESET, --env and all "
+            "settings to continue it, or name another --run-dir"
         )
     return spec, arguments.run_dir, True
 
 
 def learner_parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus learner` takes."""
+    """Return the parser of `daedalus learner`."""
     options = command_parser("learner", DESCRIPTION, EXAMPLES)
     add_settings(options)
-    where = options.add_mutually_exclusive_group()
-    where.add_argument(
-        "--listen", action="append", metavar="tcp/HOST:PORT", help=f"where actors connect (default: {LISTEN})"
+    addresses = options.add_mutually_exclusive_group()
+    addresses.add_argument(
+        "--listen", action="append", metavar="tcp/HOST:PORT", help=f"address where actors connect (default: {LISTEN})"
     )
-    where.add_argument(
+    addresses.add_argument(
         "--connect",
         action="append",
         metavar="tcp/HOST:PORT",
-        help="use the Zenoh router there instead of an own one",
+        help="address of a Zenoh router to use instead of the one inside this process",
     )
     options.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the newest checkpoint in --run-dir if there is one, else begin there: "
-        "for a supervisor that starts the same command again",
+        help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
+        "For a supervisor that repeats the same command",
     )
     add_tls(options)
     add_insecure(options)
     add_logging(options)
-    # What the launcher says to the learner it starts: a directory with config.toml that is there already.
+    # Options for `daedalus train`, which has created the run directory and its config.toml.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)

@@ -1,4 +1,4 @@
-"""Starts processes, restarts those that die, ends them all. Leaves none behind."""
+"""Supervision of child processes: start them, restart them if they die, and end all of them."""
 
 import os
 import subprocess
@@ -10,25 +10,25 @@ from dataclasses import dataclass, field
 
 from daedalus.cli.child_output import INHERITED, Streams
 
-_MOST_FAILURES = 3  # of one process's own doing, by exit status
-_SOON_SECONDS = 60.0  # a failure later than that after its start begins the count anew
-_MOST_RESTARTS = 1000  # of one process killed from outside
-_LEAVING_SECONDS = 10.0  # from the end of a process's work to that of all the others'
+_MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
+_SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
+_MOST_RESTARTS = 1000  # of one process that is killed by signals
+_LEAVING_SECONDS = 10.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
 
-# Where there are fewer cores than processes, the learner comes first: it is the one that all others wait for.
-_ACTORS_NICENESS = 5  # beyond the learner's
+# With fewer cores than processes, the learner runs first, because all actors wait for it.
+_ACTORS_NICENESS = 5  # added to the niceness of the learner
 
-# An actor has one core at most: pools of threads in its libraries would only spin on everybody else's.
+# An actor uses one core. Thread pools of its libraries would take time on the cores of other processes.
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 def start(
     module: str, *arguments: str, one_thread: bool = False, streams: Streams = INHERITED
 ) -> subprocess.Popen[bytes]:
-    """Starts `python -m module` with its own end of a pipe as standard input.
+    """Start `python -m module` with a pipe as its standard input.
 
-    The pipe closes when this process is gone, however it went, and the child then ends by itself.
+    The pipe closes when this process ends for any reason, and the child process then ends by itself.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
@@ -40,18 +40,18 @@ def start(
 
 
 class FailedError(Exception):
-    """A process failed too often."""
+    """Error of a process that failed too often."""
 
 
 @dataclass(slots=True)
 class Supervised:
-    """A process that is started again when it dies before its work is over."""
+    """Process that is restarted when it dies before its work is done."""
 
     name: str
-    begin: Callable[[bool], subprocess.Popen[bytes]]  # starts it; told whether it is the first time
-    ended: Set[int]  # exit statuses that say that its work is over
+    begin: Callable[[bool], subprocess.Popen[bytes]]  # starts the process; the argument is True for the first start
+    ended: Set[int]  # exit statuses that mean that the work is done
     restarts: int = 0
-    failures: int = 0  # in a row, of its own doing, each soon after its start
+    failures: int = 0  # in a row, by exit status, each soon after the start
     process: subprocess.Popen[bytes] = field(init=False)
     _started: float = field(init=False)
     _ended_at: float | None = None
@@ -67,16 +67,16 @@ class Supervised:
 
     @property
     def failed_at_once(self) -> bool:
-        """Whether its first life ended by a failure of its own, soon: to start it again would change nothing."""
+        """Whether the first process failed soon after its start, so that a restart would not help."""
         status = self.process.poll()
         failed = status is not None and status > 0 and status not in self.ended
         return failed and self.restarts == 0 and time.monotonic() - self._started < _SOON_SECONDS
 
     def check(self) -> str | None:
-        """Restarts the process if it died; returns what there is to say about that.
+        """Restart the process if it died, and return a message about the restart, or None.
 
-        Where its work is over and yet the others go on, it was told so by a learner that has come back since.
-        Raises FailedError if it failed by itself too often, soon after its start each time.
+        A process whose work is done is restarted if the other processes continue: a learner has been restarted since.
+        Raises FailedError if the process failed too often, soon after each start.
         """
         status, now = self.process.poll(), time.monotonic()
         if status is None:
@@ -86,12 +86,12 @@ class Supervised:
             if now < self._ended_at + _LEAVING_SECONDS:
                 return None
             self._start(first=False)
-            return f"{self.name} had left; started again"
+            return f"{self.name} ended before the run; started again"
         if status > 0:
             lived = now - self._started
             self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
         if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
-            raise FailedError(f"{self.name} failed {self.failures} times; its error is above")
+            raise FailedError(f"{self.name} failed {self.failures} times; see the error above")
         self.restarts += 1
         self._start(first=False)
         how = f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
@@ -101,12 +101,12 @@ class Supervised:
 def supervised_actor(
     name: str, connect: str, options: tuple[str, ...] = (), streams: Streams = INHERITED
 ) -> Supervised:
-    """An actor, or the evaluator, under supervision."""
+    """Start an actor, or the evaluator, under supervision."""
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
-        arguments = ["--connect", connect, "--name", name, "--log-level", "warning", *options]
+        arguments = ["--connect", connect, "--name", name, *options]
         process = start("daedalus.cli.commands.actor", *arguments, one_thread=True, streams=streams)
-        with suppress(AttributeError, OSError):  # not everywhere, and it may be gone already
+        with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
             os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
         return process
@@ -115,7 +115,7 @@ def supervised_actor(
 
 
 def stop(processes: list[subprocess.Popen[bytes]]) -> None:
-    """Ends processes: asks them all, waits, then kills those that are left."""
+    """End processes: send SIGTERM to all, wait, then kill those that are left."""
     for process in processes:
         if process.poll() is None:
             process.terminate()

@@ -1,4 +1,4 @@
-"""`daedalus.train`: what `daedalus train` does, as a function."""
+"""`daedalus.train`: the command `daedalus train` as a function."""
 
 import logging
 import sys
@@ -18,27 +18,27 @@ from daedalus.learner.run.settings import SettingsError, assign, run_spec
 
 
 class TrainingError(Exception):
-    """Training did not finish; the message holds the reason as the failed process printed it."""
+    """Error of a training that did not finish. The message holds what the failed process printed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
-    """How a run ended, from its summary.json."""
+    """Result of a run, from its summary.json."""
 
     directory: Path
     solved: bool  # the target return was reached
     finished: bool  # solved, or the budget is used up
-    exit_status: int  # of `daedalus train`: 0 target reached or asked-for steps done, 3 budget ended without the target
+    exit_status: int  # as of `daedalus train`: 0, or 3 if the budget was used up before the target
     env_steps: int
     updates: int
     episodes: int
-    episode_return_mean: float | None  # of the newest training episodes; None if none has ended
+    episode_return_mean: float | None  # mean of the newest training episodes; None if none has ended
     evaluation_return_mean: float  # over evaluation.final_episodes episodes of the best policy
     evaluation_return_std: float
     wall_seconds: float  # training, without the final evaluation
     seconds_to_target: float | None
     env_steps_per_second: float
-    summary: Mapping[str, Any]  # all of summary.json
+    summary: Mapping[str, Any]  # the whole summary.json
 
 
 def train(
@@ -54,24 +54,24 @@ def train(
     wrap: str | None = None,
     quiet: bool = False,
 ) -> RunResult:
-    """Train with a learner and actors as processes of this machine, evaluate the result, and return it.
+    """Train with a learner and actors as processes of this machine, evaluate the policy, and return the result.
 
-    Works from any thread and in notebooks. An exception in this function, such as the KeyboardInterrupt of Ctrl-C, ends
-    the processes; the learner saves a checkpoint first, from which `daedalus resume` continues.
+    Works in any thread and in notebooks. An exception in this function, such as the KeyboardInterrupt of Ctrl-C, ends
+    the processes. The learner saves a checkpoint before it ends, and `daedalus resume` continues from it.
 
     Args:
       preset: a preset such as "cartpole", or the path of a TOML file such as a run's config.toml.
-      env: any gymnasium environment with default settings, in place of a preset; "module:Id" for your own.
+      env: any gymnasium environment with default settings, instead of a preset; "module:Id" for your own.
       algorithm: "a2c", "a3c", "impala" or "appo".
       actors: number of actor processes.
-      seed: of the network, the environments and the actions.
-      env_steps: the budget, in environment steps over all actors.
+      seed: seed of the network, the environments and the actions.
+      env_steps: budget, the environment steps of all actors together.
       run_dir: a new directory for the run (default: a new folder in runs/).
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       quiet: print nothing.
 
-    Raises SettingsError for settings that make no run, TrainingError if a process failed.
+    Raises SettingsError for invalid settings, TrainingError if a process failed.
     """
     started = time.monotonic()
     chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors)
@@ -88,7 +88,7 @@ def train(
 
 
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
-    """Run to the end, with the output of the child processes passed on to this process's streams."""
+    """Run to the end, and pass the output of the child processes on to this process's streams."""
 
     def pass_on(line: str, stream: TextIO) -> None:
         if not quiet:
@@ -96,7 +96,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
             stream.flush()
 
     failure: RunFailedError | None = None
-    out, err = sys.stdout, sys.stderr  # a notebook replaces them; they are this cell's now
+    out, err = sys.stdout, sys.stderr  # a notebook replaces these streams for each cell
     output = CollectedOutput(lambda line: pass_on(line, out))
     errors = CollectedOutput(lambda line: pass_on(line, err))
     try:
@@ -108,7 +108,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
     finally:
         output.close()
         printed = errors.close()
-    # A process that is started again fails with the same words.
+    # A restarted process fails with the same message.
     reasons = dict.fromkeys(f"{printed}\n{failure}".strip().splitlines())
     raise TrainingError("\n".join(reasons) or f"the learner ended with status {failure.status}")
 

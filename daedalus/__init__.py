@@ -1,6 +1,6 @@
-"""Actor-critic reinforcement learning with one learner and any number of actors, anywhere.
+"""Actor-critic reinforcement learning with one learner and any number of actors, on any machines.
 
-The public API; each name is imported when it is first used, so that `import daedalus` itself loads no other package:
+This is the public API. Each name is imported when it is first used, so `import daedalus` loads no other package:
 
     result = daedalus.train("cartpole")
     policy = daedalus.load_policy(result.directory)

@@ -1,4 +1,4 @@
-"""A CA of a test's own, with an identity of every kind."""
+"""Certificates for tests: a CA, and certificates for each role."""
 
 import datetime
 from pathlib import Path
@@ -10,14 +10,14 @@ from daedalus.transport.credentials import Credentials
 
 
 def make_certificates(directory: Path) -> Path:
-    """What `daedalus certs` makes for the actors arm and box."""
+    """Create a CA and certificates with `daedalus certs`, with the actors arm and box; return the folder."""
     assert certs(["init", str(directory)]) == 0
     assert certs(["issue", "actor", "arm", "box", "--directory", str(directory)]) == 0
     return directory
 
 
 def issue_expired(directory: Path, role: str, name: str = "") -> Path:
-    """A folder like the others, whose certificate was good until yesterday."""
+    """Create a folder whose certificate expired yesterday, and return it."""
     folder = directory / f"expired-{role}"
     hosts = [] if name else ["localhost", "127.0.0.1"]
     authority = CertificateAuthority(directory / "ca")
@@ -27,5 +27,5 @@ def issue_expired(directory: Path, role: str, name: str = "") -> Path:
 
 
 def unchecked(folder: Path, role: str = "actor", name: str = "arm") -> Credentials:
-    """As somebody would use it who does not look at it first."""
+    """Return credentials whose files were not checked."""
     return Credentials(folder, role, name)

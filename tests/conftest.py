@@ -1,4 +1,4 @@
-"""Fixtures for tests of whole processes."""
+"""Fixtures for tests with processes."""
 
 import socket
 import sys
@@ -18,7 +18,7 @@ def _log_lines() -> Iterator[None]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
-    """Starts `daedalus ARGUMENTS` in the test's folder; whatever still runs is killed afterwards."""
+    """Function that starts `daedalus ARGUMENTS` in the folder of the test. Processes left are killed at the end."""
     running: list[Running] = []
 
     def start_one(*arguments: object, directory: Path = tmp_path) -> Running:
@@ -33,7 +33,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
 
 @pytest.fixture
 def address() -> str:
-    """A loopback address that nobody listens on."""
+    """Return a loopback address that no process listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""An environment that counts, so that a row in the wrong place shows."""
+"""Environment whose observations and rewards count steps, so that a misplaced row is visible."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ import numpy as np
 
 
 class Counting(gymnasium.Env[np.ndarray, np.int64]):
-    """Observation: [episode, step]. Reward: 10 * episode + step + action / 10. Ends at a fixed step.
+    """Environment that counts. Observation: [episode, step]. Reward: 10 * episode + step + action / 10.
 
-    `ends` says how each episode ends in turn: a positive number terminates it after so many steps, a negative one
-    truncates it.
+    `ends` lists the lengths of the episodes in turn. A positive number terminates the episode after this number of
+    steps; a negative number truncates it.
     """
 
     def __init__(self, ends: tuple[int, ...] = (3, -2, 1)) -> None:

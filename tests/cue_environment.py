@@ -1,6 +1,6 @@
-"""A small task of memory: a cue at the start decides which action is rewarded at the end.
+"""Small memory task: a cue at the start of an episode decides which action is rewarded at its end.
 
-Importing it registers `Cue-v0`, so processes started in this folder can be told to play `cue_environment:Cue-v0`.
+Importing this module registers `Cue-v0`. Processes started in this folder can play `cue_environment:Cue-v0`.
 """
 
 from typing import Any
@@ -8,11 +8,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-LENGTH = 6  # steps from the cue to the answer, both included
+LENGTH = 6  # steps from the cue to the rewarded action, both included
 
 
 class CueEnvironment(gymnasium.Env):
-    """Shows [cue, 0] once, then [0, 0], last [0, 1]: the action that is then the cue's earns 1, the other -1."""
+    """Environment that shows [cue, 0], then [0, 0], last [0, 1]. The last action earns 1 if it is the cue, else -1."""
 
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)

@@ -1,4 +1,4 @@
-"""What goes wrong out there, made here: a link that stalls, and a sender that is no actor of ours."""
+"""Faults for tests: connections that stall or are slow, and a sender of arbitrary rollouts."""
 
 import contextlib
 import queue
@@ -24,12 +24,12 @@ ANSWER_SECONDS = 60.0
 
 
 def port_of(address: str) -> int:
-    """Of tcp/HOST:PORT."""
+    """Return the port of tcp/HOST:PORT."""
     return int(address.rsplit(":", 1)[1])
 
 
 class StallingProxy:
-    """Forwards TCP connections to an address, until it is told to stall: then all stay open and nothing moves."""
+    """TCP proxy that can stall: the connections then stay open and no byte is forwarded."""
 
     def __init__(self, target: str) -> None:
         self._target = port_of(target)
@@ -42,15 +42,15 @@ class StallingProxy:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def stall(self) -> None:
-        """Half-open from now on, as when a cable is pulled: no byte, no error; new connections are not served."""
+        """Stop forwarding without an error, as if a cable was pulled. New connections are not served either."""
         self._flowing.clear()
 
     def resume(self) -> None:
-        """Lets everything flow that was held back."""
+        """Forward all bytes again, also those that were held back."""
         self._flowing.set()
 
     def close(self) -> None:
-        """Ends all connections."""
+        """Close all connections."""
         self._closed = True
         self._flowing.set()
         for each in [self._listener, *self._sockets]:
@@ -89,10 +89,10 @@ class StallingProxy:
 
 
 class SlowProxy:
-    """A TCP proxy before a port of this machine that carries so many bytes a second each way, each so much later."""
+    """TCP proxy with a limited rate in each direction and a delay."""
 
     def __init__(self, target: str, *, up: float, down: float, delay: float) -> None:
-        """`up` and `down` in bytes a second, `delay` in seconds each way."""
+        """Start the proxy. `up` and `down` are in bytes per second, `delay` in seconds in each direction."""
         self._target, self._rates, self._delay = port_of(target), {"up": up, "down": down}, delay
         self.carried = {"up": 0, "down": 0}  # bytes
         self._sockets: list[socket.socket] = []
@@ -116,7 +116,7 @@ class SlowProxy:
                 continue
             self._sockets += (near, far)
             for way, source, sink in (("up", near, far), ("down", far, near)):
-                # Buffers as small as a slow link's own: else the first megabytes would seem to have passed at once.
+                # Small buffers, as on a slow link: larger ones would take the first megabytes at once.
                 source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
                 passing: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
                 self._spawn(self._read, way, source, passing)
@@ -145,7 +145,7 @@ class SlowProxy:
                 sink.sendall(data)
 
     def close(self) -> None:
-        """Ends every connection."""
+        """Close all connections."""
         for end in (self._listener, *self._sockets):
             with contextlib.suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -153,7 +153,7 @@ class SlowProxy:
 
 
 class Sender:
-    """Takes part in a CartPole run under a name of its own, and sends what a test makes."""
+    """Client that joins a CartPole run as an actor and sends the rollouts of a test."""
 
     def __init__(self, address: str, name: str, environments: int = 2) -> None:
         self.transport = connect([address])
@@ -165,14 +165,13 @@ class Sender:
         self.key = keys.rollouts(self.welcome.run, name)
 
     def version(self) -> int:
-        """The newest, or 0 before there is one."""
-        newest = [
-            message for message in self._queries.newest_snapshot(self.welcome.run) if isinstance(message, Snapshot)
-        ]
+        """Return the newest policy version, or 0 before the first."""
+        messages = self._queries.newest_snapshot(self.welcome.run)
+        newest = [message for message in messages if isinstance(message, Snapshot)]
         return newest[0].policy_version if newest else 0
 
     def rollout(self, sequence: int, version: int, **changed: Any) -> bytes:
-        """An encoded rollout of plausible numbers, but for what is changed."""
+        """Return an encoded rollout of plausible values, with the given fields changed."""
         random = np.random.default_rng(sequence)
         shape = (self.welcome.spec.collection.rollout_length, self.environments)
         content: dict[str, Any] = {
@@ -196,17 +195,17 @@ class Sender:
         return encode(Rollout(identity=identity, policy_version=version, **{**content, **changed}))
 
     def poison(self, sequence: int, version: int) -> bytes:
-        """One with a nan in it."""
+        """Return an encoded rollout whose rewards are nan."""
         shape = (self.welcome.spec.collection.rollout_length, self.environments)
         return self.rollout(sequence, version, rewards=np.full(shape, np.nan, np.float32))
 
     def send(self, payload: bytes) -> Acknowledgement:
-        """Sends bytes as a rollout and waits for what becomes of them."""
+        """Send bytes as a rollout and return the answer of the learner."""
         (answer,) = self.transport.query(self.key, payload, timeout=ANSWER_SECONDS)
         message = decode(answer, Limits())
         assert isinstance(message, Acknowledgement)
         return message
 
     def close(self) -> None:
-        """Leaves."""
+        """Close the connection."""
         self.transport.close()

@@ -1,6 +1,6 @@
-"""Several hosts on this machine: network namespaces with addresses of their own, joined by cables to one switch.
+"""Several hosts on this machine: network namespaces with addresses of their own, connected to one switch.
 
-The switch has a namespace too, and nothing of the machine's own network is touched. Needs Linux, root and iproute2.
+The switch has a namespace too, so the network of the machine does not change. Needs Linux, root and iproute2.
 """
 
 import secrets
@@ -16,63 +16,63 @@ _SWITCH = "switch"
 
 
 class NoHostsError(Exception):
-    """This machine makes no such hosts; the message says why."""
+    """Error if this machine cannot create network namespaces. The message gives the reason."""
 
 
 class Host:
-    """A machine with one address, as far as the processes on it can tell."""
+    """Network namespace with one address, which its processes see as a machine of their own."""
 
     def __init__(self, network: "Network", name: str, address: str) -> None:
         self._network, self.name, self.address = network, name, address
 
     def start(self, *arguments: object) -> Running:
-        """Starts `daedalus ARGUMENTS` there."""
+        """Start `daedalus ARGUMENTS` on this host."""
         return self.run(*DAEDALUS, *arguments)
 
     def run(self, *command: object) -> Running:
-        """Starts any command there."""
+        """Start a command on this host."""
         return self._network.run(self.name, *command)
 
     def unplug(self) -> None:
-        """Pulls its cable: no byte comes or goes, and nobody is told."""
+        """Disconnect the host from the switch. Its connections get no error."""
         self._network.command(_SWITCH, "ip", "link", "set", self.name, "down")
 
     def plug_in(self) -> None:
-        """Puts the cable back."""
+        """Connect the host to the switch again."""
         self._network.command(_SWITCH, "ip", "link", "set", self.name, "up")
 
     def lose(self, other: "Host") -> None:
-        """Drops all that it sends to another, whose own still arrives."""
+        """Drop all packets that this host sends to another. Packets of the other host still arrive."""
         self._network.command(self.name, "ip", "route", "add", "blackhole", other.address)
 
     def find(self, other: "Host") -> None:
-        """Sends to the other again."""
+        """Send packets to the other host again."""
         self._network.command(self.name, "ip", "route", "del", "blackhole", other.address)
 
     def limit(self, rate: str) -> None:
-        """Lets its cable carry no more than that each way: `1mbit`."""
+        """Limit the link in both directions to a rate such as `1mbit`."""
         for place, device in ((self.name, "eth0"), (_SWITCH, self.name)):
             bucket = ("tbf", "rate", rate, "burst", "4kb", "latency", "400ms")
             self._network.command(place, "tc", "qdisc", "add", "dev", device, "root", *bucket)
 
     def reaches(self, address: str) -> bool:
-        """Whether it has a way to an address at all."""
+        """Return whether this host has a route to an address."""
         words = self._network.words(self.name, "ip", "route", "get", address)
         return subprocess.run(words, capture_output=True, check=False).returncode == 0
 
 
 class Network:
-    """A switch, and the hosts on it."""
+    """Switch and its hosts."""
 
     def __init__(self, directory: Path) -> None:
-        """Processes run in `directory`. Raises NoHostsError where this machine makes no hosts."""
+        """Create the switch. Processes run in `directory`. Raises NoHostsError."""
         self._directory = directory
-        self.mark = f"daedalus-{secrets.token_hex(4)}"  # the names of its namespaces begin with it
+        self.mark = f"daedalus-{secrets.token_hex(4)}"  # prefix of the names of its namespaces
         self._spaces: list[str] = []
         self._running: list[Running] = []
         self._hosts = 0
         if shutil.which("ip") is None or shutil.which("tc") is None:
-            raise NoHostsError("there are no ip and tc here: install iproute2")
+            raise NoHostsError("ip and tc are not installed: install iproute2")
         try:
             self._space(_SWITCH)
             self.command(_SWITCH, "ip", "link", "add", "bridge", "type", "bridge")
@@ -82,7 +82,7 @@ class Network:
             raise
 
     def host(self, name: str) -> Host:
-        """Another host on the switch."""
+        """Add a host to the switch and return it."""
         self._space(name)
         self._cable(name, "eth0", _SWITCH, name)
         self.command(_SWITCH, "ip", "link", "set", name, "master", "bridge")
@@ -92,7 +92,7 @@ class Network:
         return Host(self, name, address)
 
     def host_behind_nat(self, name: str) -> Host:
-        """One that reaches all others by a gateway, which hides it: nobody has a way to it."""
+        """Add a host that reaches the others through NAT, so that the others have no route to it."""
         gateway = self.host(f"{name}-nat")
         self._space(name)
         self._cable(name, "eth0", gateway.name, "inside")
@@ -105,20 +105,20 @@ class Network:
         return Host(self, name, "192.168.77.2")
 
     def run(self, space: str, *command: object) -> Running:
-        """Starts a command in a namespace."""
+        """Start a command in a namespace."""
         self._running.append(Running(self.words(space, *command), self._directory))
         return self._running[-1]
 
     def words(self, space: str, *command: object) -> list[str]:
-        """A command, as it is given for a namespace: the process that this starts becomes the command's own."""
+        """Return the command line that runs a command in a namespace, as the same process."""
         return ["ip", "netns", "exec", self._named(space), *map(str, command)]
 
     def command(self, space: str, *command: str) -> None:
-        """Runs a command in a namespace to its end. Raises NoHostsError if it fails."""
+        """Run a command in a namespace and wait for its end. Raises NoHostsError if it fails."""
         _run(*self.words(space, *command))
 
     def close(self) -> None:
-        """Ends all processes and takes every namespace away, and with it what is in it."""
+        """End all processes and delete all namespaces."""
         for running in self._running:
             running.end()
         for name in self._spaces:

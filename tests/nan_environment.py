@@ -1,4 +1,4 @@
-"""A simulator that is broken: from its eleventh step on it rewards with nan."""
+"""Broken environment: from the eleventh step on, its rewards are nan."""
 
 from typing import Any
 

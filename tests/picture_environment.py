@@ -1,4 +1,4 @@
-"""An environment of pixels and continuous actions that counts, and functions to wrap environments with."""
+"""Counting environment with pixels and continuous actions, and functions that wrap environments."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ import numpy as np
 
 
 class Picture(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Observation: noise, but for the first pixel, [episode, step, 0]. Reward: the sum of the action."""
+    """Environment whose observation is noise with [episode, step, 0] in the first pixel. Reward: sum of the action."""
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's own form
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - the form that gymnasium uses
 
     def __init__(self, end: int = 5, render_mode: str | None = None) -> None:
         self.observation_space = gymnasium.spaces.Box(0, 255, (6, 8, 3), np.uint8)

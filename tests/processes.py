@@ -1,4 +1,4 @@
-"""Processes under test: starting them, waiting for what they say, finding what they leave."""
+"""Processes under test: start them, wait for their output, and find processes that are left."""
 
 import os
 import re
@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-LIMIT = 120.0  # seconds that anything may take on a slow machine; nothing waits so long on a healthy one
+LIMIT = 120.0  # seconds; timeout of each step, long enough for a slow machine
 
 
 class Running:
-    """A process of the system under test, and the lines that it printed."""
+    """Process under test, and the lines that it printed."""
 
     def __init__(self, arguments: list[str], directory: Path) -> None:
         self.process = subprocess.Popen(
@@ -44,7 +44,7 @@ class Running:
         return "\n".join(self.lines)
 
     def expect(self, pattern: str) -> re.Match[str]:
-        """Waits for a line that matches."""
+        """Wait for a line that matches and return the match."""
 
         def found() -> re.Match[str] | None:
             return next((match for line in self.lines if (match := re.search(pattern, line))), None)
@@ -56,7 +56,7 @@ class Running:
         return match
 
     def wait(self) -> int:
-        """The exit status, once the process and its output have ended."""
+        """Wait for the end of the process and its output; return the exit status."""
         status = self.process.wait(LIMIT)
         self._reader.join(LIMIT)
         return status
@@ -70,15 +70,15 @@ class Running:
 
 
 def until(condition: Callable[[], object]) -> None:
-    """Waits until a condition that no event announces holds."""
+    """Check a condition repeatedly until it holds."""
     deadline = time.monotonic() + LIMIT
     while not condition():
-        assert time.monotonic() < deadline, "it never came true"
+        assert time.monotonic() < deadline, f"the condition did not hold within {LIMIT:g} s"
         time.sleep(0.05)
 
 
 def processes_mentioning(text: str) -> list[int]:
-    """The ids of all processes, but this one, whose command line holds `text`."""
+    """Return the ids of all other processes whose command line contains `text`."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():

@@ -1,4 +1,4 @@
-"""Run directories with checkpoints in them, as a learner would have saved them."""
+"""Run directories with checkpoints, as a learner saves them."""
 
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ def save(
     weights_seed: int = 5,
     **spec: Any,
 ) -> Path:
-    """A run with these checkpoints, all of the same untrained policy but with a taste for all actions."""
+    """Save a run with checkpoints of one untrained policy that takes all actions; return the run directory."""
     made = make_environments(environment, 1)
     made.close()
     run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
@@ -57,6 +57,6 @@ def save(
 
 
 def score(run: Path, score: float, version: int) -> Path:
-    """As if an evaluation had found this."""
+    """Rename a checkpoint as an evaluation with this score does; return its folder."""
     directory = run / "checkpoints" / f"{version:010d}"
     return directory.rename(directory.with_name(best_name(score, version)))

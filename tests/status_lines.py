@@ -1,6 +1,6 @@
-"""What a learner's status tells, line by line: `python tests/status_lines.py tcp/HOST:PORT` until it is killed.
+"""Program that prints the status of a learner repeatedly: `python tests/status_lines.py tcp/HOST:PORT`.
 
-An empty line each time that no learner answers.
+Each line is one JSON object, or empty if no learner answers. The program runs until it is killed.
 """
 
 import sys

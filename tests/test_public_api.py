@@ -1,4 +1,4 @@
-"""`import daedalus`: the names that it offers, `daedalus.train` and `daedalus.load_policy`."""
+"""Test of the public API: `import daedalus`, `daedalus.train` and `daedalus.load_policy`."""
 
 import ast
 import inspect
@@ -27,7 +27,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError, find_policy, pret
 BUDGET = {"env_steps": 20_000, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
 
 
-def test_importing_it_loads_no_other_package() -> None:
+def test_importing_daedalus_loads_no_other_package() -> None:
     program = "import sys; before = set(sys.modules); import daedalus; print(*sys.modules.keys() - before)"
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     loaded = set(output.split()) - {"daedalus"}
@@ -35,7 +35,7 @@ def test_importing_it_loads_no_other_package() -> None:
 
 
 @pytest.mark.parametrize("name", daedalus.__all__)
-def test_each_name_is_there_documented_and_declared_for_type_checkers(name: str) -> None:
+def test_each_public_name_is_documented_and_declared_for_type_checkers(name: str) -> None:
     value = getattr(daedalus, name)
     assert name in dir(daedalus)
     if name != "__version__":
@@ -45,7 +45,7 @@ def test_each_name_is_there_documented_and_declared_for_type_checkers(name: str)
     assert name in names | {"__version__"}
 
 
-def test_the_version_is_the_distributions() -> None:
+def test_the_version_is_that_of_the_distribution() -> None:
     assert daedalus.__version__ == version("daedalus-rl")
 
 
@@ -57,7 +57,7 @@ def test_an_unknown_name_is_refused() -> None:
 # ------------------------------------------------------------------------------------------------ train
 
 
-def test_train_returns_the_result_from_any_thread(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_train_returns_the_result_in_another_thread(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     results: list[daedalus.RunResult] = []
     directory = tmp_path / "from-a-thread"
@@ -67,7 +67,7 @@ def test_train_returns_the_result_from_any_thread(tmp_path: Path, capfd: pytest.
     thread.join()
     (result,) = results
     summary = json.loads((directory / "summary.json").read_text())
-    assert (result.directory, result.exit_status) == (directory, 3)  # the budget ended without the target
+    assert (result.directory, result.exit_status) == (directory, 3)  # the budget was used up before the target
     assert (result.solved, result.finished) == (False, True)
     assert result.env_steps == summary["env_steps"] >= 20_000
     assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
@@ -80,14 +80,14 @@ def test_train_returns_the_result_from_any_thread(tmp_path: Path, capfd: pytest.
     assert policy.policy_version == result.updates
 
 
-def test_train_passes_the_output_of_its_processes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_prints_the_output_of_its_processes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = daedalus.train(env="CartPole-v1", **BUDGET, run_dir=tmp_path / "run")
-    assert (result.exit_status, result.solved) == (0, False)  # no target: the asked-for steps were done
+    assert (result.exit_status, result.solved) == (0, False)  # no target: all steps were done
     assert "env_steps" in capsys.readouterr().out  # printed by the learner
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_train_prints_its_own_records_unless_quiet(tmp_path: Path, quiet: bool) -> None:
+def test_train_prints_its_log_records_unless_quiet(tmp_path: Path, quiet: bool) -> None:
     settings = {**BUDGET, "env": "CartPole-v1", "run_dir": "run", "quiet": quiet}
     program = f"import daedalus, logging; daedalus.train(**{settings}); print(logging.getLogger('daedalus').handlers)"
     output = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -98,7 +98,7 @@ def test_train_prints_its_own_records_unless_quiet(tmp_path: Path, quiet: bool) 
     assert not output.stderr or not quiet
 
 
-def test_train_tells_why_it_failed(tmp_path: Path) -> None:
+def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
     with pytest.raises(daedalus.TrainingError) as failed:
         daedalus.train(env="CartPole-v9", run_dir=tmp_path / "run", quiet=True)
     lines = str(failed.value).splitlines()
@@ -116,7 +116,7 @@ def test_train_tells_why_it_failed(tmp_path: Path) -> None:
         ({"preset": "cartpole", "run_dir": "."}, "run directory . exists"),
     ],
 )
-def test_settings_that_make_no_run_are_refused(arguments: dict, message: str) -> None:
+def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(daedalus.SettingsError) as refused:
         daedalus.train(**arguments)
     assert str(refused.value).startswith(message)
@@ -143,7 +143,7 @@ def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
 
 
 def play(policy: daedalus.Policy, environment: gymnasium.Env, seed: int, steps: int = 10_000) -> float:
-    """The return of one episode in a plain gymnasium loop."""
+    """Play one episode in a plain gymnasium loop and return its return."""
     observation, _ = environment.reset(seed=seed)
     policy.reset()
     total = 0.0
@@ -157,7 +157,7 @@ def play(policy: daedalus.Policy, environment: gymnasium.Env, seed: int, steps: 
 
 
 def evaluated(directory: Path, seed: int) -> tuple[float, int]:
-    """The return of one episode by the evaluation, and the seed of its environment."""
+    """Evaluate one episode; return its return and the seed of its environment."""
     saved = find_policy(directory)
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
@@ -170,7 +170,7 @@ def evaluated(directory: Path, seed: int) -> tuple[float, int]:
 
 
 @pytest.mark.parametrize("memory", ["none", "gru"])
-def test_a_loaded_policy_plays_as_the_evaluation_does(tmp_path: Path, memory: str) -> None:
+def test_a_loaded_policy_gets_the_returns_of_the_evaluation(tmp_path: Path, memory: str) -> None:
     save(tmp_path, CARTPOLE, 7, policy={"hidden": (16,), "memory": memory, "memory_units": 8})
     policy = daedalus.load_policy(tmp_path)
     assert (policy.policy_version, policy.spec.environment.id) == (7, "CartPole-v1")
@@ -182,10 +182,10 @@ def test_a_loaded_policy_plays_as_the_evaluation_does(tmp_path: Path, memory: st
     assert len(set(returns)) > 1
 
 
-def test_the_shipped_policy_drives_gymnasiums_car() -> None:
+def test_the_pretrained_policy_plays_gymnasiums_car_racing() -> None:
     policy = daedalus.load_policy(pretrained="car_racing")
     environment = policy.spec.environment
-    assert environment.action_repeat * environment.frame_stack > 1  # what the policy itself has to keep
+    assert environment.action_repeat * environment.frame_stack > 1  # state that the policy keeps itself
     limit = 60
     own = environment.as_evaluated("gymnasium").model_copy(update={"max_episode_steps": limit, "processes": False})
     saved = find_policy(pretrained("car_racing"))
@@ -202,7 +202,7 @@ def test_the_shipped_policy_drives_gymnasiums_car() -> None:
     assert play(policy, car, seed) == pytest.approx(expected, abs=1e-3)
 
 
-def test_frames_are_stacked_and_forgotten_at_a_reset(tmp_path: Path) -> None:
+def test_stacked_frames_are_cleared_by_reset(tmp_path: Path) -> None:
     save(tmp_path, COUNTING, 1)
     policy = daedalus.load_policy(tmp_path)
     space = policy.observation_space
@@ -212,7 +212,7 @@ def test_frames_are_stacked_and_forgotten_at_a_reset(tmp_path: Path) -> None:
     assert [policy.act(observation) for observation in observations] == actions
 
 
-def test_sampled_actions_follow_a_seed(tmp_path: Path) -> None:
+def test_sampled_actions_depend_on_the_seed(tmp_path: Path) -> None:
     save(tmp_path, CARTPOLE, 1)
     policy = daedalus.load_policy(tmp_path)
     observation = np.zeros(4, np.float32)
@@ -225,7 +225,7 @@ def test_sampled_actions_follow_a_seed(tmp_path: Path) -> None:
     assert len(set(sampled(1))) == 2
 
 
-def test_spaces_may_be_given_in_place_of_the_environment(tmp_path: Path) -> None:
+def test_load_policy_accepts_spaces_instead_of_the_environment(tmp_path: Path) -> None:
     save(tmp_path, CARTPOLE, 1)
     space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float64)
     policy = daedalus.load_policy(tmp_path, observation_space=space, action_space=gymnasium.spaces.Discrete(2, start=5))
@@ -234,7 +234,7 @@ def test_spaces_may_be_given_in_place_of_the_environment(tmp_path: Path) -> None
         daedalus.load_policy(tmp_path, observation_space=space, action_space=gymnasium.spaces.Discrete(3))
 
 
-def test_what_cannot_be_loaded_is_refused(tmp_path: Path) -> None:
+def test_invalid_arguments_of_load_policy_and_act_are_refused(tmp_path: Path) -> None:
     save(tmp_path, CARTPOLE, 1)
     with pytest.raises(ValueError, match="either a run directory or a pretrained policy"):
         daedalus.load_policy()

@@ -1,4 +1,4 @@
-"""The arrows between the packages, and what nothing that is read may do."""
+"""Test of the structure: which package imports which, and that no code executes what it reads."""
 
 import ast
 import subprocess
@@ -39,27 +39,27 @@ def imported(tree: ast.Module) -> set[str]:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_packages_import_along_the_arrows_only(package: str) -> None:
+def test_a_package_imports_only_the_allowed_packages(package: str) -> None:
     for path, tree in sources(package):
         ours = {name.split(".")[1] for name in imported(tree) if name.startswith("daedalus.")}
         assert ours <= ALLOWED[package], path
 
 
 def test_no_file_imports_a_package_by_its_folder() -> None:
-    """A package imported by its folder's name would exist twice, and anything else may bear that name."""
+    """A package that is imported by the name of its folder would exist twice, and other packages may have that name."""
     for folder in (*PACKAGES, "tests", "benchmarks", "examples"):
         for path, tree in sources(folder):
             top_level = {name.split(".")[0] for name in imported(tree)}
             assert not top_level & {*PACKAGES, "launch"}, path
 
 
-def test_zenoh_is_imported_only_in_its_own_files_of_the_transport() -> None:
+def test_only_the_zenoh_files_of_the_transport_import_zenoh() -> None:
     users = {path.name for package in PACKAGES for path, tree in sources(package) if "zenoh" in imported(tree)}
     assert users == {"zenoh_transport.py", "zenoh_session.py", "zenoh_callbacks.py"}
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_nothing_that_executes_what_it_reads_is_used(package: str) -> None:
+def test_no_file_uses_a_function_that_executes_its_input(package: str) -> None:
     for path, tree in sources(package):
         assert not {name.split(".")[0] for name in imported(tree)} & EXECUTING, path
         for node in ast.walk(tree):
@@ -67,8 +67,8 @@ def test_nothing_that_executes_what_it_reads_is_used(package: str) -> None:
                 assert ast.unparse(node.func) not in {"eval", "exec", "torch.load", "yaml.load", "np.load"}, path
 
 
-def test_nothing_is_decided_by_the_time_of_day() -> None:
-    """Which may be set at any time; it only dates TensorBoard's events and certificates, and names run directories."""
+def test_no_decision_depends_on_the_system_clock() -> None:
+    """The system clock may change at any time. It dates events, records and certificates, and names directories."""
     wall = {"time.time", "time.time_ns", "time.strftime", "datetime.now", "datetime.datetime.now"}
     users = {
         (path.name, ast.unparse(node.func))
@@ -79,9 +79,9 @@ def test_nothing_is_decided_by_the_time_of_day() -> None:
     }
     assert users == {
         ("tensorboard_writer.py", "time.time"),
-        ("logs.py", "time.strftime"),  # only dates log records
+        ("logs.py", "time.strftime"),  # dates log records
         ("run_directory.py", "time.strftime"),
-        ("certificate_authority.py", "datetime.datetime.now"),  # certificates are good from one day to another
+        ("certificate_authority.py", "datetime.datetime.now"),  # certificates are valid between two dates
     }
 
 

@@ -1,4 +1,4 @@
-"""The distributions: what is in them, and that they work beside packages and scripts with the same names as ours."""
+"""Test of wheel and sdist: their files, and use beside packages and scripts of the same names."""
 
 import os
 import shutil
@@ -21,7 +21,7 @@ RAISES = "raise ImportError('this is not the package that Daedalus means')\n"
 
 
 def run(*words: str | Path, folder: Path) -> str:
-    """Runs a command without this repository on the path; returns its output."""
+    """Run a command without this repository on the path and return its output."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     result = subprocess.run(
         words, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
@@ -32,7 +32,7 @@ def run(*words: str | Path, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the source tree with its links: building leaves files behind."""
+    """Copy the source tree with its links, because a build leaves files in it."""
     copy = tmp_path_factory.mktemp("source") / "tree"
     shutil.copytree(ROOT / "daedalus", copy / "daedalus", symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     for link in (copy / "daedalus").iterdir():
@@ -53,7 +53,7 @@ def sdist(tree: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(sdist: Path) -> Path:
-    """Built from the unpacked sdist, as installers do that find no wheel."""
+    """Build the wheel from the unpacked sdist, as an installer does if there is no wheel."""
     unpacked, target = sdist.parent.parent / "unpacked", sdist.parent.parent / "wheel"
     with tarfile.open(sdist) as archive:
         archive.extractall(unpacked, filter="data")
@@ -64,21 +64,21 @@ def wheel(sdist: Path) -> Path:
     return built
 
 
-def installed(environment: Path, *what: str | Path) -> Path:
-    """Makes an environment that sees this one's packages but not this repository; returns its site-packages."""
+def installed(environment: Path, *packages_to_install: str | Path) -> Path:
+    """Create an environment with the packages of this one but without this repository; return its site-packages."""
     run(sys.executable, "-m", "venv", "--without-pip", environment, folder=environment.parent)
     pip = [sys.executable, "-m", "pip", "--python", environment / "bin" / "python"]
     options = ["--quiet", "--no-deps", "--no-index", "--no-build-isolation"]
     (packages,) = environment.glob("lib/python*/site-packages")
     # Lines of a .pth file are added to the path; .pth files in the folders that they name are not read.
     (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    run(*pip, "install", *options, *what, folder=environment.parent)
+    run(*pip, "install", *options, *packages_to_install, folder=environment.parent)
     return packages
 
 
 @pytest.fixture(scope="module")
 def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment with the wheel, and with a package `launch` as ROS 2 installs it."""
+    """Create an environment with the wheel and with a package `launch`, as ROS 2 installs it."""
     folder = tmp_path_factory.mktemp("installed") / "environment"
     packages = installed(folder, wheel)
     (packages / "launch").mkdir()
@@ -88,14 +88,14 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def scripts(tmp_path: Path) -> Path:
-    """A folder of a user's scripts that have the names of our packages."""
+    """Return a folder with user scripts that have the names of our packages."""
     for name in SCRIPTS:
         (tmp_path / f"{name}.py").write_text(RAISES)
     return tmp_path
 
 
 def expected_in_package() -> set[str]:
-    """The paths of all files that belong to the package, through its links."""
+    """Return the paths of all files of the package, through its links."""
     paths = set()
     for entry in (ROOT / "daedalus").iterdir():
         files = [path for path in entry.resolve().rglob("*") if path.is_file()] if entry.is_dir() else [entry]
@@ -103,7 +103,7 @@ def expected_in_package() -> set[str]:
     return {path.as_posix() if path.parts[0] == "daedalus" else f"daedalus/{path.as_posix()}" for path in paths}
 
 
-def test_the_wheel_holds_one_top_level_package_whole(wheel: Path) -> None:
+def test_the_wheel_holds_one_complete_top_level_package(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     ours = {name for name in names if name.startswith("daedalus/")}
@@ -116,10 +116,10 @@ def test_the_wheel_holds_one_top_level_package_whole(wheel: Path) -> None:
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-def test_the_sdist_holds_the_same_package_and_what_builds_it(sdist: Path) -> None:
+def test_the_sdist_holds_the_same_package_and_its_build_files(sdist: Path) -> None:
     with tarfile.open(sdist) as archive:
         files = [member for member in archive.getmembers() if not member.isdir()]
-    assert all(member.isfile() for member in files)  # no links: not every system can make them
+    assert all(member.isfile() for member in files)  # no links: not every system supports them
     names = {member.name.partition("/")[2] for member in files}
     ours = {name for name in names if name.startswith("daedalus/")}
     assert ours == expected_in_package()
@@ -127,7 +127,7 @@ def test_the_sdist_holds_the_same_package_and_what_builds_it(sdist: Path) -> Non
     assert names - ours - made == {*FILES, "PKG-INFO", "setup.cfg"}
 
 
-def test_training_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:
+def test_train_works_beside_packages_and_scripts_of_the_same_names(environment: Path, scripts: Path) -> None:
     settings = ("--env-steps", "20000", "--set", "training.target_return=none", "--set", "evaluation.final_episodes=3")
     output = run(environment / "daedalus", "train", "cartpole", *settings, "--run-dir", "run", folder=scripts)
     assert "evaluation: return" in output

@@ -1,8 +1,8 @@
-"""Everything that can fail, made to fail, and what became of it: one table at the end.
+"""Cause every kind of fault and print what happened, in one table.
 
-python -m benchmarks.chaos                     all of it, within 40 minutes on two cores
-python -m benchmarks.chaos freezes fuzz        these sections
-python -m benchmarks.chaos --scale 0.1 ...     a tenth of the events
+python -m benchmarks.chaos                     all sections, within 40 minutes on two cores
+python -m benchmarks.chaos freezes fuzz        only these sections
+python -m benchmarks.chaos --scale 0.1 ...     a tenth of the faults
 """
 
 import argparse
@@ -16,8 +16,8 @@ from benchmarks.running import machine, table
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("sections", nargs="*", metavar="SECTION", help="which (default: all)")
-    options.add_argument("--scale", type=float, default=1.0, help="how many of the events (default: 1.0, all)")
+    options.add_argument("sections", nargs="*", metavar="SECTION", help="sections to run (default: all)")
+    options.add_argument("--scale", type=float, default=1.0, help="factor on the number of faults (default: 1.0)")
     arguments = options.parse_args()
 
     def scaled(events: int) -> int:
@@ -41,7 +41,7 @@ def main() -> int:
     }
     unknown = set(arguments.sections) - sections.keys()
     if unknown:
-        options.error(f"no section {', '.join(sorted(unknown))}: there are {', '.join(sections)}")
+        options.error(f"unknown section {', '.join(sorted(unknown))}: choose from {', '.join(sections)}")
     rows, failed, began = [], False, time.monotonic()
     for name in arguments.sections or sections:
         say(f"--- {name}")
@@ -54,7 +54,7 @@ def main() -> int:
         taken = f"{time.monotonic() - section_began:.0f} s"
         rows += [(name if not index else "", *row, taken if not index else "") for index, row in enumerate(found)]
     print(f"{machine()}; {(time.monotonic() - began) / 60:.1f} minutes\n")
-    print(table(("section", "what", "figure", "took"), rows))
+    print(table(("section", "measurement", "result", "duration"), rows))
     return int(failed)
 
 

@@ -1,4 +1,4 @@
-"""Actors that are killed, frozen, poisoned; and that every rollout is accounted for."""
+"""Faults of actors: kills, freezes and nan rewards; and an account of every rollout."""
 
 import os
 import random
@@ -13,11 +13,11 @@ from processes import Running
 from benchmarks.chaos.scene import ENDLESS, FailedError, Scene, read_json, say, scene, seconds
 
 _SMALL = ("--set", "collection.envs_per_actor=16")
-_WAITED = 2 + 2  # seconds: the lease, and as much again
+_WAITED = 2 + 2  # seconds: twice the lease
 
 
 def kills(count: int) -> list[tuple[str, str]]:
-    """Actors of `daedalus train` are killed one after another."""
+    """Kill actors of `daedalus train` one after another."""
     choose, back, updates = random.Random(1), [], []
     with scene() as here:
         here.start("train", "cartpole", "--actors", 8, "--listen", here.address, *_SMALL, *ENDLESS)
@@ -36,14 +36,14 @@ def kills(count: int) -> list[tuple[str, str]]:
         lives = sum(each.lives for each in status.actors)
         rejected = dict(status.rollouts_rejected)
     return [
-        ("actor kills", f"{count} over 8 actors, {lives} lives, rejected {rejected or 'none'}"),
-        ("the replacement's first rollout was trained on after", seconds(back)),
-        ("the longest time without an update meanwhile", seconds(updates)),
+        ("actor kills", f"{count} over 8 actors, {lives} processes, rejected {rejected or 'none'}"),
+        ("the first rollout of the restarted actor was trained on after", seconds(back)),
+        ("longest time without an update meanwhile", seconds(updates)),
     ]
 
 
 def barriers(count: int) -> list[tuple[str, str]]:
-    """Under a2c, whose updates wait for every live actor, one of three is killed."""
+    """Kill one of three actors under a2c, whose updates wait for every live actor."""
     pauses = []
     with scene() as here:
         actors = _three_by_hand(here, "--algorithm", "a2c", "--actors", 3)
@@ -65,7 +65,7 @@ def barriers(count: int) -> list[tuple[str, str]]:
 
 
 def _three_by_hand(here: Scene, *settings: object) -> dict[str, Running]:
-    """A learner and three actors that all contribute, by their names."""
+    """Start a learner and three actors, wait until all are trained on, and return the actors by name."""
     here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *settings, *_SMALL, *ENDLESS)
     names = ("actor-a", "actor-b", "actor-c")
     actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in names}
@@ -80,7 +80,7 @@ def _actors(here: Scene) -> list:
 
 
 def _longest_pause(here: Scene, name: str, lives: int, env_steps: int) -> float:
-    """Until a new life of the actor contributes: the longest that the learner went without an update."""
+    """Wait until a restarted actor is trained on; return the longest time without an update meanwhile."""
     longest, changed, updates = 0.0, time.monotonic(), -1
 
     def is_back() -> bool:
@@ -95,12 +95,12 @@ def _longest_pause(here: Scene, name: str, lives: int, env_steps: int) -> float:
         actor = next(each for each in status.actors if each.actor == name)
         return actor.lives > lives and actor.env_steps > env_steps
 
-    here.wait(f"a new life of {name}", is_back)
+    here.wait(f"a new process of {name}", is_back)
     return longest
 
 
 def freezes(count: int) -> list[tuple[str, str]]:
-    """An actor is stopped (SIGSTOP) until it is missed, and let go on."""
+    """Stop an actor (SIGSTOP) until the learner notices, then let it continue."""
     seen, back = [], []
     with scene() as here:
         actors = _three_by_hand(here)
@@ -110,20 +110,23 @@ def freezes(count: int) -> list[tuple[str, str]]:
             others = [other for other in names if other != name]
             actors[name].process.send_signal(signal.SIGSTOP)
             try:
-                seen.append(here.wait(f"{name} missed", lambda name=name: not _is_alive(here, name)))
+                seen.append(here.wait(f"{name} noticed as gone", lambda name=name: not _is_alive(here, name)))
                 here.wait_for_training(*others)
             finally:
                 actors[name].process.send_signal(signal.SIGCONT)
             back.append(here.wait_for_training(name))
-            say(f"freeze {number + 1} of {count}: missed after {seen[-1]:.2f} s, back after {back[-1]:.2f} s")
+            say(f"freeze {number + 1} of {count}: noticed after {seen[-1]:.2f} s, back after {back[-1]:.2f} s")
         status = here.status()
         assert status is not None
         lives = max(each.lives for each in status.actors)
     late = sum(each > _WAITED for each in seen)
     return [
-        ("actor freezes", f"{count} over 3 actors; {late} seen later than {_WAITED} s; lives of an actor: {lives}"),
-        ("the freeze was seen after", seconds(seen)),
-        ("rollouts of it were trained on again after", seconds(back)),
+        (
+            "actor freezes",
+            f"{count} over 3 actors; {late} noticed later than {_WAITED} s; processes per actor: {lives}",
+        ),
+        ("the freeze was noticed after", seconds(seen)),
+        ("new rollouts of the actor were trained on after", seconds(back)),
     ]
 
 
@@ -133,7 +136,7 @@ def _is_alive(here: Scene, name: str) -> bool:
 
 
 def accounting(kills: int) -> list[tuple[str, str]]:
-    """Actors that keep a journal of what they send are killed; the learner's count is held against their journals."""
+    """Kill actors that keep a journal of what they send, and compare the counts of the learner with the journals."""
     choose = random.Random(2)
     with scene() as here:
         here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *_SMALL, *ENDLESS)
@@ -158,8 +161,8 @@ def accounting(kills: int) -> list[tuple[str, str]]:
         for actor in actors.values():
             actor.process.kill()
             actor.wait()
-        here.wait("all actors missed", lambda: not any(each.alive for each in _actors(here)))
-        here.wait("all judged", lambda: (now := here.status()) is not None and not now.queue_bytes)
+        here.wait("all actors gone", lambda: not any(each.alive for each in _actors(here)))
+        here.wait("the end of the queue", lambda: (now := here.status()) is not None and not now.queue_bytes)
         status = here.status()
         assert status is not None
         sent, answered = _journals(here.folder, journal)
@@ -169,20 +172,22 @@ def accounting(kills: int) -> list[tuple[str, str]]:
         rejected.update(each.rollouts_rejected)
     again = rejected.pop("duplicate", 0)
     lost = sent - accepted - rejected.total()
-    most = 2 * (kills + len(names))  # each life had two in flight at most
+    most = 2 * (kills + len(names))  # each process had at most two in flight
     if not 0 <= lost <= most or answered["accepted"] > accepted:
-        raise FailedError(f"{sent} sent, {accepted} accepted, {dict(rejected)} rejected, {lost} lost; told {answered}")
+        raise FailedError(
+            f"{sent} sent, {accepted} accepted, {dict(rejected)} rejected, {lost} lost; answers {answered}"
+        )
     return [
         (
             "rollouts sent = accepted + rejected + lost in flight",
-            f"{sent:,} = {accepted:,} + {rejected.total():,} + {lost}, over {kills + len(names)} killed lives "
-            f"(at most {most} in flight; {again} came twice and were taken once)",
+            f"{sent:,} = {accepted:,} + {rejected.total():,} + {lost}, over {kills + len(names)} killed processes "
+            f"(at most {most} in flight; {again} arrived twice and were accepted once)",
         )
     ]
 
 
 def _journals(folder: Path, journal: Path) -> tuple[int, Counter[str]]:
-    """How many rollouts were sent, and what their senders were told."""
+    """Return the number of rollouts sent, and the answers by verdict."""
     sent, answers = 0, Counter[str]()
     for path in folder.glob(f"{journal.name}-*"):
         lines = path.read_text().split("\n")
@@ -192,7 +197,7 @@ def _journals(folder: Path, journal: Path) -> tuple[int, Counter[str]]:
 
 
 def solve(seeds: int) -> list[tuple[str, str]]:
-    """CartPole is solved while an actor is killed every 5 s and one rollout in a hundred has a nan in it."""
+    """Solve CartPole while an actor is killed every 5 s and one rollout in a hundred contains a nan."""
     taken, poisoned, killed = [], 0, 0
     for seed in range(1, seeds + 1):
         with scene() as here:

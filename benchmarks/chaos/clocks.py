@@ -1,4 +1,4 @@
-"""The time of day is set forward and back by an hour under every process of a run."""
+"""Changes of the system clock, by an hour forward and back, for all processes of a run."""
 
 import time
 from pathlib import Path
@@ -10,14 +10,14 @@ _LIBRARIES = (  # Debian's package faketime
     "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1",
     "/usr/lib/aarch64-linux-gnu/faketime/libfaketimeMT.so.1",
 )
-_SETTLE_SECONDS = 3.0  # the library looks once a second what time it is to pretend
+_SETTLE_SECONDS = 3.0  # the library reads the pretended time once a second
 
 
 def steps(measured_seconds: float) -> list[tuple[str, str]]:
-    """What is trained on a second before each step and after it."""
+    """Measure the training speed before each change of the clock and after it."""
     library = next((path for path in _LIBRARIES if Path(path).exists()), None)
     if library is None:
-        say("SKIPPED: libfaketime is not there (Debian: apt install faketime)")
+        say("SKIPPED: libfaketime is not installed (Debian: apt install faketime)")
         return [("clock steps", "SKIPPED: libfaketime is not installed")]
     with scene() as here:
         pretended = here.folder / "time"
@@ -44,14 +44,16 @@ def steps(measured_seconds: float) -> list[tuple[str, str]]:
             clock.wait()
             off = int(clock.output) - time.time()
             if abs(off - int(step)) > 60:
-                raise FailedError(f"the clock was to be off by {step} s and is by {off:.0f}")
+                raise FailedError(f"the clock is off by {off:.0f} s instead of {step} s")
             rates[f"off by {step} s"] = _rate(here, measured_seconds)
         status = here.status()
         assert status is not None
         lives = max(actor.lives for actor in status.actors)
         age = status.checkpoint_age_seconds
         if lives != 1 or age is None or age > 60 or status.rollouts_rejected.keys() - {"stale"}:
-            raise FailedError(f"lives {lives}, last checkpoint {age} s ago, rejected {status.rollouts_rejected}")
+            raise FailedError(
+                f"processes per actor {lives}, last checkpoint {age} s ago, rejected {status.rollouts_rejected}"
+            )
     return [("clock steps", "; ".join(f"{when} {rate:,.0f} env_steps/s" for when, rate in rates.items()))]
 
 

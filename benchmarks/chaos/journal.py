@@ -1,4 +1,4 @@
-"""An actor that writes down what it sends before it sends it: `python journal.py ADDRESS NAME FILE`."""
+"""Actor that writes each rollout to a journal before it sends it: `python journal.py ADDRESS NAME FILE`."""
 
 import os
 import secrets
@@ -17,7 +17,7 @@ from daedalus.transport.interface import Transport
 
 
 class JournalTransport:
-    """A transport that keeps a journal of `query_async`; a line is in the file before the next thing happens."""
+    """Transport that writes each `query_async` and its answer to a file before it continues."""
 
     def __init__(self, transport: Transport, path: str) -> None:
         self._transport = transport

@@ -1,4 +1,4 @@
-"""Learners that are killed, at every stage of saving; checkpoints that are torn or flipped."""
+"""Faults of learners: kills at every stage of saving, stops, and damaged checkpoints."""
 
 import os
 import random
@@ -21,7 +21,7 @@ from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
 
 
 def kills(count: int) -> list[tuple[str, str]]:
-    """The learner of `daedalus train` is killed while it saves, and between; the run goes on each time."""
+    """Kill the learner of `daedalus train` while it saves and between; the run continues each time."""
     choose, back, stages = random.Random(3), [], Counter[str]()
     with scene() as here:
         saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "policy.hidden=[512,512]")
@@ -44,19 +44,22 @@ def kills(count: int) -> list[tuple[str, str]]:
             os.kill(victim, signal.SIGKILL)
             stages[stage] += 1
             began = time.monotonic()
-            here.wait("the learner", lambda epoch=epoch: _lives_anew(here, epoch))
+            here.wait("the learner", lambda epoch=epoch: _is_restarted(here, epoch))
             here.wait_for_training()
             back.append(time.monotonic() - began)
-            line = [line for line in training.lines if "going on from checkpoint" in line][-1]
+            line = [line for line in training.lines if "resuming from checkpoint" in line][-1]
             version = int(line.split("checkpoint ")[1].split()[0])
             if version < durable:
-                raise FailedError(f"went on from {version}, {durable} was on the disk:\n{training.output}")
+                raise FailedError(f"resumed from {version}, but {durable} was on the disk:\n{training.output}")
             say(f"learner kill {number + 1} of {count} ({stage}): back after {back[-1]:.2f} s")
         partial = [entry.name for entry in checkpoints.glob(".*.partial")]
     return [
         ("learner kills", f"{count}: {', '.join(f'{n} {stage}' for stage, n in sorted(stages.items()))}"),
-        ("went on from the last durable checkpoint", f"{count} of {count}; unfinished ones left: {len(partial)}"),
-        ("the next update after", seconds(back)),
+        (
+            "resumed from the newest durable checkpoint",
+            f"{count} of {count}; unfinished checkpoints left: {len(partial)}",
+        ),
+        ("the next update came after", seconds(back)),
     ]
 
 
@@ -64,28 +67,28 @@ def _durable(checkpoints: Path) -> int:
     return max((int(entry.name) for entry in checkpoints.glob("0*")), default=-1)
 
 
-def _lives_anew(here: Scene, epoch: int | None) -> bool:
+def _is_restarted(here: Scene, epoch: int | None) -> bool:
     status = here.status()
     return status is not None and status.learner_epoch != epoch
 
 
 def _await_stage(checkpoints: Path, choose: random.Random) -> str:
-    """Waits for a moment within the saving of a checkpoint: so many of its files are there."""
+    """Wait until a checkpoint is being saved and a random number of its files exist; return a description."""
     files = choose.randrange(6)
     deadline = time.monotonic() + LIMIT
     while time.monotonic() < deadline:
         for partial in checkpoints.glob(".*.partial"):
             try:
-                there = len(os.listdir(partial))
+                started = len(os.listdir(partial))
             except FileNotFoundError:
                 continue
-            if there >= files:
-                return f"while saving, {there} of 5 files begun"
+            if started >= files:
+                return f"while saving, {started} of 5 files started"
     raise FailedError("no checkpoint was being saved")
 
 
 def stops(count: int) -> list[tuple[str, str]]:
-    """`daedalus train` is told to stop, once or twice, beside an actor that is frozen."""
+    """Stop `daedalus train` with one or two signals while an actor is frozen."""
     taken, saved = [], 0
     shared_memory = set(os.listdir("/dev/shm"))
     for number in range(count):
@@ -109,14 +112,14 @@ def stops(count: int) -> list[tuple[str, str]]:
     segments = set(os.listdir("/dev/shm")) - shared_memory
     return [
         (
-            "SIGTERM or SIGINT, once or twice, beside a frozen actor",
+            "SIGTERM or SIGINT, once or twice, with a frozen actor",
             f"{seconds(taken)}; {saved} checkpoints; no process and {len(segments)} shared-memory segments left",
         )
     ]
 
 
 def damaged(count: int) -> list[tuple[str, str]]:
-    """Checkpoints whose files are cut, flipped or missing: none is accepted, the one before it is."""
+    """Damage the newest checkpoint in many ways: the previous one must be loaded each time."""
     choose = random.Random(4)
     spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"), policy=PolicySpec(hidden=(64, 64)))
@@ -147,18 +150,18 @@ def damaged(count: int) -> list[tuple[str, str]]:
             try:
                 loaded = load_newest(run)
             except DamagedError as error:
-                raise FailedError(f"the good one was not found: {error}") from None
+                raise FailedError(f"the undamaged checkpoint was not found: {error}") from None
             if loaded.policy.policy_version != 1:
                 accepted += 1
             if any(not np.isfinite(array).all() for array in loaded.policy.weights.values()):
-                raise FailedError("weights that are no numbers")
+                raise FailedError("weights that are not finite")
             shutil.rmtree(newest)
             shutil.copytree(original, newest)
     return [
         (
             "damaged checkpoints",
             f"{count} ({', '.join(f'{n} {kind}' for kind, n in sorted(kinds.items()))}): {accepted} accepted; "
-            f"the one before was loaded {count - accepted} times",
+            f"the previous checkpoint was loaded {count - accepted} times",
         )
     ]
 
@@ -171,7 +174,7 @@ def _damage(directory: Path, choose: random.Random) -> str:
         data = data[: choose.randrange(len(data))]
     elif kind == "flipped":
         data[choose.randrange(len(data))] ^= 1 << choose.randrange(8)
-    elif kind == "zeroed":  # a block that never reached the disk
+    elif kind == "zeroed":  # a block that was not written to the disk
         start = choose.randrange(len(data))
         end = min(start + 4096, len(data))
         if not any(data[start:end]):

@@ -1,4 +1,4 @@
-"""Routers that are killed, and links that are cut without a word."""
+"""Faults of the network: killed routers, and links that stall without an error."""
 
 import time
 
@@ -10,7 +10,7 @@ _SMALL = ("--set", "collection.envs_per_actor=16")
 
 
 def routers(count: int) -> list[tuple[str, str]]:
-    """A router that learner and actors use is killed and started again."""
+    """Kill and restart a router that learner and actors use."""
     back = []
     with scene() as here:
         router = here.router()
@@ -34,13 +34,13 @@ def routers(count: int) -> list[tuple[str, str]]:
         assert status is not None
         lives = max(each.lives for each in status.actors)
     return [
-        ("router restarts", f"{count}; lives of an actor: {lives}"),
+        ("router restarts", f"{count}; processes per actor: {lives}"),
         ("rollouts of all actors were trained on after", seconds(back)),
     ]
 
 
 def cuts(cut_seconds: float, rounds: int) -> list[tuple[str, str]]:
-    """Links go half-open: those of four actors at once, and that of the learner to its router."""
+    """Stall links: those of four actors at once, and that of the learner to its router."""
     actors_back, learner_back, meanwhile = [], [], []
     with scene() as here:
         here.router()
@@ -73,7 +73,7 @@ def cuts(cut_seconds: float, rounds: int) -> list[tuple[str, str]]:
             status = here.status()
             assert status is not None
             if any(each.lives != 1 for each in status.actors):
-                raise FailedError("an actor was started again")
+                raise FailedError("an actor was restarted")
         finally:
             for proxy in proxies.values():
                 proxy.close()

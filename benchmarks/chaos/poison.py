@@ -1,4 +1,4 @@
-"""A simulator that is wrong now and then: one rollout in a hundred of CartPole's preset has a reward of nan in it."""
+"""Wrapper with rare nan rewards: one rollout in a hundred of the CartPole preset contains one."""
 
 import random
 from typing import Any
@@ -18,5 +18,5 @@ class _Poisoned(gymnasium.Wrapper):
 
 
 def poisoned(env: gymnasium.Env) -> gymnasium.Env:
-    """For `daedalus train cartpole --wrap poison:poisoned`."""
+    """Wrap an environment, for `daedalus train cartpole --wrap poison:poisoned`."""
     return _Poisoned(env)

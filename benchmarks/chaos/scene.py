@@ -1,4 +1,4 @@
-"""One service under observation: its processes, what its learner tells, and how long things take."""
+"""One service under measurement: its processes, the status of its learner, and waiting times."""
 
 import contextlib
 import json
@@ -25,23 +25,23 @@ from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.zenoh_transport import connect
 
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-LIMIT = 120.0  # seconds; what takes longer has failed
+LIMIT = 120.0  # seconds; timeout of each step
 _POLL_SECONDS = 0.02
 
 
 class FailedError(Exception):
-    """A promise was not kept."""
+    """Error of a service that did not behave as documented."""
 
 
 def free_address() -> str:
-    """A loopback address that nobody listens on."""
+    """Return a loopback address that no process listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Scene:
-    """Processes in a folder of their own, and the learner at an address."""
+    """Processes in a temporary folder, and the address of their learner."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory()
@@ -51,22 +51,22 @@ class Scene:
         self._transport: Transport | None = None
 
     def start(self, *arguments: object) -> Running:
-        """Starts `daedalus ARGUMENTS`."""
+        """Start `daedalus ARGUMENTS`."""
         return self.run([*COMMAND, *map(str, arguments)])
 
     def run(self, command: Sequence[str], directory: Path | None = None) -> Running:
-        """Starts any command, in the scene's folder unless told otherwise."""
+        """Start a command in a directory (default: the temporary folder)."""
         self._running.append(Running(list(command), directory or self.folder))
         return self._running[-1]
 
     def router(self) -> Running:
-        """Starts a router of its own at the address."""
+        """Start a router at the address."""
         running = self.start("router", "--listen", self.address)
         running.expect("listening")
         return running
 
     def status(self) -> RunStatus | None:
-        """What the learner tells; None if it does not answer now."""
+        """Return the status of the learner, or None if it does not answer."""
         try:
             if self._transport is None:
                 self._transport = connect([self.address])
@@ -77,48 +77,48 @@ class Scene:
         return report.status if isinstance(report, StatusReport) else None
 
     def actor(self, name: str) -> ActorStatus | None:
-        """What the learner tells of one actor."""
+        """Return the status of one actor, or None."""
         status = self.status()
         return next((each for each in status.actors if each.actor == name), None) if status else None
 
     def env_steps(self, *names: str) -> int:
-        """Trained on, of the named actors together, or of the whole run."""
+        """Return the env_steps trained on, of the named actors or of the whole run."""
         status = self.status()
         if status is None:
             return 0
         return sum(each.env_steps for each in status.actors if each.actor in names) if names else status.env_steps
 
-    def wait(self, what: str, condition: Callable[[], object]) -> float:
-        """Seconds until a condition holds. Raises FailedError after LIMIT of them."""
+    def wait(self, description: str, condition: Callable[[], object]) -> float:
+        """Wait until a condition holds; return the seconds. Raises FailedError after LIMIT seconds."""
         began = time.monotonic()
         while not condition():
             if time.monotonic() > began + LIMIT:
                 output = "\n".join(running.output[-2000:] for running in self._running)
-                raise FailedError(f"{what}: not within {LIMIT:g} s\n{output}")
+                raise FailedError(f"{description}: not within {LIMIT:g} s\n{output}")
             time.sleep(_POLL_SECONDS)
         return time.monotonic() - began
 
     def wait_for_training(self, *names: str) -> float:
-        """Seconds until something more was trained on, of the named actors or at all."""
+        """Wait until new rollouts of the named actors, or any, are trained on; return the seconds."""
         before = self.env_steps(*names)
         return self.wait(f"training of {names or 'all'}", lambda: self.env_steps(*names) > before)
 
     def process(self, *texts: str) -> int:
-        """The one process whose command line holds all of the texts, once it is there."""
+        """Wait for the one process whose command line contains all texts; return its id."""
         found: list[int] = []
 
-        def look() -> bool:
+        def find() -> bool:
             found[:] = sorted(set.intersection(*(set(processes_mentioning(text)) for text in texts)))
             return len(found) == 1
 
-        self.wait(f"one process of {texts}", look)
+        self.wait(f"one process of {texts}", find)
         return found[0]
 
     def close(self) -> None:
-        """Ends everything."""
+        """End all processes."""
         if self._transport is not None:
             self._transport.close()
-        for running in self._running:  # launchers first: they end what they started
+        for running in self._running:  # launchers first: they end their child processes
             with contextlib.suppress(ProcessLookupError):
                 os.kill(running.process.pid, signal.SIGCONT)
                 running.process.terminate()
@@ -131,7 +131,7 @@ class Scene:
 
 @contextlib.contextmanager
 def scene() -> Iterator[Scene]:
-    """A Scene that is closed in the end."""
+    """Create a Scene and close it at the end."""
     made = Scene()
     try:
         yield made
@@ -140,7 +140,7 @@ def scene() -> Iterator[Scene]:
 
 
 def resident_mib(pid: int) -> float:
-    """The memory of a process."""
+    """Return the resident memory of a process, in MiB."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS"):
             return int(line.split()[1]) / 1024
@@ -148,15 +148,15 @@ def resident_mib(pid: int) -> float:
 
 
 def seconds(values: Sequence[float]) -> str:
-    """Median and worst."""
+    """Return the median and the maximum as text."""
     return f"median {np.median(values):.2f} s, worst {max(values):.2f} s of {len(values)}"
 
 
 def say(text: str) -> None:
-    """Progress, beside the results."""
+    """Print a line of progress to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A run's summary."""
+    """Return the content of a JSON file."""
     return json.loads(path.read_text())

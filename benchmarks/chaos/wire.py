@@ -1,4 +1,4 @@
-"""More rollouts than the learner can take, and bytes of every kind."""
+"""Overload of the learner, a stopped subscriber, and damaged messages."""
 
 import os
 import random
@@ -16,7 +16,7 @@ from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
 
 _QUEUE_MIB = 16
-# Updates that take long beside what a rollout costs to send: else one machine could not send ten times too many.
+# Slow updates, so that one machine can send ten times more rollouts than the learner can train on.
 _SLOW = (
     "--algorithm=appo",
     "--set=policy.hidden=[256,256]",
@@ -27,7 +27,7 @@ _ENVIRONMENTS = 128
 
 
 class _Flood:
-    """Sends rollouts at a steady rate, whatever is answered."""
+    """Sender of rollouts at a constant rate, which ignores the answers unless it is windowed."""
 
     def __init__(self, address: str, name: str, rate: float, windowed: bool) -> None:
         self._sender = Sender(address, name, _ENVIRONMENTS)
@@ -60,7 +60,7 @@ class _Flood:
             self._room.release()
 
     def stop(self) -> None:
-        """Sends nothing more and waits for all answers."""
+        """Stop sending and wait for all answers."""
         self._stop.set()
         self._thread.join()
         deadline = time.monotonic() + 60.0
@@ -70,7 +70,7 @@ class _Flood:
 
 
 def overload(measured_seconds: float) -> list[tuple[str, str]]:
-    """Ten times the rollouts that the learner can take are sent to it, by senders that heed no answer."""
+    """Send ten times the rollouts that the learner can train on, from senders that ignore the answers."""
     with scene() as here:
         running = here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *_SLOW, *ENDLESS)
         here.wait("the learner", lambda: here.status() is not None)
@@ -97,14 +97,14 @@ def overload(measured_seconds: float) -> list[tuple[str, str]]:
         total = sum(flood.sent for flood in wild)
         status = here.status()
         assert status is not None
-        told = [each for each in status.actors if each.actor.startswith("wild")]
-        accepted, busy = sum(each.rollouts_accepted for each in told), sum(each.busy_answers for each in told)
+        flooding = [each for each in status.actors if each.actor.startswith("wild")]
+        accepted, busy = sum(each.rollouts_accepted for each in flooding), sum(each.busy_answers for each in flooding)
     kept = answers["accepted"] + answers["busy"] + answers["rejected"] == total
     if not kept or (answers["accepted"], answers["busy"]) != (accepted, busy):
         raise FailedError(f"{total} sent; answers {dict(answers)}; the learner counts {accepted} and {busy}")
     return [
-        ("overload", f"{sent / taken:.1f} times what the learner takes, for {measured_seconds:g} s, heeding no answer"),
-        ("updates a second, of the unloaded rate", f"{loaded:.1f} of {unloaded:.1f}: {loaded / unloaded:.0%}"),
+        ("overload", f"{sent / taken:.1f} times the rate of the learner, for {measured_seconds:g} s, answers ignored"),
+        ("updates per second, of the unloaded rate", f"{loaded:.1f} of {unloaded:.1f}: {loaded / unloaded:.0%}"),
         (f"memory beyond the unloaded learner's (queue {_QUEUE_MIB} MiB)", f"{grown:.0f} MiB"),
         (
             "rollouts sent = accepted + busy + stale",
@@ -115,7 +115,7 @@ def overload(measured_seconds: float) -> list[tuple[str, str]]:
 
 
 def _rates(here: Scene, measured_seconds: float) -> tuple[float, float]:
-    """Updates and rollouts a second."""
+    """Measure updates and rollouts per second."""
     before, began = here.status(), time.monotonic()
     time.sleep(measured_seconds)
     after, ended = here.status(), time.monotonic()
@@ -127,7 +127,7 @@ def _rates(here: Scene, measured_seconds: float) -> tuple[float, float]:
 
 
 class _PeakMemory:
-    """The most that a process holds meanwhile."""
+    """Maximum resident memory of a process while this object measures."""
 
     def __init__(self, pid: int) -> None:
         self._pid, self._peak, self._stop = pid, 0.0, threading.Event()
@@ -145,7 +145,7 @@ class _PeakMemory:
 
 
 def slow_subscriber(measured_seconds: float) -> list[tuple[str, str]]:
-    """One of three actors is stopped: snapshots reach the others as before."""
+    """Stop one of three actors: the others must receive snapshots as before."""
     with scene() as here:
         here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *_SLOW[1:2], *ENDLESS)
         actors = {name: here.start("actor", "--connect", here.address, "--name", name) for name in ("a", "b", "c")}
@@ -160,7 +160,7 @@ def slow_subscriber(measured_seconds: float) -> list[tuple[str, str]]:
             actors["c"].process.send_signal(signal.SIGCONT)
     return [
         (
-            "policy lag of two actors, and snapshots a second",
+            "policy lag of two actors, and snapshots per second",
             f"with the third playing {before[0]:.1f} and {before[1]:.0f}, "
             f"with it stopped {after[0]:.1f} and {after[1]:.0f}",
         )
@@ -180,7 +180,7 @@ def _lag(here: Scene, measured_seconds: float) -> tuple[float, float]:
 
 
 def fuzz(count: int) -> list[tuple[str, str]]:
-    """Messages of every kind, damaged in every way, through the full decode."""
+    """Decode randomly damaged messages of every kind."""
     began = time.monotonic()
     workers = os.cpu_count() or 1
     outcomes, grown = Counter[str](), []
@@ -196,7 +196,7 @@ def fuzz(count: int) -> list[tuple[str, str]]:
         (
             "mutated messages through the decoder",
             f"{outcomes.total():,} in {taken:.0f} s: {outcomes['refused']:,} refused, {outcomes['decoded']:,} decoded "
-            f"(still whole), 0 other exceptions; memory grew by {max(grown):.1f} MiB at most",
+            f"(still valid), 0 other exceptions; memory grew by {max(grown):.1f} MiB at most",
         )
     ]
 
@@ -224,7 +224,7 @@ def _mutated(message: bytes, others: list[bytes], choose: random.Random) -> byte
     data = bytearray(message)
     for _ in range(choose.choice([1, 1, 1, 2, 4, 16])):
         place = choose.randrange(len(data)) if data else 0
-        # Most of what can be said wrong stands in the header, which comes first.
+        # Most fields are in the header, which comes first.
         if choose.random() < 0.5 and len(data) > 12:
             place = choose.randrange(min(len(data), 200))
         kind = choose.randrange(7)

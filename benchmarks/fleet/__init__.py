@@ -1,1 +1,1 @@
-"""How the cost of a run grows with its fleet: `python -m benchmarks.fleet`."""
+"""Measurement of the cost of a run by the number of its actors: `python -m benchmarks.fleet`."""

@@ -1,11 +1,11 @@
-"""One learner and fleets of simulated actors: how the cost of a run grows with them.
+"""Measure the cost of a run by the number of its actors, with one learner and simulated actors.
 
     python -m benchmarks.fleet --actors 1 10 100 1000 --plot docs/fleet.png
 
-Simulated actors are whole to the learner and its router, with sessions, presence and acknowledgements of their own,
-but play nothing: each sends one recorded rollout of CartPole, 16 rows of 16 environments, again and again. First all
-of them together send --rate rollouts a second, which the learner can take: what that costs, and how long answers and
-snapshots take, is the fleet's doing. Then all send as fast as they are answered.
+A simulated actor has a session, presence and acknowledgements of its own, but no environments: it sends one recorded
+rollout of CartPole, 16 rows of 16 environments, repeatedly. First all actors together send --rate rollouts per second,
+a rate that the learner can train on. The cost and the latencies then depend on the number of actors only. Then all
+actors send as fast as they get answers.
 """
 
 import argparse
@@ -28,22 +28,26 @@ _HEADER = (
     "rollouts/s",
     "ack ms, p50 and p99",
     "snapshot ms, p50 and p99",
-    "to the last actor",
+    "ms to the last actor",
     "missed",
-    "CPU s a 1,000 rollouts: learner",
+    "CPU s per 1,000 rollouts: learner",
     "router",
     "MiB: learner",
     "router",
-    "at most, rollouts/s",
+    "maximum, rollouts/s",
 )
 
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--actors", type=int, nargs="+", default=[1, 10, 100, 1000])
-    options.add_argument("--rate", type=float, default=100.0, help="rollouts a second of all (default: %(default)g)")
-    options.add_argument("--seconds", type=float, default=20.0, help="of each measurement (default: %(default)g)")
-    options.add_argument("--plot", type=Path, help="draw the growth into this file")
+    options.add_argument(
+        "--rate", type=float, default=100.0, help="rollouts per second of all actors (default: %(default)g)"
+    )
+    options.add_argument(
+        "--seconds", type=float, default=20.0, help="duration of each measurement (default: %(default)g)"
+    )
+    options.add_argument("--plot", type=Path, help="picture of the results to write")
     parsed = options.parse_args()
     rows = []
     for count in parsed.actors:
@@ -58,7 +62,7 @@ def main() -> int:
 
 
 class Swarm:
-    """Simulated actors in as many processes as they need."""
+    """Simulated actors in several processes."""
 
     def __init__(self, here: Scene, count: int, rate: float, seconds: float) -> None:
         each = [len(part) for part in np.array_split(np.arange(count), -(-count // _PER_PROCESS))]
@@ -75,20 +79,20 @@ class Swarm:
             )
 
     def await_ready(self) -> None:
-        """Waits until all have joined and there is a policy."""
+        """Wait until all actors have joined and the learner has a policy."""
         for process in self._processes:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
 
     def go(self) -> None:
-        """Has them send."""
+        """Let the actors send."""
         for process in self._processes:
             assert process.stdin is not None
             process.stdin.write("go\n")
             process.stdin.flush()
 
     def results(self) -> list[dict]:
-        """What came of it, once they are done."""
+        """Wait for the results of all processes and return them."""
         found = []
         for process in self._processes:
             assert process.stdout is not None
@@ -97,14 +101,14 @@ class Swarm:
         return found
 
     def close(self) -> None:
-        """Ends them."""
+        """End the processes."""
         for process in self._processes:
             process.kill()
             process.wait()
 
 
 def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str, float]:
-    """One fleet: at a given rate, then as fast as it goes."""
+    """Measure a number of actors, first at a given rate, then at the maximum rate."""
     router = here.router()
     notes = here.folder / "published"
     settings = ("--set", "collection.envs_per_actor=16", "--set", "collection.rollout_length=16", *ENDLESS)
@@ -140,7 +144,7 @@ def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str,
 
 
 def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: float, seconds: float) -> dict:
-    """How long snapshots took, of those that were published while all sent."""
+    """Return the delays of the snapshots that were published while the actors sent."""
     published = {}
     for line in notes.read_text().splitlines():
         version, at = line.split()
@@ -192,7 +196,7 @@ def _plot(rows: Sequence[dict[str, float]], path: Path) -> None:
     counts = [row["actors"] for row in rows]
     for axis, title, names in (
         (axes[0], "milliseconds", ("ack_50", "ack_99", "snapshot_50", "snapshot_99")),
-        (axes[1], "CPU seconds a 1,000 rollouts", ("learner_cpu", "router_cpu")),
+        (axes[1], "CPU seconds per 1,000 rollouts", ("learner_cpu", "router_cpu")),
         (axes[2], "MiB", ("learner_mib", "router_mib")),
     ):
         for name in names:

@@ -1,10 +1,9 @@
-"""Many simulated actors in one process: sessions of their own, no environments, one recorded rollout each.
+"""Many simulated actors in one process, each with a session of its own and one recorded rollout.
 
     python -m benchmarks.fleet.swarm ADDRESS FIRST COUNT RATE SECONDS
 
-They join as numbers FIRST to FIRST + COUNT - 1, say `ready`, wait for a line on standard input, and then send for
-SECONDS: each one at most RATE rollouts a second, and never more than one that is not answered. Prints what came of it
-as JSON.
+The actors join with the numbers FIRST to FIRST + COUNT - 1, print `ready`, and wait for a line on standard input. Then
+each actor sends at most RATE rollouts per second for SECONDS, with at most one in flight. Prints the results as JSON.
 """
 
 import json
@@ -34,7 +33,7 @@ _WAIT_SECONDS = 120.0
 
 
 def recorded(rows: int) -> Rollout:
-    """A rollout of plausible numbers: what one holds does not matter here, how large it is does."""
+    """Return a rollout of plausible values. Only its size matters."""
     random = np.random.default_rng(1)
     shape = (rows, ENVIRONMENTS)
     return Rollout(
@@ -54,11 +53,11 @@ def recorded(rows: int) -> Rollout:
 
 
 class Simulated:
-    """One actor, as far as the learner and the router can tell."""
+    """Actor with a session and without environments."""
 
     def __init__(self, address: str, name: str) -> None:
         transport = connect_with_retry([address], threading.Event(), _WAIT_SECONDS)
-        assert transport is not None  # nobody tells it to stop
+        assert transport is not None  # the event is never set
         self._transport = transport
         self._queries = LearnerQueries(self._transport)
         self._changed = threading.Condition()
@@ -66,7 +65,7 @@ class Simulated:
         self._sequence, self._version = 0, -1
         self._sent_at = 0.0
         self.latencies: list[float] = []
-        self.came: list[tuple[int, float]] = []  # policy versions, and when
+        self.came: list[tuple[int, float]] = []  # policy version and time of each snapshot received
         incarnation = secrets.randbits(62)
         join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
         self._welcome = self._queries.join_learner(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
@@ -83,11 +82,11 @@ class Simulated:
 
     @property
     def verdicts(self) -> Counter[str]:
-        """What became of its rollouts."""
+        """Number of answers by verdict."""
         return self._in_flight.verdicts
 
     def has_policy(self) -> bool:
-        """Whether the learner has one; asks for it."""
+        """Query the newest snapshot and return whether there is one."""
         for message in self._queries.newest_snapshot(self._welcome.run):
             if isinstance(message, Snapshot):
                 self._version = max(self._version, message.policy_version)
@@ -97,13 +96,13 @@ class Simulated:
         data = self._inbox.take()
         if data is not None:
             now = time.monotonic()
-            # Only its header is looked at: a thousand actors share these cores, which would each have their own.
+            # Decode only the header: a thousand simulated actors share these cores.
             content = msgpack.unpackb(data[12 : 12 + int.from_bytes(data[8:12], "little")])
             self._version = content["fields"].get("policy_version", self._version)
             self.came.append((self._version, now))
 
     def play(self, rate: float, until: float) -> None:
-        """Sends, on a thread of its own."""
+        """Send rollouts at a rate until a time. Blocks the calling thread."""
         pause = 1 / rate
         due = time.monotonic() + np.random.default_rng().uniform(0, pause)
         while (now := time.monotonic()) < until:
@@ -137,11 +136,11 @@ class Simulated:
         with self._changed:
             self._in_flight.acknowledge(sequence, answer, now)
             if answer is not None and answer.verdict == "accepted":
-                self.latencies.append(now - self._sent_at)  # from the first attempt, busy answers included
+                self.latencies.append(now - self._sent_at)  # from the first attempt, with the time of busy answers
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Leaves."""
+        """Close the session."""
         self._transport.close()
 
 

@@ -1,4 +1,4 @@
-"""`daedalus actor`: constructs one actor and runs it.
+"""`daedalus actor`: construct one actor and run it.
 
 Exit status: 0 the run is over, 1 failed, 2 bad usage.
 """
@@ -19,7 +19,7 @@ from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 
 def main() -> int:
-    """Runs `daedalus actor`."""
+    """Run `daedalus actor` and return its exit status."""
     arguments = options.parser().parse_args()
     try:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")

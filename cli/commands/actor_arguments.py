@@ -1,4 +1,4 @@
-"""The actor's command line."""
+"""The command line of `daedalus actor`."""
 
 import argparse
 import os
@@ -14,60 +14,45 @@ from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import authorization_hint
 
 DESCRIPTION = """\
-Plays environments for a learner and streams what happens to it. Needs one address; the environment, the
-network and all else come from the learner. May start before it, and join or leave at any time."""
+Plays environments and sends rollouts to a learner. An actor needs one address: the environment, the network and all
+settings come from the learner. An actor may start before the learner, and may join or leave at any time."""
 
 EXAMPLES = """\
 examples:
   daedalus actor --connect tcp/127.0.0.1:7447
   daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
   daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
-  daedalus actor --connect tcp/127.0.0.1:7447 --evaluator"""
+  daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
+
+exit status: 0 the run is over or the actor was stopped, 1 failed, 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus actor` takes."""
+    """Return the parser of `daedalus actor`."""
     options = command_parser("actor", DESCRIPTION, EXAMPLES)
-    add_connect(options, "where the learner, or a router that knows it, listens")
+    add_connect(options, "address of the learner or of its router. May be given several times")
     options.add_argument(
         "--envs",
         type=int,
         metavar="E",
-        help="environments to step together (default: what the learner asks for)",
+        help="number of environments to step together (default: as the learner asks)",
     )
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
-        help="your own transform: takes each gymnasium environment and returns the one to play",
+        help="your function that takes each gymnasium environment and returns the environment to play",
     )
     options.add_argument(
         "--runtime",
         choices=("onnx", "torch"),
         default="onnx",
-        help="what runs the policy (default: %(default)s, which needs no torch)",
+        help="library that runs the policy (default: %(default)s, which needs no torch)",
     )
-    options.add_argument(
-        "--run", default=keys.ANY_RUN, metavar="NAME", help="which run to join, where several share a network"
-    )
-    options.add_argument(
-        "--name",
-        metavar="NAME",
-        help="this actor's name, the same after a restart (default: from the host's)",
-    )
-    options.add_argument(
-        "--link",
-        choices=("auto", "lan", "wan"),
-        default="auto",
-        help="wan: fetch weights in bfloat16, as differences, and as often as the link bears, instead of every version "
-        "whole (default: %(default)s, measured when joining)",
-    )
-    options.add_argument(
-        "--timeout", type=float, metavar="SECONDS", help="how long to look for a learner (default: for ever)"
-    )
+    _add_connection(options)
     options.add_argument(
         "--evaluator",
         action="store_true",
-        help="play greedily on the run's schedule and report, instead of gathering experience",
+        help="play greedily on the schedule of the run and report the returns, instead of sending rollouts",
     )
     add_tls(options)
     add_logging(options)
@@ -75,17 +60,42 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def _add_connection(options: argparse.ArgumentParser) -> None:
+    """Add the options about the learner, the name and the link."""
+    options.add_argument(
+        "--run", default=keys.ANY_RUN, metavar="NAME", help="run to join, if several runs share a network"
+    )
+    options.add_argument(
+        "--name",
+        metavar="NAME",
+        help="name of this actor. Keep it after a restart (default: made from the name of the host)",
+    )
+    options.add_argument(
+        "--link",
+        choices=("auto", "lan", "wan"),
+        default="auto",
+        help="lan: receive every snapshot in full. wan: fetch snapshots as bfloat16 differences, as often as the link "
+        "allows (default: %(default)s, which measures the link)",
+    )
+    options.add_argument(
+        "--timeout",
+        type=float,
+        metavar="SECONDS",
+        help="time to look for a learner before giving up (default: no limit)",
+    )
+
+
 def config(arguments: argparse.Namespace, credentials: Credentials | None) -> ActorConfig:
-    """The checked configuration; raises ValueError with one line that says what is wrong."""
+    """Return the checked configuration. Raises ValueError with a message of one line."""
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:
-        raise ValueError(f"--envs must be from 1 to 4096, not {arguments.envs}")
+        raise ValueError(f"--envs is {arguments.envs}: choose a number from 1 to 4096")
     if arguments.run != keys.ANY_RUN:
         keys.check_name(arguments.run, "run")
     name = arguments.name or (f"{credentials.name}.{os.getpid()}" if credentials else _default_name())
     if credentials and credentials.name not in (name, name.partition(".")[0]):
         raise ValueError(
             f"the certificate in {credentials.directory} is not for {name!r}: "
-            f"--name {credentials.name} or {credentials.name}.ANYTHING"
+            f"use --name {credentials.name} or {credentials.name}.ANYTHING"
         )
     return ActorConfig(
         name=keys.check_name(name, "actor name"),

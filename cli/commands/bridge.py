@@ -1,6 +1,6 @@
-"""`daedalus bridge`: listens for clients in other languages.
+"""`daedalus bridge`: listen for actors in other languages.
 
-Exit status: 0 told to stop, 1 failed, 2 bad usage.
+Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
 """
 
 import argparse
@@ -21,22 +21,24 @@ _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it r
 LISTEN = "tcp/127.0.0.1:7448"
 
 DESCRIPTION = """\
-Carries queries, answers, snapshots and presence between a plain TCP connection and the network of a run, for actors
-in languages without a Zenoh binding. docs/wire.md says what it speaks; examples/node is such an actor. With an actor's
-certificate it reaches a network over TLS; its clients always come in the clear."""
+Forwards queries, answers, snapshots and presence between plain TCP connections and the network of a run. Actors in
+languages without a Zenoh binding connect to it. docs/wire.md describes the protocol, and examples/node is such an
+actor. The bridge can use TLS towards the network, with the certificate of an actor. Its clients use no TLS."""
 
 EXAMPLES = """\
 examples:
   daedalus bridge --connect tcp/127.0.0.1:7447
-  daedalus bridge --connect tls/gpu-box:7447 --tls actor-arm-3 --listen tcp/127.0.0.1:7448"""
+  daedalus bridge --connect tls/gpu-box:7447 --tls actor-arm-3 --listen tcp/127.0.0.1:7448
+
+exit status: 0 stopped by a signal, 1 failed, 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus bridge`."""
     options = command_parser("bridge", DESCRIPTION, EXAMPLES)
-    add_connect(options, "where the learner, or a router that knows it, listens")
+    add_connect(options, "address of the learner or of its router. May be given several times")
     options.add_argument(
-        "--listen", default=LISTEN, metavar="tcp/HOST:PORT", help="where clients connect (default: %(default)s)"
+        "--listen", default=LISTEN, metavar="tcp/HOST:PORT", help="address where clients connect (default: %(default)s)"
     )
     add_tls(options)
     add_insecure(options)
@@ -45,15 +47,13 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Runs `daedalus bridge`."""
+    """Run `daedalus bridge` and return its exit status."""
     arguments = parser().parse_args()
     configure_logging(arguments.log_level, as_json=arguments.log_json, prefix="bridge: ")
     try:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
         if arguments.listen.startswith("tls/"):
-            raise AddressError(
-                f"{arguments.listen}: clients come to a bridge in the clear, listen on tcp/127.0.0.1:PORT"
-            )
+            raise AddressError(f"{arguments.listen}: the clients of a bridge use no TLS, listen on tcp/127.0.0.1:PORT")
         check_listening([arguments.listen], tls=False, insecure=arguments.insecure)
     except SECURITY_ERRORS as error:
         print(f"daedalus bridge: {error}", file=sys.stderr)
@@ -65,7 +65,7 @@ def main() -> int:
     except OSError as error:
         print(f"daedalus bridge: cannot listen on {arguments.listen}: {error.strerror}", file=sys.stderr)
         return 1
-    _logger.info(f"clients connect to tcp/{host}:{listener.getsockname()[1]}")
+    _logger.info("clients connect to tcp/%s:%d", host, listener.getsockname()[1])
     Bridge(listener, lambda: connect(arguments.connect, credentials)).run(stop)
     return 0
 

@@ -1,4 +1,4 @@
-"""`daedalus completion`: prints a script that completes the command line of `daedalus` in a shell."""
+"""`daedalus completion`: print a script that completes the command line of `daedalus` in a shell."""
 
 import argparse
 import importlib
@@ -18,7 +18,7 @@ examples:
   daedalus completion zsh > ~/.zfunc/_daedalus      (with fpath+=~/.zfunc before compinit in ~/.zshrc)
   daedalus completion tcsh > ~/.daedalus.completion.csh      (source it in ~/.tcshrc)"""
 
-# Where the parser of each command is: module in cli, function. Only this command imports them all.
+# Module in cli and function of the parser of each command. Only this command imports all of them.
 _PARSERS = {
     "train": ("commands.train", "train_parser"),
     "resume": ("commands.train", "resume_parser"),
@@ -43,14 +43,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def completion(arguments: list[str]) -> int:
-    """Runs `daedalus completion`."""
+    """Run `daedalus completion` and return its exit status."""
     parsed = parser().parse_args(arguments)
     print(shtab.complete(command_tree(), parsed.shell))
     return 0
 
 
 def command_tree() -> argparse.ArgumentParser:
-    """Return one parser of all commands, with what completes each argument; for completion only, not to parse with."""
+    """Return one parser of all commands, for completion only: its choices are not those of the commands."""
     root = argparse.ArgumentParser(prog="daedalus")
     commands = root.add_subparsers(metavar="COMMAND")
     for name, (module, function) in _PARSERS.items():
@@ -63,11 +63,11 @@ def command_tree() -> argparse.ArgumentParser:
 
 
 def _complete(action: argparse.Action) -> None:
-    """Say what completes an argument. The choices are not the parser's: it also takes files, and checks by itself."""
+    """Set the words or files that complete an argument. The command itself also accepts other values."""
     if action.dest == "preset":
         action.choices = preset_names()
     elif action.dest == "algorithm":
-        action.choices = list(ALGORITHMS)
+        action.choices = tuple(ALGORITHMS)
     elif action.type is Path:
         folder = action.metavar in ("DIR", "RUN_DIR")
         vars(action)["complete"] = shtab.DIRECTORY if folder else shtab.FILE

@@ -1,4 +1,4 @@
-"""`daedalus evaluate`: plays a run's best checkpoint, or a given one, and prints how it does."""
+"""`daedalus evaluate`: play episodes with a policy and print their returns."""
 
 import argparse
 import json
@@ -27,18 +27,23 @@ from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spec import EnvironmentSpec
 
 _PROGRESS_SECONDS = 5.0
-_FRAMES_PER_SECOND = 30.0  # of environments that do not say
+_FRAMES_PER_SECOND = 30.0  # of environments without render_fps
 _ATARI_FRAMES_PER_SECOND = 60.0
 
 
 class _StoppedError(Exception):
-    """Told to stop before the last episode ended."""
+    """Error of an evaluation that was stopped before its last episode ended."""
 
 
-def main(words: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
-    """Runs `daedalus evaluate`. Exit status: 0 done, 1 failed, or stopped by the event, 2 bad usage."""
-    arguments = parser().parse_args(words)
-    configure_logging(prefix="daedalus evaluate: ", write=lambda line: print(line, file=sys.stderr))
+def main(command_line: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
+    """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage."""
+    arguments = parser().parse_args(command_line)
+    configure_logging(
+        arguments.log_level,
+        as_json=arguments.log_json,
+        prefix="daedalus evaluate: ",
+        write=lambda line: print(line, file=sys.stderr),
+    )
     stop = stop or threading.Event()
     try:
         check(arguments)
@@ -50,7 +55,7 @@ def main(words: Sequence[str] | None = None, stop: threading.Event | None = None
     try:
         result = _evaluate(arguments, stop)
     except (_StoppedError, DamagedError, NoPolicyError, EnvironmentSetupError, PolicyError, VideoError) as error:
-        # The signal may have gone to the environments' processes as well; that they have ended is no news then.
+        # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
     print(json.dumps(result) if arguments.json else _text(result))
@@ -58,7 +63,7 @@ def main(words: Sequence[str] | None = None, stop: threading.Event | None = None
 
 
 def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
-    """Everything between the command line and the result."""
+    """Return the result of the evaluation that the arguments describe."""
     directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
     policy = find_policy(directory, arguments.newest)
     spec = _environment(policy, arguments)
@@ -78,7 +83,7 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
 
 
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
-    """What to play: as in training, but for whose implementation it is."""
+    """Return the environment to play: that of the training, on the backend of the evaluation."""
     trained = policy.spec.environment
     watched = arguments.video is not None or arguments.render
     backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
@@ -111,7 +116,7 @@ def _play(
         if environments.spaces != policy.spaces:
             raise EnvironmentSetupError(
                 f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
-                "choose another --backend, or install the version that the run used (versions.json)"
+                "choose another --backend, or install the versions that the run used (versions.json)"
             )
         runtime = OnnxRuntime(policy.program)
         runtime.load(policy.weights)
@@ -123,10 +128,10 @@ def _play(
 
 
 def _frames_per_second(spec: EnvironmentSpec) -> float:
-    """How fast an environment's own steps are meant to be seen."""
+    """Return the frames per second at which an environment's own steps are meant to be shown."""
     skipped = spec.kwargs.get("frameskip", 4)
     if spec.id.startswith("ALE/") and isinstance(skipped, int):
-        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30, whatever it skips
+        return _ATARI_FRAMES_PER_SECOND / skipped  # its metadata say 30 for any frameskip
     maker = gymnasium.spec(spec.id.rpartition(":")[2]).entry_point
     metadata = getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "metadata", {})
     return float(metadata.get("render_fps", _FRAMES_PER_SECOND))
@@ -167,7 +172,10 @@ def _text(result: dict[str, Any]) -> str:
 
 
 class _Progress:
-    """Says every few seconds how far the episodes are: one line, rewritten on a terminal. Ends them when told to."""
+    """Callback that reports progress every few seconds, and raises _StoppedError when `stop` is set.
+
+    On a terminal it rewrites one line.
+    """
 
     def __init__(self, stream: TextIO, episodes: int, stop: threading.Event) -> None:
         self._stream, self._episodes, self._stop = stream, episodes, stop
@@ -188,7 +196,7 @@ class _Progress:
         self._rewriting = self._terminal
 
     def end(self) -> None:
-        """Takes the rewritten line away."""
+        """Clear the rewritten line."""
         if self._rewriting:
             self._stream.write("\r\x1b[K")
             self._stream.flush()

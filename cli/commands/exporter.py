@@ -1,7 +1,8 @@
-"""`daedalus exporter`: the status of learners as Prometheus metrics over HTTP."""
+"""`daedalus exporter`: serve the status of learners as Prometheus metrics over HTTP."""
 
 import argparse
 import contextlib
+import logging
 import sys
 import threading
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.commands.status import ask
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import ProtocolError
 from daedalus.transport.connecting import connect_with_retry
@@ -20,52 +21,55 @@ from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
+_logger = logging.getLogger(__name__)
+
 _LISTEN = "127.0.0.1:9464"
-_REOPEN_SECONDS = 10.0  # how often a session that brings no answer is replaced by another
+_REOPEN_SECONDS = 10.0  # after this time without an answer, a new session replaces the old one
 
 _DESCRIPTION = """\
-Serves what `daedalus status` shows as Prometheus metrics: asks the learners at each scrape, remembers nothing. May
-start before them; while none answers, daedalus_up is 0. deploy/grafana holds a dashboard for it."""
+Serves the values of `daedalus status` as Prometheus metrics. It queries the learners at each scrape and stores nothing.
+It may start before a learner: while no learner answers, daedalus_up is 0. deploy/grafana has a dashboard."""
 
 _EXAMPLES = """\
 examples:
   daedalus exporter --connect tcp/127.0.0.1:7447         then: curl http://127.0.0.1:9464/metrics
   daedalus exporter --connect tcp/router:7447 --listen 0.0.0.0:9464
 
-exit status: 0 it was told to stop, 1 it cannot listen there or is not let in, 2 bad usage"""
+exit status: 0 stopped by a signal, 1 the address is in use or the router rejects the certificate, 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus exporter` takes."""
+    """Return the parser of `daedalus exporter`."""
     options = command_parser("exporter", _DESCRIPTION, _EXAMPLES)
-    add_connect(options, "where the learner, or its router, listens")
+    add_connect(options, "address of the learner or of its router. May be given several times")
     options.add_argument(
         "--listen",
         default=_LISTEN,
         type=_host_and_port,
         metavar="HOST:PORT",
-        help="where Prometheus scrapes (default: %(default)s)",
+        help="address that Prometheus scrapes (default: %(default)s)",
     )
     add_tls(options)
+    add_logging(options)
     return options
 
 
 def _host_and_port(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT: write for example {_LISTEN}")
     return host.strip("[]"), int(port)
 
 
 class StatusCollector:
-    """Asks the learners whenever it is scraped; what one scrape costs is bounded by the status query's time."""
+    """Collector that queries the learners at each scrape. The timeout of the query bounds the time of a scrape."""
 
     def __init__(self) -> None:
-        self.transport: Transport | None = None  # once there is a router
-        self.unanswered = False  # at the last scrape
+        self.transport: Transport | None = None  # None until a router answers
+        self.unanswered = False  # whether no learner answered the last scrape
 
     def collect(self) -> Iterator["Metric"]:
-        """The metrics as of now."""
+        """Query the learners and return their metrics."""
         from daedalus.cli.prometheus_metrics import metrics
 
         statuses = []
@@ -76,24 +80,27 @@ class StatusCollector:
         return metrics(statuses)
 
     def describe(self) -> list["Metric"]:
-        """Nothing: else the registry would ask the learners to find out."""
+        """Return nothing, so that the registry does not query the learners to find the metrics."""
         return []
 
 
 def exporter(arguments: list[str]) -> int:
-    """Runs `daedalus exporter`."""
+    """Run `daedalus exporter` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
         from prometheus_client import CollectorRegistry, start_http_server
     except ModuleNotFoundError:
-        print('daedalus exporter: needs prometheus-client: pip install "daedalus-rl[monitoring]"', file=sys.stderr)
+        print(
+            'daedalus exporter: prometheus-client is not installed: pip install "daedalus-rl[monitoring]"',
+            file=sys.stderr,
+        )
         return 1
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
         print(f"daedalus exporter: {error}", file=sys.stderr)
         return 2
-    configure_logging(prefix="exporter: ")
+    configure_logging(parsed.log_level, as_json=parsed.log_json, prefix="exporter: ")
     stop = stop_on_signals()
     collector, registry = StatusCollector(), CollectorRegistry()
     registry.register(collector)
@@ -101,12 +108,15 @@ def exporter(arguments: list[str]) -> int:
     try:
         server, thread = start_http_server(port, host, registry)
     except OSError as error:
-        print(f"daedalus exporter: cannot listen on {host}:{port}: {error.strerror}", file=sys.stderr)
+        print(
+            f"daedalus exporter: cannot listen on {host}:{port}: {error.strerror}: choose another --listen",
+            file=sys.stderr,
+        )
         return 1
-    print(f"exporter: http://{host}:{server.server_port}/metrics", flush=True)
+    _logger.info("serving http://%s:%d/metrics", host, server.server_port)
     try:
         _follow(collector, parsed.connect, credentials, stop)
-    except TransportError as error:  # no waiting mends it
+    except TransportError as error:  # retrying will not help
         print(f"daedalus exporter: {error}", file=sys.stderr)
         return 1
     finally:
@@ -119,8 +129,7 @@ def exporter(arguments: list[str]) -> int:
 def _follow(
     collector: StatusCollector, endpoints: list[str], credentials: Credentials | None, stop: threading.Event
 ) -> None:
-    """Keeps the collector connected, until told to stop. Raises TransportError if it will never be let in."""
-
+    """Keep the collector connected until a signal. Raises TransportError if the router rejects the certificate."""
     transport = connect_with_retry(endpoints, stop, credentials=credentials)
     if transport is None:
         return
@@ -128,7 +137,7 @@ def _follow(
     try:
         while not stop.wait(_REOPEN_SECONDS):
             if collector.unanswered:
-                # It reconnects by itself, unless the link is dead without a word.
+                # Zenoh reconnects by itself, except if the connection died without an error.
                 with contextlib.suppress(TransportError):
                     transport.reopen()
     finally:

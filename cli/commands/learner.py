@@ -1,19 +1,21 @@
-"""`daedalus learner`: constructs one learner and runs it.
+"""`daedalus learner`: construct one learner and run it.
 
-Exit status: 0 the target was reached or the asked-for steps were done, 3 the budget ended without the target,
-1 failed or stopped early, 2 bad usage.
+Exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
+before the target, 1 failed or stopped early, 2 bad usage.
 """
 
 import argparse
 import logging
 import sys
+import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
-from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_again
+from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_to_resume
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
@@ -27,8 +29,8 @@ from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import CredentialsError
-from daedalus.transport.interface import TransportError
+from daedalus.transport.credentials import Credentials, CredentialsError
+from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
 from daedalus.transport.zenoh_transport import listen
 
@@ -40,8 +42,17 @@ if TYPE_CHECKING:
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    """Run to train, from the command line."""
+
+    spec: RunSpec
+    directory: Path
+    exists: bool  # whether the run directory was created before
+
+
 def main() -> int:
-    """Runs `daedalus learner`."""
+    """Run `daedalus learner` and return its exit status."""
     started = time.monotonic()
     arguments = learner_parser().parse_args()
     keep_freed_memory()
@@ -49,48 +60,24 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        spec, directory, begun = _what(arguments)
-        addresses = arguments.listen or [LISTEN]
-        if arguments.connect:
-            credentials = credentials_to_connect(arguments.connect, arguments.tls, "learner")
-        else:
-            credentials = credentials_to_listen(addresses, arguments.tls, "learner", insecure=arguments.insecure)
+        run = _resolve(arguments)
+        credentials = _credentials(arguments)
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
-    progress = Progress(sys.stdout, spec.training.env_steps)
+    progress = Progress(sys.stdout, run.spec.training.env_steps)
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
-        restored = None
-        if arguments.resume and begun:
-            restored = _newest_checkpoint(directory)
-        if arguments.connect:
-            transport = connect_with_retry(arguments.connect, stop, credentials=credentials)
-        else:
-            transport = listen(addresses, credentials=credentials)
-        if transport is None:
-            return FAILED
+        restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
+        transport = _open_transport(arguments, credentials, stop)
     except (TransportError, DamagedError, CredentialsError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
+    if transport is None:  # stopped while no router answered
+        return FAILED
     try:
-        if not begun:
-            run_directory.create(directory, spec)
-        if arguments.prepared is None:
-            there = ", ".join(arguments.connect or addresses)
-            _logger.info(f"run {directory}: learning {spec.environment.id} with {spec.training.algorithm}")
-            _logger.info(f"actors join with: daedalus actor --connect {there}")
-        service = LearnerService(
-            spec,
-            directory,
-            transport,
-            stop,
-            progress,
-            [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
-            started=arguments.started or started,
-            restored=restored,
-        )
-        return _status(service.run(), spec)
+        _announce(run, arguments)
+        return _train(run, transport, stop, progress, arguments.started or started, restored)
     except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -98,34 +85,92 @@ def main() -> int:
         transport.close()
 
 
-def _what(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
-    """The run to learn, where it goes, and whether it was begun before. Raises SettingsError."""
+def _resolve(arguments: argparse.Namespace) -> _Run:
+    """Return the run that the arguments define. Raises SettingsError."""
     if arguments.prepared:
-        return run_directory.read_config(arguments.prepared), arguments.prepared, True
+        return _Run(spec=run_directory.read_config(arguments.prepared), directory=arguments.prepared, exists=True)
     if arguments.resume:
-        spec, directory, begun = resolve_again(arguments)
+        spec, directory, exists = resolve_to_resume(arguments)
     else:
         spec, directory = resolve(arguments)
-        begun = False
-    if not begun:
+        exists = False
+    if not exists:
         run_directory.check_free(directory)
-    return spec, directory, begun
+    return _Run(spec=spec, directory=directory, exists=exists)
+
+
+def _credentials(arguments: argparse.Namespace) -> Credentials | None:
+    """Return the credentials for the addresses, or None without TLS. Raises SECURITY_ERRORS."""
+    if arguments.connect:
+        return credentials_to_connect(arguments.connect, arguments.tls, "learner")
+    return credentials_to_listen(_addresses(arguments), arguments.tls, "learner", insecure=arguments.insecure)
+
+
+def _addresses(arguments: argparse.Namespace) -> list[str]:
+    """Return the addresses that actors connect to."""
+    return arguments.connect or arguments.listen or [LISTEN]
+
+
+def _open_transport(
+    arguments: argparse.Namespace, credentials: Credentials | None, stop: threading.Event
+) -> Transport | None:
+    """Connect to a router or listen for actors; return None if stopped before a router answered.
+
+    Raises TransportError or CredentialsError.
+    """
+    if arguments.connect:
+        return connect_with_retry(arguments.connect, stop, credentials=credentials)
+    return listen(_addresses(arguments), credentials=credentials)
+
+
+def _announce(run: _Run, arguments: argparse.Namespace) -> None:
+    """Create the run directory if it is new, and log how actors join. Raises SettingsError."""
+    if not run.exists:
+        run_directory.create(run.directory, run.spec)
+    if arguments.prepared is None:
+        spec = run.spec
+        _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
+        _logger.info("actors join with: daedalus actor --connect %s", ", ".join(_addresses(arguments)))
+
+
+def _train(
+    run: _Run,
+    transport: Transport,
+    stop: threading.Event,
+    progress: Progress,
+    started: float,
+    restored: "Checkpoint | None",
+) -> int:
+    """Run the learner to its end and return the exit status."""
+    directory = run.directory
+    service = LearnerService(
+        run.spec,
+        directory,
+        transport,
+        stop,
+        progress,
+        [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
+        started=started,
+        restored=restored,
+    )
+    return _status(service.run(), run.spec)
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
-    """What to go on from; None if the run ended before its first checkpoint. Raises DamagedError if none is whole."""
+    """Return the newest undamaged checkpoint, or None if there is none yet. Raises DamagedError if all are damaged."""
     if not checkpoints(directory):
-        _logger.info("there is no checkpoint yet: the run starts from its beginning")
+        _logger.info("no checkpoint found: the run starts from the beginning")
         return None
     from daedalus.learner.training.checkpoint import load_newest
 
     restored = load_newest(directory)
-    steps = restored.counters["env_steps"]
-    _logger.info(f"going on from checkpoint {restored.policy.policy_version} at {steps:,} env_steps")
+    steps = f"{restored.counters['env_steps']:,}"
+    _logger.info("resuming from checkpoint %d at %s env_steps", restored.policy.policy_version, steps)
     return restored
 
 
 def _status(outcome: Outcome, spec: RunSpec) -> int:
+    """Return the exit status for the end of a run."""
     if not outcome.finished:
         return FAILED
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved

@@ -1,4 +1,4 @@
-"""`daedalus plot`: the curves of one or more runs, from their metrics.csv, as one picture."""
+"""`daedalus plot`: draw the learning curves of one or more runs from their metrics.csv."""
 
 import argparse
 import csv
@@ -6,12 +6,17 @@ import math
 import sys
 from pathlib import Path
 
+from daedalus.cli.arguments import command_parser
 from daedalus.learner.run.run_directory import METRICS
+
+_DESCRIPTION = "Draws return, entropy, value loss and policy lag of runs over their env_steps."
 
 _EXAMPLES = """\
 examples:
   daedalus plot runs/cartpole-impala-s1-20261121-101500 --output curve.png
-  daedalus plot runs/cartpole-*-s1-* --output algorithms.png"""
+  daedalus plot runs/cartpole-*-s1-* --output algorithms.png
+
+exit status: 0 done, 1 failed, 2 bad usage"""
 
 _PANELS = (
     ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: evaluations)"),
@@ -23,25 +28,24 @@ _PANELS = (
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus plot`."""
-    options = argparse.ArgumentParser(
-        prog="daedalus plot",
-        description="Draws return, entropy, value loss and policy lag against env_steps.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    options = command_parser("plot", _DESCRIPTION, _EXAMPLES)
+    options.add_argument(
+        "directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, each in one colour"
     )
-    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, one colour each")
-    options.add_argument("--output", type=Path, required=True, metavar="FILE", help="the picture: .png, .svg or .pdf")
+    options.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
+    )
     return options
 
 
 def plot(arguments: list[str]) -> int:
-    """Runs `daedalus plot`. Exit status: 0 drawn, 1 failed."""
+    """Run `daedalus plot` and return its exit status: 0 done, 1 failed."""
     parsed = parser().parse_args(arguments)
     try:
         runs = {directory.name: _read(directory) for directory in parsed.directories}
         _draw(runs, parsed.output)
     except ModuleNotFoundError:
-        print('daedalus plot: needs matplotlib: pip install "daedalus-rl[plot]"', file=sys.stderr)
+        print('daedalus plot: matplotlib is not installed: pip install "daedalus-rl[plot]"', file=sys.stderr)
         return 1
     except (OSError, ValueError) as error:
         print(f"daedalus plot: {error}", file=sys.stderr)
@@ -51,16 +55,16 @@ def plot(arguments: list[str]) -> int:
 
 
 def _read(directory: Path) -> dict[str, list[float]]:
-    """Columns of a run's metrics; unknown values are NaN."""
+    """Return the columns of a run's metrics. Unknown values are NaN."""
     with open(directory / METRICS, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     if not rows:
-        raise ValueError(f"{directory / METRICS} has no rows yet")
+        raise ValueError(f"{directory / METRICS} has no rows yet: wait until the run has made its first updates")
     return {name: [float(row[name]) if row[name] else float("nan") for row in rows] for name in rows[0]}
 
 
 def _evaluations(run: dict[str, list[float]]) -> tuple[list[float], list[float]]:
-    """At which env_steps a run was evaluated, and the mean returns; empty where it was not."""
+    """Return the env_steps and mean returns of a run's evaluations, or empty lists if there are none."""
     env_steps, returns = run.get("evaluation_env_steps", []), run.get("evaluation_return_mean", [])
     by_env_steps = {at: mean for at, mean in zip(env_steps, returns, strict=True) if not math.isnan(at)}
     return list(by_env_steps), list(by_env_steps.values())

@@ -1,9 +1,11 @@
-"""`daedalus router`: a Zenoh router on its own, which learner and actors meet at."""
+"""`daedalus router`: run a Zenoh router that a learner and its actors connect to."""
 
 import argparse
+import logging
 import sys
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
 from daedalus.transport.addresses import check_connecting
@@ -12,45 +14,49 @@ from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 from daedalus.transport.zenoh_transport import listen
 
+_logger = logging.getLogger(__name__)
+
 _DESCRIPTION = """\
-Carries the traffic between a learner and its actors, in a process of its own: a learner that is restarted, or moved
-to another host, keeps its address. It holds no state, so it can be restarted too. Any other Zenoh router of the same
-version, such as zenohd, does as well. Stops at SIGTERM or Ctrl-C."""
+Forwards the traffic between a learner and its actors. With a router of its own, a learner can restart or move to
+another host, and the actors keep the same address. The router stores nothing, so it can restart too. Any other Zenoh
+router of the same version works as well, such as zenohd. SIGTERM or Ctrl-C stops it."""
 
 _EXAMPLES = """\
 examples:
   daedalus router                                          then: daedalus learner cartpole --connect tcp/127.0.0.1:7447
-  daedalus router --listen tcp/0.0.0.0:7447 --insecure     other hosts may come: on a trusted network only
+  daedalus router --listen tcp/0.0.0.0:7447 --insecure     for other hosts, on a trusted network only
   daedalus router --listen tls/0.0.0.0:7447 --tls certs/router     on any network (daedalus certs --help)
-  daedalus router --connect tcp/gpu-box:7447               joins another router; actors here need this one's address
+  daedalus router --connect tcp/gpu-box:7447               joins another router: actors may use either address
 
-exit status: 0 it was told to stop, 1 it cannot listen there, 2 bad usage"""
+exit status: 0 stopped by a signal, 1 cannot listen at the address, 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus router` takes."""
+    """Return the parser of `daedalus router`."""
     options = command_parser("router", _DESCRIPTION, _EXAMPLES)
     options.add_argument(
         "--listen",
         default=LISTEN,
         metavar="tcp/HOST:PORT",
-        help="where learner and actors connect (default: %(default)s)",
+        help="address where learner and actors connect (default: %(default)s)",
     )
     options.add_argument(
         "--connect",
         action="append",
         default=[],
         metavar="tcp/HOST:PORT",
-        help="another router to join, now or as soon as it is there; may be given several times",
+        help="another router to join, now or when it starts. May be given several times",
     )
     add_tls(options)
     add_insecure(options)
+    add_logging(options)
     return options
 
 
 def router(arguments: list[str]) -> int:
-    """Runs `daedalus router`."""
+    """Run `daedalus router` and return its exit status."""
     parsed = parser().parse_args(arguments)
+    configure_logging(parsed.log_level, as_json=parsed.log_json, prefix="router: ")
     try:
         if parsed.connect:
             check_connecting(parsed.connect, tls=parsed.tls is not None)
@@ -65,7 +71,7 @@ def router(arguments: list[str]) -> int:
         print(f"daedalus router: {error}", file=sys.stderr)
         return 1
     try:
-        print(f"router: listening on {parsed.listen}", flush=True)
+        _logger.info("listening on %s", parsed.listen)
         stop.wait()
     finally:
         transport.close()

@@ -1,4 +1,4 @@
-"""`daedalus status`: the service and its fleet as the learner sees them, for a person or for a health check."""
+"""`daedalus status`: show the state of a learner and its actors, for a person or for a health check."""
 
 import argparse
 import sys
@@ -16,41 +16,42 @@ from daedalus.transport.zenoh_transport import connect
 HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
 
 _DESCRIPTION = """\
-Asks the learners at an address how they and their actors fare. As a health check it says by its exit status
-whether the service does its work: actors take part, updates are made, checkpoints are saved."""
+Shows the state of the learners at an address and of their actors. The exit status serves as a health check: a learner
+is healthy if actors take part, updates are made and checkpoints are saved."""
 
 _EXAMPLES = """\
 examples:
   daedalus status --connect tcp/127.0.0.1:7447
   daedalus status --connect tcp/gpu-box:7447 --json
-  daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo somebody should look
+  daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
 
-MB/h up: rollouts; down: snapshots, with an s where the link is slow and they are fetched small.
+MB/h up counts rollouts, MB/h down counts snapshots. An s marks an actor that fetches compact snapshots, over a slow
+link.
 
-exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the problems stand in the answer)"""
+exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems)"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parses what `daedalus status` takes."""
+    """Return the parser of `daedalus status`."""
     options = command_parser("status", _DESCRIPTION, _EXAMPLES)
-    add_connect(options, "where the learner, or its router, listens")
-    options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="only this run")
-    how = options.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print each as one JSON object a line")
-    how.add_argument("--quiet", action="store_true", help="print problems only")
+    add_connect(options, "address of the learner or of its router. May be given several times")
+    options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="show only this run")
+    output = options.add_mutually_exclusive_group()
+    output.add_argument("--json", action="store_true", help="print each run as one JSON object per line")
+    output.add_argument("--quiet", action="store_true", help="print only problems")
     add_tls(options)
     return options
 
 
 def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
-    """What the learners behind a transport tell, within 5 s. Raises TransportError or ProtocolError."""
+    """Return the status of each learner that answers within 5 s. Raises TransportError or ProtocolError."""
     answers = transport.query(keys.status(run), timeout=5.0)
     reports = [decode(answer, STATUS_LIMITS) for answer in answers]
     return [report.status for report in reports if isinstance(report, StatusReport)]
 
 
 def status(arguments: list[str]) -> int:
-    """Runs `daedalus status`."""
+    """Run `daedalus status` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
@@ -67,7 +68,7 @@ def status(arguments: list[str]) -> int:
         print(f"daedalus status: {error}", file=sys.stderr)
         return NO_ANSWER
     if not statuses:
-        print("daedalus status: no learner answers there", file=sys.stderr)
+        print("daedalus status: no learner answers at this address: is a learner running?", file=sys.stderr)
         return NO_ANSWER
     for status in statuses:
         if parsed.json:

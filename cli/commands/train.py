@@ -1,4 +1,4 @@
-"""`daedalus train` and `daedalus resume`: a learner and actors on this machine, watched to their end."""
+"""`daedalus train` and `daedalus resume`: train with a learner and actors on this machine, and evaluate the policy."""
 
 import argparse
 import sys
@@ -7,7 +7,7 @@ from typing import Any
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.settings_arguments import add_settings, resolve
 from daedalus.learner.run import run_directory
@@ -16,10 +16,10 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
-Starts a learner and actors as processes of this machine and shows how they learn. Stops when the target is
-reached or the budget is used up, then plays 100 episodes (evaluation.final_episodes) with the best policy
-that was found, or with the last. Where the run was evaluated on a schedule (evaluation.seconds), the best is
-chosen among the three that scored highest and the last, by as many fresh episodes of each."""
+Starts a learner and actors as processes of this machine and shows their progress. Training stops when the target is
+reached or the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes). If the run was
+evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as many new episodes
+each to select the best. Otherwise the newest policy is used."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -29,21 +29,23 @@ examples:
   daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
   daedalus train cartpole --set training.stop_when_solved=false --env-steps 5000000
 
-exit status: 0 the target was reached or the asked-for steps were done, 3 the budget ended without the target,
-1 failed or stopped, 2 bad usage"""
+exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
+before the target, 1 failed or stopped, 2 bad usage"""
 
 _RESUME = """\
-Continues a run from its newest checkpoint that is whole: weights, optimiser, counters and random state go on
-as they were; the environments start new episodes."""
+Continues a run from its newest undamaged checkpoint, with the same weights, optimiser state, counters and random state.
+The environments start new episodes."""
 
 _RESUME_EXAMPLES = """\
 examples:
   daedalus resume runs/cartpole-impala-s1-20261121-101500
-  daedalus resume RUN_DIR --env-steps 3000000      (the whole budget, the steps already done included)"""
+  daedalus resume RUN_DIR --env-steps 3000000      (the whole budget, with the steps already done)
+
+exit status: as of daedalus train"""
 
 
 def train(arguments: list[str]) -> int:
-    """Runs `daedalus train`."""
+    """Run `daedalus train` and return its exit status."""
     started = process_started()
     parsed = train_parser().parse_args(arguments)
     try:
@@ -57,7 +59,7 @@ def train(arguments: list[str]) -> int:
 
 
 def resume(arguments: list[str]) -> int:
-    """Runs `daedalus resume`."""
+    """Run `daedalus resume` and return its exit status."""
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
     try:
@@ -76,32 +78,33 @@ def train_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus train`."""
     options = command_parser("train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
-    _add_where(options)
+    _add_machine_options(options)
     return options
 
 
 def resume_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus resume`."""
     options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
-    options.add_argument("directory", type=Path, metavar="RUN_DIR", help="the run to continue")
-    options.add_argument("--env-steps", type=int, metavar="N", help="a new budget (default: the one it had)")
-    _add_where(options)
+    options.add_argument("directory", type=Path, metavar="RUN_DIR", help="run to continue")
+    options.add_argument("--env-steps", type=int, metavar="N", help="new budget (default: the budget of the run)")
+    _add_machine_options(options)
     return options
 
 
-def _add_where(options: argparse.ArgumentParser) -> None:
+def _add_machine_options(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--listen",
         metavar="tcp/HOST:PORT",
-        help="where more actors may join (default: a free port of this machine)",
+        help="address where more actors may join (default: a free port of this machine)",
     )
     add_tls(options)
     add_insecure(options)
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
-        help="your own transform, for this machine's actors: takes each gymnasium environment, returns the one to play",
+        help="your function that takes each gymnasium environment of these actors and returns the environment to play",
     )
+    add_logging(options)
 
 
 def _check_listening(parsed: argparse.Namespace) -> None:
@@ -119,10 +122,12 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
         tls=parsed.tls,
         insecure=parsed.insecure,
         wrap=parsed.wrap,
+        log_level=parsed.log_level,
+        log_json=parsed.log_json,
     )
-    # The learner rewrites a line of progress on the same terminal: a record takes its place.
+    # The learner rewrites a line of progress on the same terminal: a record replaces this line.
     clear = "\r\x1b[K" if sys.stdout.isatty() else ""
-    configure_logging(write=lambda line: print(f"{clear}{line}", flush=True))
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=lambda line: print(f"{clear}{line}", flush=True))
     try:
         end = run_locally(run, stop_on_signals())
     except RunStoppedError:
@@ -153,5 +158,5 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['backend']}'s {evaluation['environment']}"
     )
-    folder = f"all of it lies in {run.directory}; draw it with: daedalus plot {run.directory} --output curve.png"
+    folder = f"run directory: {run.directory}; draw the curves with: daedalus plot {run.directory} --output curve.png"
     return f"{trained}\n{evaluated}\n{folder}"

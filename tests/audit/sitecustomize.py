@@ -1,4 +1,4 @@
-"""Ends any process that unpickles a class or a function: with this folder on PYTHONPATH, Python loads it by itself."""
+"""Audit hook that ends a process that unpickles a class or function. Python loads this file from PYTHONPATH."""
 
 import os
 import sys

@@ -58,7 +58,7 @@ def test_presence_of_a_killed_client_ends(start: Start, address: str, router: Tr
     ("arguments", "complaint"),
     [
         (("--listen", "localhost"), "not an address"),
-        (("--listen", "tls/127.0.0.1:0"), "in the clear"),
+        (("--listen", "tls/127.0.0.1:0"), "use no TLS"),
         (("--listen", "tcp/0.0.0.0:0"), "is unencrypted and open to every host"),
         (("--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
     ],

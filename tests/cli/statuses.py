@@ -1,4 +1,4 @@
-"""Statuses as a learner would send them."""
+"""Examples of the status that a learner sends."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`daedalus certs`: what it makes, and what it refuses."""
+"""Test of `daedalus certs`."""
 
 import json
 import stat
@@ -15,20 +15,22 @@ def make(directory: Path) -> Path:
     return directory
 
 
-def test_a_new_ca_makes_the_first_identities(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_creates_a_ca_and_certificates_for_learner_router_and_operator(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     made = make(tmp_path / "certs")
     assert sorted(entry.name for entry in made.iterdir()) == ["ca", "learner", "operator", "router"]
     for role in ("learner", "router", "operator"):
         assert load(made / role, role).role == role
-    assert "reached as gpu-box, " in capsys.readouterr().out
+    assert "valid for gpu-box, " in capsys.readouterr().out
 
 
-def test_keys_are_for_nobody_else(tmp_path: Path) -> None:
+def test_a_key_file_is_readable_by_its_owner_only(tmp_path: Path) -> None:
     for key in make(tmp_path / "certs").rglob("key.pem"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
 
 
-def test_actors_are_known_to_those_who_let_them_in(tmp_path: Path) -> None:
+def test_issue_and_revoke_update_the_authorised_names_of_learner_and_router(tmp_path: Path) -> None:
     made = make(tmp_path / "certs")
     assert certs(["issue", "actor", "arm", "box", "--directory", str(made)]) == 0
     assert certs(["issue", "operator", "ann", "--directory", str(made)]) == 0
@@ -46,7 +48,7 @@ def test_actors_are_known_to_those_who_let_them_in(tmp_path: Path) -> None:
     assert not (made / "actor-box").exists()
 
 
-def test_an_actor_may_bear_the_name_of_a_role(tmp_path: Path) -> None:
+def test_an_actor_may_have_the_name_of_a_role(tmp_path: Path) -> None:
     made = make(tmp_path / "certs")
     assert certs(["issue", "actor", "learner", "operator", "--directory", str(made)]) == 0
     assert load(made / "actor-learner", "actor").name == "learner"
@@ -57,15 +59,15 @@ def test_an_actor_may_bear_the_name_of_a_role(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["init", "{certs}"], "is not empty"),
-        (["issue", "actor", "--directory", "{certs}"], "issued by name"),
-        (["issue", "learner", "x", "--directory", "{certs}"], "issued by name"),
-        (["issue", "actor", "a.b", "--directory", "{certs}"], "no '.' in a certificate's name"),
+        (["issue", "actor", "--directory", "{certs}"], "wrong number of names"),
+        (["issue", "learner", "x", "--directory", "{certs}"], "wrong number of names"),
+        (["issue", "actor", "a.b", "--directory", "{certs}"], "'a.b' has a '.': name it 'a'"),
         (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
         (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
         (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a"),
     ],
 )
-def test_mistakes_are_told_in_a_line(
+def test_a_mistake_is_reported_in_one_line_and_changes_no_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     made = make(tmp_path / "certs")

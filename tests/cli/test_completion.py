@@ -1,4 +1,4 @@
-"""`daedalus completion`: its bash script is asked through bash itself what completes a line."""
+"""Test of `daedalus completion`: bash itself runs the script."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from daedalus.cli.commands.completion import _PARSERS, command_tree, completion
 from daedalus.learner.run.settings import preset_names
 
 BASH = shutil.which("bash")
-needs_bash = pytest.mark.skipif(BASH is None, reason="there is no bash here")
+needs_bash = pytest.mark.skipif(BASH is None, reason="bash is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def completed(script: Path, line: str) -> set[str]:
-    """What bash offers for the last word of a line, as it does when Tab is pressed."""
+    """Return what bash offers for the last word of a line when Tab is pressed."""
     program = (
         'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}\n'
         "function=$(complete -p daedalus | sed 's/.*-F \\([^ ]*\\).*/\\1/')\n"
@@ -66,7 +66,7 @@ def test_the_script_is_valid_bash(script: Path) -> None:
         ("daedalus completion z", {"zsh"}),
     ],
 )
-def test_bash_completes(script: Path, line: str, expected: set[str]) -> None:
+def test_bash_completes_commands_options_and_values(script: Path, line: str, expected: set[str]) -> None:
     assert completed(script, line) == expected
 
 
@@ -85,18 +85,18 @@ def test_a_script_for_each_shell_names_every_command(shell: str, capsys: pytest.
     assert set(re.findall(r"[\w-]+", output)) >= set(_PARSERS)
 
 
-def test_every_command_is_completed_and_its_hidden_options_are_not(script: Path) -> None:
+def test_every_command_is_completed_without_its_hidden_options(script: Path) -> None:
     assert _PARSERS.keys() == {*main._MODULES, *main._COMMANDS}
     assert "--exit-with-parent" not in script.read_text()
     assert "--prepared" not in script.read_text()
 
 
-def test_the_tree_says_what_each_command_does() -> None:
+def test_the_tree_describes_each_command() -> None:
     text = command_tree().format_help()
     assert "Starts a learner and actors as processes of this machine" in " ".join(text.split())
 
 
-def test_no_other_command_loads_the_parsers_of_all() -> None:
+def test_another_command_does_not_load_the_completion() -> None:
     program = "import sys, daedalus.cli.commands.train; print('shtab' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"

@@ -1,4 +1,4 @@
-"""cli/commands/exporter.py: what it does with a network, and with mistakes."""
+"""Test of cli/commands/exporter.py: scrapes over a network, and mistakes on the command line."""
 
 import socket
 import sys
@@ -35,7 +35,7 @@ def collector(network: MemoryNetwork) -> StatusCollector:
     return collector
 
 
-def test_every_scrape_asks_anew(network: MemoryNetwork, collector: StatusCollector) -> None:
+def test_each_scrape_queries_the_learners_again(network: MemoryNetwork, collector: StatusCollector) -> None:
     assert (up(collector), collector.unanswered) == (0.0, True)
     learner = MemoryTransport(network)
     answer = encode(StatusReport(status=run_status()))
@@ -45,16 +45,16 @@ def test_every_scrape_asks_anew(network: MemoryNetwork, collector: StatusCollect
     assert (up(collector), collector.unanswered) == (0.0, True)
 
 
-def test_without_a_router_no_learner_is_up() -> None:
+def test_no_learner_is_up_without_a_router() -> None:
     assert up(StatusCollector()) == 0.0
 
 
-def test_an_answer_that_is_none_of_ours_is_no_learner(network: MemoryNetwork, collector: StatusCollector) -> None:
+def test_an_invalid_answer_does_not_count_as_a_learner(network: MemoryNetwork, collector: StatusCollector) -> None:
     MemoryTransport(network).serve(keys.status("mine"), lambda request: request.reply(b"nonsense"))
     assert up(collector) == 0.0
 
 
-def test_a_failing_transport_is_no_learner(collector: StatusCollector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_learner_is_up_if_the_transport_fails(collector: StatusCollector, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_arguments: object, **_options: object) -> list[bytes]:
         raise TransportError("closed")
 
@@ -62,12 +62,12 @@ def test_a_failing_transport_is_no_learner(collector: StatusCollector, monkeypat
     assert up(collector) == 0.0
 
 
-def test_to_register_it_asks_nobody(collector: StatusCollector) -> None:
+def test_registering_the_collector_queries_no_learner(collector: StatusCollector) -> None:
     CollectorRegistry().register(collector)
     assert not collector.unanswered
 
 
-def test_a_missing_package_is_told_with_its_extra(
+def test_a_missing_package_is_reported_with_the_extra_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
@@ -78,14 +78,14 @@ def test_a_missing_package_is_told_with_its_extra(
 
 
 @pytest.mark.parametrize("listen", ["9464", ":9464", "host:", "host:metrics", "host:65536"])
-def test_a_bad_address_is_bad_usage(listen: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_listening_address_is_bad_usage(listen: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         exporter(["--connect", UNUSED, "--listen", listen])
     assert ended.value.code == 2
     assert "is not HOST:PORT" in capsys.readouterr().err
 
 
-def test_an_address_in_use_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_in_use_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

@@ -1,4 +1,4 @@
-"""cli/commands/plot.py: what is drawn."""
+"""Test of cli/commands/plot.py."""
 
 import math
 from pathlib import Path
@@ -16,14 +16,14 @@ env_steps,episode_return_mean,episode_return_std,entropy,value_loss,policy_lag_m
 """
 
 
-def test_each_evaluation_is_one_point() -> None:
+def test_each_evaluation_becomes_one_point() -> None:
     nan = math.nan
     run = {"evaluation_env_steps": [nan, 150.0, 150.0, 350.0], "evaluation_return_mean": [nan, 7.0, 7.0, 9.0]}
     assert _evaluations(run) == ([150.0, 350.0], [7.0, 9.0])
     assert _evaluations({"env_steps": [1.0]}) == ([], [])
 
 
-def test_a_run_with_evaluations_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plot_writes_a_picture_of_a_run_with_evaluations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     (tmp_path / "metrics.csv").write_text(ROWS)
     assert plot([str(tmp_path), "--output", str(tmp_path / "curve.png")]) == 0, capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""cli/prometheus_metrics.py: a status in Prometheus' words."""
+"""Test of cli/prometheus_metrics.py."""
 
 from collections.abc import Iterable
 
@@ -14,7 +14,7 @@ from daedalus.protocol.status import RunStatus
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
-class Fixed:
+class FixedCollector:
     def __init__(self, statuses: Iterable[RunStatus]) -> None:
         self.statuses = statuses
 
@@ -23,9 +23,9 @@ class Fixed:
 
 
 def scraped(*statuses: RunStatus) -> Samples:
-    """What Prometheus reads, by name and labels; a series that comes twice fails."""
+    """Return what Prometheus reads, by name and labels. A duplicate series fails."""
     registry = CollectorRegistry()
-    registry.register(Fixed(statuses))
+    registry.register(FixedCollector(statuses))
     samples: Samples = {}
     for family in text_string_to_metric_families(generate_latest(registry).decode()):
         for sample in family.samples:
@@ -39,11 +39,11 @@ def value(samples: Samples, name: str, **labels: str) -> float | None:
     return samples.get((name, tuple(sorted(labels.items()))))
 
 
-def test_no_answer_is_one_sample() -> None:
+def test_only_daedalus_up_is_exported_if_no_learner_answers() -> None:
     assert scraped() == {("daedalus_up", ()): 0.0}
 
 
-def test_a_run_and_its_actors() -> None:
+def test_the_values_of_a_run_and_its_actors_are_exported() -> None:
     samples = scraped(run_status(actors=(actor_status("a", env_steps=40), actor_status("b", env_steps=60))))
     assert value(samples, "daedalus_up") == 1.0
     assert value(samples, "daedalus_run_info", run="mine", environment="CartPole-v1", algorithm="impala") == 1.0
@@ -56,37 +56,37 @@ def test_a_run_and_its_actors() -> None:
     assert value(samples, "daedalus_actors", run="mine", state="alive") == 2.0
 
 
-def test_what_is_not_known_yet_has_no_sample() -> None:
+def test_an_unknown_value_has_no_sample() -> None:
     samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None))
     assert value(samples, "daedalus_episode_return_mean", run="mine") is None
     assert value(samples, "daedalus_checkpoint_age_seconds", run="mine") is None
 
 
-def test_problems_are_not_healthy() -> None:
+def test_a_run_with_a_problem_is_not_healthy() -> None:
     samples = scraped(run_status(problems=("no update for 70 s",)))
     assert value(samples, "daedalus_healthy", run="mine") == 0.0
     assert value(samples, "daedalus_up") == 1.0
 
 
 @pytest.mark.parametrize(("alive", "quarantined", "state"), [(False, "", "gone"), (True, "unfit", "quarantined")])
-def test_actors_that_do_not_take_part_are_counted(alive: bool, quarantined: str, state: str) -> None:
+def test_actors_are_counted_by_state(alive: bool, quarantined: str, state: str) -> None:
     samples = scraped(run_status(actors=(actor_status("a"), actor_status("b", alive=alive, quarantined=quarantined))))
     counts = {each: value(samples, "daedalus_actors", run="mine", state=each) for each in ("alive", state)}
     assert counts == {"alive": 1.0, state: 1.0}
 
 
-def test_an_actor_that_is_gone_leaves_no_series() -> None:
+def test_an_actor_that_is_gone_has_no_series() -> None:
     samples = scraped(run_status(actors=(actor_status("a"), actor_status("b", alive=False))))
     assert {labels["actor"] for _, each in samples if "actor" in (labels := dict(each))} == {"a"}
 
 
-def test_two_runs_stand_side_by_side_and_a_run_that_answers_twice_counts_once() -> None:
+def test_two_runs_are_exported_and_a_run_that_answers_twice_only_once() -> None:
     samples = scraped(run_status(), run_status(run="other", updates=9), run_status(run="other", updates=9))
     assert value(samples, "daedalus_updates_total", run="mine") == 7.0
     assert value(samples, "daedalus_updates_total", run="other") == 9.0
 
 
-def test_names_from_outside_are_escaped() -> None:
+def test_label_values_from_the_network_are_escaped() -> None:
     nasty = 'a"} 1\nevil_total{x="'
     assert value(scraped(run_status(environment=nasty)), "daedalus_run_info", **_info(nasty)) == 1.0
 

@@ -1,4 +1,4 @@
-"""cli/supervisor.py: the processes of `daedalus train`."""
+"""Test of cli/supervisor.py: the processes of `daedalus train`."""
 
 import os
 import subprocess
@@ -15,9 +15,11 @@ from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_ac
 from daedalus.protocol.spec import RunSpec
 
 
-@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="processes have no priorities here")
-def test_actors_come_after_the_learner() -> None:
-    actor = supervised_actor("actor-0", "tcp/127.0.0.1:1")  # nobody listens there: it goes on looking
+@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="this system has no process priorities")
+def test_an_actor_has_a_lower_priority_than_the_learner() -> None:
+    actor = supervised_actor(
+        "actor-0", "tcp/127.0.0.1:1"
+    )  # nothing listens at this address: the actor continues to look for a learner
     try:
         ours = os.getpriority(os.PRIO_PROCESS, 0)
         assert os.getpriority(os.PRIO_PROCESS, actor.process.pid) == min(ours + 5, 19)
@@ -26,16 +28,16 @@ def test_actors_come_after_the_learner() -> None:
 
 
 def supervised(program: str, ended: Set[int] = frozenset({0})) -> Supervised:
-    """A process that runs a line of Python."""
+    """Return a supervised process that runs a line of Python."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         return subprocess.Popen([sys.executable, "-S", "-c", program, str(first)], stdin=subprocess.PIPE)
 
-    return Supervised("it", begin, ended)
+    return Supervised("worker", begin, ended)
 
 
-def news(process: Supervised) -> str:
-    """What the next check that has something to say tells."""
+def message(process: Supervised) -> str:
+    """Check the process until there is a message; return the message."""
     found: list[str] = []
     until(lambda: found.append(process.check() or "") or found[-1])
     return found[-1]
@@ -44,12 +46,12 @@ def news(process: Supervised) -> str:
 SLEEP = "import time; time.sleep(1000)"
 
 
-def test_a_killed_process_is_started_again_and_told_that_it_is_not_the_first() -> None:
+def test_a_killed_process_is_restarted_with_the_argument_for_a_restart() -> None:
     process = supervised(f"import sys; sys.argv[1] == 'True' or sys.exit(0); {SLEEP}")
     try:
         assert process.check() is None
         process.process.kill()
-        assert news(process) == "it was killed by signal 9; started again"
+        assert message(process) == "worker was killed by signal 9; started again"
         assert process.process.wait(LIMIT) == 0
         assert process.check() is None
         assert (process.restarts, process.failures) == (1, 0)
@@ -57,40 +59,40 @@ def test_a_killed_process_is_started_again_and_told_that_it_is_not_the_first() -
         stop([process.process])
 
 
-def test_a_process_that_fails_by_itself_is_given_up_after_the_third_time() -> None:
+def test_a_process_that_failed_three_times_is_not_restarted() -> None:
     process = supervised("raise SystemExit(7)")
     process.process.wait(LIMIT)
     assert process.failed_at_once
-    assert [news(process), news(process)] == ["it failed with status 7; started again"] * 2
+    assert [message(process), message(process)] == ["worker failed with status 7; started again"] * 2
     assert not process.failed_at_once
-    with pytest.raises(FailedError, match="it failed 3 times"):
-        news(process)
+    with pytest.raises(FailedError, match="worker failed 3 times"):
+        message(process)
     stop([process.process])
 
 
-def test_failures_far_apart_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_long_after_the_start_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "_SOON_SECONDS", 0.0)
     process = supervised("raise SystemExit(7)")
     for _ in range(5):
-        news(process)
+        message(process)
     process.process.wait(LIMIT)
     assert not process.failed_at_once
     stop([process.process])
 
 
-def test_who_left_while_the_others_go_on_is_fetched_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     process = supervised("pass")
     process.process.wait(LIMIT)
     assert process.check() is None
     assert process.restarts == 0
     monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
-    assert news(process) == "it had left; started again"
+    assert message(process) == "worker ended before the run; started again"
     stop([process.process])
 
 
-@pytest.mark.parametrize(("algorithm", "told"), [("impala", True), ("a2c", False)])
-def test_training_goes_on_without_an_actor_that_fails_for_good_unless_it_is_needed(
-    algorithm: str, told: bool, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("algorithm", "continues"), [("impala", True), ("a2c", False)])
+def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synchronous(
+    algorithm: str, continues: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "training": {"algorithm": algorithm}})
     learner, actors = supervised(SLEEP), [supervised("raise SystemExit(7)") for _ in range(2)]
@@ -98,11 +100,9 @@ def test_training_goes_on_without_an_actor_that_fails_for_good_unless_it_is_need
     evaluator.name = "evaluator"
     processes = [*actors, evaluator, learner]
     try:
-        with pytest.raises(FailedError, match="it failed 3 times"):
+        with pytest.raises(FailedError, match="worker failed 3 times"):
             watch(learner, [evaluator, *actors], spec, threading.Event())
-        assert (
-            any("it failed 3 times; its error is above; going on without it" in text for text in caplog.messages)
-            == told
-        )
+        continued = "worker failed 3 times; see the error above; training continues without this process"
+        assert any(continued in message for message in caplog.messages) == continues
     finally:
         stop([each.process for each in processes])

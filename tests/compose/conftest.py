@@ -1,4 +1,4 @@
-"""The fixture of the containers' test: `make test-compose`."""
+"""Fixture of the container test, `make test-compose`."""
 
 import os
 from collections.abc import Iterator
@@ -10,8 +10,8 @@ from docker_host import BASE, UnavailableError, compose_command, daemon, make_ba
 
 @pytest.fixture(scope="session")
 def compose() -> Iterator[Compose]:
-    """Images built, nothing started; all of it is gone afterwards, but for what makes the next time shorter."""
-    os.environ["DAEDALUS_PORT"] = "0"  # any free one: somebody may use the usual one
+    """Build the images without starting containers. Afterwards remove everything except the build cache."""
+    os.environ["DAEDALUS_PORT"] = "0"  # any free port: the default port may be in use
     try:
         compose = Compose(compose_command())
         with daemon():

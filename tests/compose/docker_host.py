@@ -1,4 +1,4 @@
-"""Docker on the machine of the test: a daemon, and a base image where none can be pulled."""
+"""Docker for the test: a daemon, and a base image if none can be pulled."""
 
 import contextlib
 import json
@@ -14,19 +14,19 @@ from pathlib import Path
 
 from pip_configuration import for_image, options_of
 
-BASE = "daedalus-test-base"  # what override.yml names
-_PYTHON = "python:3.11-slim"  # what the Dockerfile names
+BASE = "daedalus-test-base"  # the name in override.yml
+_PYTHON = "python:3.11-slim"  # the name in the Dockerfile
 _STAND_IN = "daedalus-test-debian"
 _STAND_IN_PACKAGES = "python3,python3-venv,python3-pip,ca-certificates"
 _LIMIT = 120.0  # seconds for a daemon to start
 
 
 class UnavailableError(Exception):
-    """The test cannot run here; the message says what is missing."""
+    """Error if the test cannot run on this machine. The message names what is missing."""
 
 
 def run(*command: str | Path, check: bool = True, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Runs a command; its output is in the result, and in the error."""
+    """Run a command and return the result with its output. Raises AssertionError with the output."""
     result = subprocess.run(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
     )
@@ -36,13 +36,13 @@ def run(*command: str | Path, check: bool = True, folder: Path | None = None) ->
 
 
 def compose_command() -> list[str]:
-    """`docker compose`, or the older program of its own. Raises UnavailableError."""
+    """Return the command `docker compose` or `docker-compose`. Raises UnavailableError."""
     if shutil.which("docker") is None:
-        raise UnavailableError("there is no docker on this machine")
+        raise UnavailableError("docker is not installed")
     for command in (["docker", "compose"], ["docker-compose"]):
         if shutil.which(command[0]) and run(*command, "version", check=False).returncode == 0:
             return command
-    raise UnavailableError("there is no docker compose on this machine")
+    raise UnavailableError("docker compose is not installed")
 
 
 def _answers() -> bool:
@@ -51,12 +51,12 @@ def _answers() -> bool:
 
 @contextlib.contextmanager
 def daemon() -> Iterator[None]:
-    """A docker daemon: the machine's, or one for the time of the test. Raises UnavailableError."""
+    """Use the docker daemon of the machine, or start one for the test. Raises UnavailableError."""
     if _answers():
         yield
         return
     if shutil.which("dockerd") is None or os.geteuid() != 0:
-        raise UnavailableError("no docker daemon answers, and none can be started: that takes dockerd, and root")
+        raise UnavailableError("no docker daemon answers, and this test cannot start one without dockerd and root")
     with tempfile.TemporaryFile("w+") as log:
         process = subprocess.Popen(["dockerd"], stdout=log, stderr=subprocess.STDOUT)
         try:
@@ -73,9 +73,9 @@ def daemon() -> Iterator[None]:
 
 
 def make_base() -> None:
-    """Tags as BASE what the Dockerfile is to build on, knowing this machine's pip configuration and certificates.
+    """Build the base image BASE with this machine's pip configuration and certificates.
 
-    The configuration belongs to the machine, so it is neither in the Dockerfile nor in an image that is kept.
+    The configuration belongs to the machine, so it is not in the Dockerfile, and the image is removed after the test.
     """
     origin = _PYTHON if run("docker", "pull", _PYTHON, check=False).returncode == 0 else _stand_in()
     with tempfile.TemporaryDirectory() as name:
@@ -97,11 +97,11 @@ def make_base() -> None:
 
 
 def _stand_in() -> str:
-    """Debian 12 with its Python 3.11, by debootstrap. Raises UnavailableError."""
+    """Return the name of an image of Debian 12 with Python 3.11, made by debootstrap. Raises UnavailableError."""
     if run("docker", "image", "inspect", _STAND_IN, check=False).returncode == 0:
         return _STAND_IN
     if shutil.which("debootstrap") is None or os.geteuid() != 0:
-        raise UnavailableError(f"{_PYTHON} cannot be pulled, nor a stand-in be made: that takes debootstrap, and root")
+        raise UnavailableError(f"{_PYTHON} cannot be pulled, and a substitute needs debootstrap and root")
     with tempfile.TemporaryDirectory() as folder:
         run("debootstrap", "--variant=minbase", f"--include={_STAND_IN_PACKAGES}", "bookworm", folder)
         for unneeded in ("var/cache/apt", "var/lib/apt/lists"):

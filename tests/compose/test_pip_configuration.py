@@ -1,4 +1,4 @@
-"""What an image takes over of this machine's pip configuration; needs no docker."""
+"""Test of pip_configuration.py. It needs no docker."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pytest
 from pip_configuration import for_image, options_of
 
 
-def test_a_later_section_replaces_an_earlier_one_and_other_commands_do_not_count() -> None:
+def test_a_later_section_replaces_an_earlier_one_and_other_commands_are_ignored() -> None:
     listing = """\
 :env:.timeout='60'
 download.timeout='5'
@@ -25,11 +25,11 @@ def test_a_file_that_an_option_names_is_copied(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["constraint", "requirement", "cert", "client-cert", "find-links"])
-def test_an_option_is_left_out_whose_file_does_not_exist(name: str, tmp_path: Path) -> None:
+def test_an_option_is_left_out_if_its_file_does_not_exist(name: str, tmp_path: Path) -> None:
     assert for_image({name: str(tmp_path / "missing"), "timeout": "60"}) == ({"timeout": "60"}, [])
 
 
-def test_each_word_of_a_list_is_taken_by_itself(tmp_path: Path) -> None:
+def test_each_word_of_a_list_is_handled_separately(tmp_path: Path) -> None:
     wheels, page = tmp_path / "wheels", tmp_path / "page.html"
     wheels.mkdir()
     page.touch()
@@ -71,6 +71,6 @@ def test_an_index_in_a_local_folder_is_copied_if_it_holds_its_files(name: str, t
     assert for_image({name: (tmp_path / "missing").as_uri()}) == ({}, [])
 
 
-def test_an_index_elsewhere_stays() -> None:
+def test_an_index_on_another_host_is_kept() -> None:
     options = {"index-url": "https://example.org/simple", "extra-index-url": "https://a.example https://b.example"}
     assert for_image(options) == (options, [])

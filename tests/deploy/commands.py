@@ -1,4 +1,4 @@
-"""Command lines in files for other programs: whether ours would take them."""
+"""Check that the command lines in deployment files are valid."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,9 @@ PARSERS = {
 
 
 def check(words: Sequence[str]) -> str:
-    """Fails if `daedalus WORDS` would be refused; returns which command it is."""
+    """Fail if `daedalus WORDS` is invalid; return the command."""
     command, *arguments = words
-    assert command in PARSERS, f"`daedalus {command}`: no such command, or none to deploy"
+    assert command in PARSERS, f"`daedalus {command}` is not a command for deployments"
     try:
         parsed = PARSERS[command]().parse_args(arguments)
         if command == "learner":
@@ -32,5 +32,5 @@ def check(words: Sequence[str]) -> str:
         if command == "router":
             check_listening([parsed.listen], tls=parsed.tls is not None, insecure=parsed.insecure)
     except (SystemExit, SettingsError, AddressError, ValueError) as error:
-        pytest.fail(f"`daedalus {' '.join(words)}` is refused: {error}")
+        pytest.fail(f"`daedalus {' '.join(words)}` is invalid: {error}")
     return command

@@ -1,4 +1,4 @@
-"""docker-compose.yml and the files that it mounts. `make test-compose` runs it."""
+"""Test of docker-compose.yml and the files that it mounts. `make test-compose` starts the containers."""
 
 import re
 from pathlib import Path
@@ -13,25 +13,25 @@ ROOT = Path(__file__).parents[2]
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
 
 
-def test_images_are_built_of_every_package() -> None:
+def test_the_build_context_holds_every_package() -> None:
     packages = {"daedalus", *(link.name for link in (ROOT / "daedalus").iterdir() if link.is_symlink())}
     kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     files = {"pyproject.toml", "constraints.txt", "README.md", "LICENSE", "MANIFEST.in"}
     assert packages | files == kept
 
 
-def test_without_the_profile_it_is_router_learner_and_actors() -> None:
+def test_the_default_services_are_router_learner_and_actor() -> None:
     assert {name for name, service in SERVICES.items() if "profiles" not in service} == {"router", "learner", "actor"}
     monitoring = {name for name, service in SERVICES.items() if service.get("profiles") == ["monitoring"]}
     assert monitoring == {"exporter", "tensorboard", "prometheus", "grafana"}
 
 
 @pytest.mark.parametrize("name", ["learner", "actor", "exporter"])
-def test_services_run_commands_that_we_take(name: str) -> None:
+def test_the_command_of_each_service_is_valid(name: str) -> None:
     assert check(SERVICES[name]["command"]) == name
 
 
-def test_the_health_check_is_a_command_that_we_take() -> None:
+def test_the_health_check_is_a_valid_command() -> None:
     kind, program, *arguments = SERVICES["learner"]["healthcheck"]["test"]
     assert (kind, program) == ("CMD", "daedalus")
     assert check(arguments) == "status"
@@ -45,19 +45,19 @@ def test_images_are_targets_of_the_dockerfile() -> None:
     assert ours == set(built)
 
 
-def test_ports_are_opened_to_this_machine_only() -> None:
+def test_ports_are_open_on_the_loopback_address_only() -> None:
     ports = [port for service in SERVICES.values() for port in service.get("ports", [])]
     assert len(ports) == 4
     assert all(port.startswith("127.0.0.1:") for port in ports)
 
 
-def test_what_is_mounted_is_there() -> None:
+def test_each_mounted_file_exists() -> None:
     mounts = [mount for service in SERVICES.values() for mount in service.get("volumes", []) if mount.startswith("./")]
     assert len(mounts) == 4
     assert all((ROOT / mount.split(":")[0]).exists() for mount in mounts)
 
 
-def test_services_name_each_other() -> None:
+def test_host_names_in_addresses_are_services() -> None:
     text = (ROOT / "docker-compose.yml").read_text()
     text += (ROOT / "deploy" / "prometheus" / "prometheus.yml").read_text()
     text += (ROOT / "deploy" / "grafana" / "provisioning" / "datasources" / "prometheus.yml").read_text()
@@ -66,11 +66,11 @@ def test_services_name_each_other() -> None:
     assert hosts <= SERVICES.keys()
 
 
-def test_the_router_is_of_the_version_that_we_speak() -> None:
+def test_the_router_image_has_the_zenoh_version_of_the_constraints() -> None:
     assert f"eclipse-zenoh=={SERVICES['router']['image'].split(':')[1]}\n" in (ROOT / "constraints.txt").read_text()
 
 
-def test_the_router_takes_its_configuration() -> None:
+def test_zenoh_reads_the_configuration_of_the_router() -> None:
     configuration = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
     assert configuration.get_json("mode") == '"router"'
     assert configuration.get_json("listen/endpoints") == '["tcp/0.0.0.0:7447"]'

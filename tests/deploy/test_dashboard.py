@@ -1,4 +1,4 @@
-"""deploy/grafana: the dashboard draws what the exporter tells, and nothing else."""
+"""Test of deploy/grafana: the dashboard draws only metrics that the exporter exports."""
 
 import json
 import re
@@ -16,7 +16,7 @@ def exported() -> set[str]:
     return {family.name + ("_total" if family.type == "counter" else "") for family in metrics([])}
 
 
-def test_every_metric_that_is_drawn_is_exported() -> None:
+def test_each_metric_of_the_dashboard_is_exported() -> None:
     expressions = [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
     expressions += [variable["query"]["query"] for variable in DASHBOARD["templating"]["list"]]
     drawn = {name for expression in expressions for name in re.findall(r"daedalus_\w+", expression)}
@@ -36,14 +36,14 @@ def test_panels_do_not_overlap() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
 
 
-def test_the_datasource_that_it_asks_is_provisioned() -> None:
+def test_the_data_source_of_the_dashboard_is_provisioned() -> None:
     provisioned = yaml.safe_load((GRAFANA / "provisioning" / "datasources" / "prometheus.yml").read_text())
     asked = {panel["datasource"]["uid"] for panel in DASHBOARD["panels"]}
     asked |= {variable["datasource"]["uid"] for variable in DASHBOARD["templating"]["list"]}
     assert asked == {source["uid"] for source in provisioned["datasources"]}
 
 
-def test_the_provider_looks_where_compose_mounts_it() -> None:
+def test_the_provider_reads_the_folder_that_compose_mounts() -> None:
     provider = yaml.safe_load((GRAFANA / "provisioning" / "dashboards" / "daedalus.yml").read_text())
     compose = yaml.safe_load((GRAFANA.parents[1] / "docker-compose.yml").read_text())
     (path,) = (each["options"]["path"] for each in provider["providers"])

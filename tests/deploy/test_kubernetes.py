@@ -1,4 +1,4 @@
-"""deploy/kubernetes: every manifest against the schemas of Kubernetes, every command against our parsers."""
+"""Test of deploy/kubernetes: manifests against the schemas of Kubernetes, commands against our parsers."""
 
 import copy
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ Manifest = dict[str, Any]
 
 
 def manifests() -> list[Manifest]:
-    """All that the kustomizations name."""
+    """Return all manifests that the kustomizations name."""
     found: list[Manifest] = []
     for folder in (FOLDER, FOLDER / "autoscaling"):
         kustomization = yaml.safe_load((folder / "kustomization.yaml").read_text())
@@ -36,7 +36,7 @@ def containers() -> Iterator[tuple[Manifest, Manifest]]:
     return ((pod, container) for pod in pods() for container in pod["spec"]["containers"])
 
 
-def test_no_manifest_is_left_out() -> None:
+def test_the_kustomizations_name_every_manifest() -> None:
     written = {path for path in FOLDER.rglob("*.yaml") if path.name != "kustomization.yaml"}
     documents = [each for path in written for each in yaml.safe_load_all(path.read_text())]
     assert len(documents) == len(ALL)
@@ -51,12 +51,12 @@ def test_no_manifest_is_left_out() -> None:
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("name", ALL)
-def test_manifests_fit_the_schemas(name: str, version: str) -> None:
+def test_each_manifest_is_valid_for_each_kubernetes_version(name: str, version: str) -> None:
     kubernetes_validate.validate(ALL[name], version, strict=True)
 
 
 @pytest.mark.parametrize("broken", ["unknown field", "wrong type", "missing field"])
-def test_a_broken_manifest_does_not_fit(broken: str) -> None:
+def test_a_broken_manifest_is_invalid(broken: str) -> None:
     manifest = copy.deepcopy(ALL["Deployment/actor"])
     container = manifest["spec"]["template"]["spec"]["containers"][0]
     if broken == "unknown field":
@@ -69,7 +69,7 @@ def test_a_broken_manifest_does_not_fit(broken: str) -> None:
         kubernetes_validate.validate(manifest, VERSIONS[-1], strict=True)
 
 
-def test_selectors_find_their_pods() -> None:
+def test_each_selector_matches_one_pod_template() -> None:
     labels = [pod["metadata"]["labels"] for pod in pods()]
     for each in ALL.values():
         if "selector" in each["spec"]:
@@ -80,11 +80,11 @@ def test_selectors_find_their_pods() -> None:
     assert f"{target['kind']}/{target['name']}" in ALL
 
 
-def test_containers_run_commands_that_we_take() -> None:
+def test_the_command_of_each_container_is_valid() -> None:
     assert [check(container["args"]) for _, container in containers()] == ["router", "learner", "actor"]
 
 
-def test_probes_ask_for_the_status_of_the_run() -> None:
+def test_the_probes_query_the_status_of_the_run() -> None:
     (learner,) = (container for _, container in containers() if container["name"] == "learner")
     ready, alive = (learner[probe]["exec"]["command"] for probe in ("readinessProbe", "livenessProbe"))
     run = Path(learner["args"][learner["args"].index("--run-dir") + 1]).name
@@ -94,7 +94,7 @@ def test_probes_ask_for_the_status_of_the_run() -> None:
     assert alive == ["sh", "-c", f"{' '.join(ready)}; test $? -ne 1"]
 
 
-def test_images_are_those_that_the_kustomization_names_and_the_dockerfile_makes() -> None:
+def test_images_are_named_by_the_kustomization_and_built_by_the_dockerfile() -> None:
     kustomization = yaml.safe_load((FOLDER / "kustomization.yaml").read_text())
     named = {image["name"] for image in kustomization["images"]}
     assert named == {container["image"] for _, container in containers()}
@@ -102,7 +102,7 @@ def test_images_are_those_that_the_kustomization_names_and_the_dockerfile_makes(
     assert all(f"FROM run AS {name.removeprefix('daedalus-')}\n" in dockerfile for name in named)
 
 
-def test_nothing_runs_as_root_or_writes_where_it_should_not() -> None:
+def test_containers_run_without_root_and_with_a_read_only_file_system() -> None:
     for pod, container in containers():
         assert pod["spec"]["securityContext"]["runAsNonRoot"] is True
         assert pod["spec"]["automountServiceAccountToken"] is False
@@ -112,11 +112,11 @@ def test_nothing_runs_as_root_or_writes_where_it_should_not() -> None:
         assert {"cpu", "memory"} <= container["resources"]["requests"].keys()
 
 
-def test_every_volume_that_is_mounted_is_there() -> None:
+def test_each_mounted_volume_is_declared() -> None:
     for each in ALL.values():
         template = each["spec"].get("template")
         if template is not None:
-            there = {volume["name"] for volume in template["spec"].get("volumes", [])}
-            there |= {claim["metadata"]["name"] for claim in each["spec"].get("volumeClaimTemplates", [])}
+            volumes = {volume["name"] for volume in template["spec"].get("volumes", [])}
+            volumes |= {claim["metadata"]["name"] for claim in each["spec"].get("volumeClaimTemplates", [])}
             mounts = (mount for one in template["spec"]["containers"] for mount in one.get("volumeMounts", []))
-            assert {mount["name"] for mount in mounts} <= there
+            assert {mount["name"] for mount in mounts} <= volumes

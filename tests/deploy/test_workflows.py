@@ -1,4 +1,4 @@
-"""The workflows of a public host, the classifiers and the citation: what they say agrees with pyproject.toml."""
+"""Test that the CI workflows, the classifiers and the citation agree with pyproject.toml."""
 
 import re
 import tomllib
@@ -23,7 +23,7 @@ def steps(workflow: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def supported() -> list[str]:
-    """The Python versions of the classifiers."""
+    """Return the Python versions of the classifiers."""
     found = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", text) for text in CLASSIFIERS]
     return [match[1] for match in found if match]
 

@@ -1,4 +1,4 @@
-"""A whole run, every process of which ends at once if it unpickles anything that could execute."""
+"""Test that no process of a run unpickles anything: an audit hook ends a process that does."""
 
 import json
 import subprocess
@@ -11,11 +11,11 @@ from processes import Running
 
 
 @pytest.fixture(autouse=True)
-def audited(monkeypatch: pytest.MonkeyPatch) -> None:
+def audit_hook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent / "audit"))
 
 
-def test_the_hook_ends_a_process_that_unpickles() -> None:
+def test_the_audit_hook_ends_a_process_that_unpickles() -> None:
     program = "import pickle; pickle.loads(pickle.dumps(print))"
     ended = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr[:9]) == (97, "UNPICKLED")

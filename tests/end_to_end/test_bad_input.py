@@ -1,4 +1,4 @@
-"""What goes wrong at the command line: one line that says what to do, and an exit status that is not 0."""
+"""Test of mistakes on the command line: one line that says what to do, and an exit status other than 0."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -35,36 +35,36 @@ Start = Callable[..., Running]
             1,
             r"nothing answers at tcp/127.0.0.1:1 \(for 0.3 s\): is the learner running",
         ),
-        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs must be from 1 to 4096"),
+        (["actor", "--connect", "tcp/127.0.0.1:1", "--envs", "0"], 2, r"--envs is 0: choose a number from 1 to 4096"),
         (["actor", "--connect", "tcp/127.0.0.1:1", "--name", "a/b"], 2, r"actor name 'a/b' must be"),
         (["trian"], 2, r"unknown command 'trian': did you mean train"),
     ],
 )
-def test_a_mistake_is_told_in_one_line(
+def test_a_mistake_is_reported_in_one_line(
     start: Start, tmp_path: Path, words: list[str], status: int, message: str
 ) -> None:
     running = start(*words)
     assert running.wait() == status, running.output
     running.expect(message)
     assert len(running.lines) == 1, running.output
-    assert not list(tmp_path.iterdir())  # nothing was begun
+    assert not list(tmp_path.iterdir())  # no run was started
 
 
-def test_an_unknown_environment_ends_training_with_near_matches(start: Start) -> None:
+def test_an_unknown_environment_ends_training_with_similar_names(start: Start) -> None:
     running = start("train", "--env", "CartPoll-v1", "--run-dir", "run")
     assert running.wait() == 1
     running.expect("unknown environment 'CartPoll-v1': did you mean CartPole-v1")
 
 
-def test_a_device_that_is_not_there_is_told_in_one_line(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # wherever this runs
+def test_a_missing_cuda_device_is_reported_in_one_line(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # also on a machine with a GPU
     running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
     assert running.wait() == 1
     running.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
     assert "Traceback" not in running.output
 
 
-def test_a_run_directory_that_exists_is_refused_and_left_alone(start: Start, tmp_path: Path) -> None:
+def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").write_text("kept")
     running = start("train", "cartpole", "--run-dir", "run")
@@ -73,7 +73,7 @@ def test_a_run_directory_that_exists_is_refused_and_left_alone(start: Start, tmp
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
 
 
-def test_an_address_in_use_is_told(start: Start, address: str, tmp_path: Path) -> None:
+def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Path) -> None:
     first = start("learner", "cartpole", "--listen", address, "--run-dir", "one")
     first.expect("actors join with")
     second = start("learner", "cartpole", "--listen", address, "--run-dir", "two")

@@ -1,4 +1,4 @@
-"""Learner and actors started by hand, in any order, over a real router."""
+"""Test of learner and actors that are started separately, in any order."""
 
 import json
 import os
@@ -15,7 +15,7 @@ ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 @pytest.fixture
 def status(start: Start, address: str) -> Callable[[], dict | None]:
-    """Asks the learner for its status; None while it does not answer."""
+    """Function that returns the status of the learner, or None while it does not answer."""
 
     def ask() -> dict | None:
         running = start("status", "--connect", address, "--json")
@@ -28,7 +28,7 @@ def env_steps(status: dict | None, actor: str) -> int:
     return next((entry["env_steps"] for entry in (status or {"actors": []})["actors"] if entry["actor"] == actor), 0)
 
 
-def test_an_actor_that_starts_first_waits_and_says_so(start: Start, address: str) -> None:
+def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, address: str) -> None:
     actor = start("actor", "--connect", address, "--name", "early")
     actor.expect("waiting for it")
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000)
@@ -38,7 +38,7 @@ def test_an_actor_that_starts_first_waits_and_says_so(start: Start, address: str
     actor.expect("the run is over")
 
 
-def test_an_actor_that_joins_late_contributes(start: Start, address: str, status: Callable[[], dict | None]) -> None:
+def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str, status: Callable[[], dict | None]) -> None:
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
     start("actor", "--connect", address, "--name", "first")
     learner.expect(r"updates .*/s")
@@ -83,7 +83,7 @@ def test_actors_find_a_learner_that_was_restarted(start: Start, address: str, tm
     assert sum("joined run" in line for line in actor.lines) == 2
 
 
-def test_an_actor_carries_no_torch_and_stays_small(start: Start, address: str) -> None:
+def test_an_actor_loads_no_torch_and_uses_little_memory(start: Start, address: str) -> None:
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
     actor = start("actor", "--connect", address, "--name", "thin")
     learner.expect(r"updates .*/s")
@@ -98,7 +98,7 @@ def test_an_actor_carries_no_torch_and_stays_small(start: Start, address: str) -
     assert resident <= 150 * 1024
 
 
-def test_sigterm_ends_an_actor_in_good_order(start: Start, address: str) -> None:
+def test_sigterm_ends_a_waiting_actor_with_status_0(start: Start, address: str) -> None:
     waiting = start("actor", "--connect", address, "--name", "waiting")
     waiting.expect("waiting for it")
     waiting.process.terminate()

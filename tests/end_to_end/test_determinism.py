@@ -1,4 +1,4 @@
-"""a2c over processes is the same computation as a2c in one."""
+"""Test that a2c with several processes computes the same as a2c in one process."""
 
 import io
 import threading
@@ -19,7 +19,7 @@ SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
 
 
 def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
-    """A learner and actors as threads of this process, over the memory transport."""
+    """Train with learner and actors as threads of this process, over the memory transport."""
     network, stop = MemoryNetwork(), threading.Event()
     run_directory.create(directory, spec)
     service = LearnerService(
@@ -50,7 +50,7 @@ def checkpoint_files(directory: Path) -> dict[str, bytes]:
     return {entry.name: entry.read_bytes() for entry in checkpoint.iterdir() if entry.suffix == ".safetensors"}
 
 
-def test_a2c_over_processes_gives_bit_for_bit_the_weights_of_one_process(
+def test_a2c_gives_bit_for_bit_equal_weights_in_one_process_and_in_several(
     start: Callable[..., Running], tmp_path: Path
 ) -> None:
     settings = read_preset("cartpole")
@@ -66,7 +66,7 @@ def test_a2c_over_processes_gives_bit_for_bit_the_weights_of_one_process(
 
 
 def test_another_seed_gives_other_weights(tmp_path: Path) -> None:
-    """The test above could not fail if nothing depended on anything."""
+    """Show that the test above can fail: the weights depend on the seed."""
     settings = read_preset("cartpole")
     choose_algorithm(settings, "a2c")
     override(settings, (*SETTINGS, "training.env_steps=8000"))

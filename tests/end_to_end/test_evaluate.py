@@ -1,4 +1,4 @@
-"""`daedalus evaluate`: which policy it plays, where, what it says of it, and the videos that it makes."""
+"""Test of `daedalus evaluate`: policies, backends, results, videos, and the evaluation after training."""
 
 import importlib
 import itertools
@@ -35,7 +35,7 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    """Runs the command in this process; its result."""
+    """Function that runs the command in this process and returns its result."""
 
     def run(*words: object) -> dict[str, Any]:
         capsys.readouterr()
@@ -49,7 +49,7 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]
 
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Runs the command in this process; the one line that it fails with."""
+    """Function that runs the command in this process and returns its one-line error message."""
 
     def run(status: int, *words: object) -> str:
         capsys.readouterr()
@@ -62,11 +62,11 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return run
 
 
-# ------------------------------------------------------------------------------------------------ what it plays
+# ------------------------------------------------------------------------------------------------ policy and seed
 
 
-def one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[int]]:
-    """The returns of the first episodes of one environment, and the actions that were taken."""
+def play_one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[int]]:
+    """Return the returns of the first episodes of one environment, and the actions taken."""
     saved = read_policy(checkpoint)
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
@@ -87,12 +87,12 @@ def one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[int]]:
 
 
 @pytest.mark.parametrize("memory", ["none", "gru"])
-def test_returns_are_those_of_episodes_played_one_by_one(
+def test_the_returns_equal_those_of_episodes_played_one_by_one(
     tmp_path: Path, evaluate: Callable[..., dict], memory: str
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 3, policy={"hidden": (16,), "memory": memory, "memory_units": 8})
     result = evaluate(run, "--episodes", 11, "--envs", 3)
-    alone = [one_by_one(checkpoints(run)[0], episodes) for episodes in (4, 4, 3)]
+    alone = [play_one_by_one(checkpoints(run)[0], episodes) for episodes in (4, 4, 3)]
     assert len(set.union(*(taken for _, taken in alone))) > 1
     expected = sorted(itertools.chain.from_iterable(returns for returns, _ in alone))
     np.testing.assert_allclose(sorted(result["returns"]), expected, atol=1e-3)
@@ -102,7 +102,7 @@ def test_returns_are_those_of_episodes_played_one_by_one(
     assert (result["episodes"], result["policy_version"], result["actions"]) == (11, 3, "greedy")
 
 
-def test_the_best_checkpoint_is_played_or_the_newest_where_that_is_asked_for(
+def test_evaluate_uses_the_best_checkpoint_or_the_newest_on_request(
     tmp_path: Path, evaluate: Callable[..., dict]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 5, 6, 7, 8, 9)
@@ -118,7 +118,9 @@ def test_the_best_checkpoint_is_played_or_the_newest_where_that_is_asked_for(
     assert [entry.name for entry in checkpoints(run)] == ["0000000009", "0000000008"]
 
 
-def test_a_damaged_best_is_named_and_the_newest_played(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_best_checkpoint_is_reported_and_the_newest_is_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = save(tmp_path / "run", COUNTING, 1, 2)
     (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
     assert main([str(run), "--episodes", "1"]) == 0
@@ -128,7 +130,9 @@ def test_a_damaged_best_is_named_and_the_newest_played(tmp_path: Path, capsys: p
     assert "gymnasium's counting_environment:Counting-v0, policy version 2: return 3." in captured.out
 
 
-def test_sampled_actions_and_seeds(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_sampled_actions_depend_on_the_seed_and_greedy_is_the_default(
+    tmp_path: Path, evaluate: Callable[..., dict]
+) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     one, same, other = (evaluate(run, "--episodes", 5, "--seed", seed, "--actions", "sampled") for seed in (3, 3, 4))
     assert one == same
@@ -140,16 +144,16 @@ def test_sampled_actions_and_seeds(tmp_path: Path, evaluate: Callable[..., dict]
     assert evaluate(run, "--episodes", 5, "--actions", "greedy")["actions"] == "greedy"
 
 
-# ------------------------------------------------------------------------------------------------ where it plays
+# ------------------------------------------------------------------------------------------------ environment
 
 
-def test_another_backend_can_be_played(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_the_backend_is_that_of_the_run_or_of_the_option(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_backend": "envpool"})
     assert evaluate(run, "--episodes", 2)["backend"] == "envpool"
     assert evaluate(run, "--episodes", 2, "--backend", "gymnasium")["backend"] == "gymnasium"
 
 
-def test_spaces_that_differ_from_the_policys_are_named(tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_spaces_that_differ_from_those_of_the_policy_are_reported(tmp_path: Path, refused: Callable[..., str]) -> None:
     spaces = make_environments(CARTPOLE, 1).spaces.model_copy(update={"action": DiscreteSpace(count=3)})
     run = save(tmp_path / "run", CARTPOLE, 1, spaces=spaces)
     line = refused(1, run, "--episodes", 1)
@@ -157,70 +161,68 @@ def test_spaces_that_differ_from_the_policys_are_named(tmp_path: Path, refused: 
     assert "trained on observation: float32 array of shape (4,); action: 3 choices" in line
 
 
-def test_a_users_own_transform_is_applied(tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_the_option_wrap_imports_the_users_function(tmp_path: Path, refused: Callable[..., str]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     assert "no_such_module" in refused(1, run, "--episodes", 1, "--wrap", "no_such_module:function")
 
 
-# ------------------------------------------------------------------------------------------------ watching it
+# ------------------------------------------------------------------------------------------------ video and window
 
 
-def test_a_video_has_every_frame_of_the_environments_own(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_a_video_has_every_frame_before_action_repeat(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", RACING, 1)
     result = evaluate(run, "--video", tmp_path / "drive.mp4", "--seed", 2)
     assert result["episodes"] == 1
-    assert result["lengths"] == [3]  # ten frames, four to an env_step
+    assert result["lengths"] == [3]  # ten frames, four per env_step
     assert result["video_seconds"] == 11 / 50
     with av.open(str(tmp_path / "drive.mp4")) as container:
         assert container.streams.video[0].average_rate == 50
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert len(frames) == 11  # the first of them before anything was done
+    assert len(frames) == 11  # the first frame is before the first action
     assert frames[0].shape == (400, 600, 3)
     assert any((frames[0] != frame).any() for frame in frames[1:])
     assert evaluate(run, "--episodes", 1, "--seed", 2)["returns"] == result["returns"]
 
 
-def test_an_atari_game_of_another_backend_is_filmed_as_gymnasium_has_it(
-    tmp_path: Path, evaluate: Callable[..., dict]
-) -> None:
+def test_a_video_of_an_atari_game_uses_gymnasiums_implementation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     pong = EnvironmentSpec(id="Pong-v5", backend="envpool", action_repeat=4, grey=True, resize=(21, 21))
     run = save(tmp_path / "run", pong.model_copy(update={"frame_stack": 4, "max_episode_steps": 40}), 1)
     options = ("--episodes", 2, "--seed", 1)
-    there, here = evaluate(run, *options), evaluate(run, *options, "--video", tmp_path / "pong.mp4")
-    assert (there["environment"], here["environment"]) == ("Pong-v5", "ALE/Pong-v5")
-    assert here["lengths"] == there["lengths"] == [10, 10]
-    assert here["video_seconds"] == 2 * 41 / 60
+    on_envpool, on_gymnasium = evaluate(run, *options), evaluate(run, *options, "--video", tmp_path / "pong.mp4")
+    assert (on_envpool["environment"], on_gymnasium["environment"]) == ("Pong-v5", "ALE/Pong-v5")
+    assert on_gymnasium["lengths"] == on_envpool["lengths"] == [10, 10]
+    assert on_gymnasium["video_seconds"] == 2 * 41 / 60
 
 
-def test_a_gif_can_be_cut_and_the_score_is_not(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_max_seconds_cuts_the_gif_but_not_the_episodes(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)
     result = evaluate(run, *options, "--max-seconds", 0.2, "--width", 150)
     assert result["video_seconds"] == 0.2
     with Image.open(tmp_path / "short.gif") as image:
         assert image.size == (150, 100)
-        assert getattr(image, "n_frames", 1) == 3  # of ten, every fourth
+        assert getattr(image, "n_frames", 1) == 3  # every fourth of ten
     assert len(result["returns"]) == 3
     assert sum(result["lengths"]) > 10
 
 
-def test_a_window_is_shown_where_there_is_a_screen(
+def test_render_needs_a_screen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], refused: Callable[..., str]
 ) -> None:
     run = save(tmp_path / "run", CARTPOLE.model_copy(update={"max_episode_steps": 5}), 1)
     monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert "needs a screen, and there is none here: record the episodes with --video" in refused(2, run, "--render")
+    assert "needs a screen, and this machine has none: record the episodes with --video" in refused(2, run, "--render")
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert evaluate(run, "--render", "--seed", 1)["lengths"] == [5]
 
 
-# ------------------------------------------------------------------------------------------------ shipped policies
+# ------------------------------------------------------------------------------------------------ pretrained policies
 
 
-def test_a_shipped_policy_plays_as_it_did_in_its_run(
+def test_a_shipped_policy_gets_the_returns_of_its_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, evaluate: Callable[..., dict], refused: Callable[..., str]
 ) -> None:
     monkeypatch.setattr("daedalus.policy.saving.saved_policy.PRETRAINED", tmp_path / "pretrained")
@@ -248,15 +250,15 @@ def test_a_shipped_policy_plays_as_it_did_in_its_run(
     assert "no pretrained policy '../run'" in refused(1, "--pretrained", "../run")
 
 
-def test_the_car_that_ships_drives(evaluate: Callable[..., dict]) -> None:
+def test_the_pretrained_car_racing_policy_drives(evaluate: Callable[..., dict]) -> None:
     result = evaluate("--pretrained", "car_racing", "--backend", "fast", "--episodes", 4)
-    assert result["return_mean"] > 600  # 905 over 100; one that stands still has -100
+    assert result["return_mean"] > 600  # 905 over 100 episodes; a car that stands still has -100
 
 
 # ------------------------------------------------------------------------------------------------ after training
 
 
-def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants_it(
+def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     tmp_path: Path,
 ) -> None:
     settings = {"final_episodes": 3, "final_backend": "envpool"}
@@ -278,7 +280,9 @@ def test_training_ends_with_an_evaluation_of_the_best_policy_where_the_run_wants
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in report
 
 
-def test_the_best_is_chosen_anew_before_the_last_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evaluation(
+    tmp_path: Path, evaluate: Callable[..., dict]
+) -> None:
     run = tmp_path / "run"
     for version in (1, 2, 3):
         save(run, CARTPOLE, version, weights_seed=version, evaluation={"final_episodes": 20})
@@ -301,7 +305,7 @@ def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:
     return evaluate(run / "checkpoints" / f"{version:010d}", "--episodes", 20)["return_mean"]
 
 
-def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) -> None:
+def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
@@ -311,10 +315,10 @@ def test_the_last_evaluation_ends_when_training_is_told_to_stop(tmp_path: Path) 
     assert not processes_mentioning(str(run))
 
 
-# ------------------------------------------------------------------------------------------------ how it behaves
+# ------------------------------------------------------------------------------------------------ command line
 
 
-def test_progress_goes_to_standard_error(
+def test_progress_is_written_to_standard_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
@@ -327,7 +331,7 @@ def test_progress_goes_to_standard_error(
     assert len(json.loads(captured.out)["returns"]) == 2
 
 
-def test_told_to_stop_it_ends_and_leaves_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stopped_evaluation_leaves_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     stop = threading.Event()
     stop.set()
@@ -336,7 +340,7 @@ def test_told_to_stop_it_ends_and_leaves_no_video(tmp_path: Path, capsys: pytest
     assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_signal_ends_it(start: Start, tmp_path: Path) -> None:
+def test_a_signal_ends_an_evaluation(start: Start, tmp_path: Path) -> None:
     save(tmp_path / "run", CARTPOLE, 1)
     running = start("evaluate", "run", "--episodes", 10**9)
     running.expect("evaluation: .* of 1000000000 episodes, mean return")
@@ -348,24 +352,24 @@ def test_a_signal_ends_it(start: Start, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
-        ([], 2, "name a run directory"),
-        (["RUN", "--pretrained", "x"], 2, "one of them only"),
-        (["RUN", "--episodes", 0], 2, "--episodes must be at least 1, not 0"),
-        (["RUN", "--envs", 0], 2, "--envs must be from 1 to 4096, not 0"),
-        (["RUN", "--seed", -1], 2, "--seed must not be negative"),
+        ([], 2, "name either a run directory"),
+        (["RUN", "--pretrained", "x"], 2, "name either a run directory"),
+        (["RUN", "--episodes", 0], 2, "--episodes is 0: choose at least 1"),
+        (["RUN", "--envs", 0], 2, "--envs is 0: choose a number from 1 to 4096"),
+        (["RUN", "--seed", -1], 2, "--seed is -1: choose 0 or more"),
         (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, unlike 'x.avi'"),
         (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
-        (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot go together"),
+        (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot be used together"),
         (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),
         (["RUN", "--video", "x.mp4", "--backend", "envpool"], 2, "leave out --backend envpool"),
-        (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width must be from 16 to 4096, not 3"),
-        (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds must be above 0, not 0"),
-        (["RUN", "--max-seconds", 5], 2, "are for --video FILE"),
+        (["RUN", "--video", "x.mp4", "--width", 3], 2, "--width is 3: choose a number from 16 to 4096"),
+        (["RUN", "--video", "x.mp4", "--max-seconds", 0], 2, "--max-seconds is 0: choose a number above 0"),
+        (["RUN", "--max-seconds", 5], 2, "need --video FILE"),
         (["RUN", "--backend", "ale"], 1, "unknown environment 'CartPole-v1'"),
         (["nowhere"], 1, "nowhere has no checkpoints: is it a run directory"),
     ],
 )
-def test_a_mistake_is_told_in_one_line(
+def test_a_mistake_is_reported_in_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     refused: Callable[..., str],

@@ -1,4 +1,4 @@
-"""What the service promises when actors, learner, router, disk and network fail: real processes, a real router."""
+"""Test of failures of actors, learner, router, disk and network, with real processes."""
 
 import json
 import os
@@ -23,7 +23,7 @@ SAVING = ("--set", "service.checkpoint_seconds=0.3")
 
 @pytest.fixture
 def status(start: Start, address: str) -> Status:
-    """Asks the learner for its status; empty while it does not answer."""
+    """Function that returns the status of the learner, or an empty dict while it does not answer."""
 
     def ask(at: str = address) -> dict:
         running = start("status", "--connect", at, "--json")
@@ -34,12 +34,12 @@ def status(start: Start, address: str) -> Status:
 
 @pytest.fixture
 def learner(start: Start, address: str) -> Callable[..., Running]:
-    """Starts a learner that never ends by itself."""
+    """Function that starts a learner with an endless run."""
     return lambda *more: start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS, *more)
 
 
 def actor_status(status: dict, name: str) -> dict:
-    """What a status tells of one actor; empty if it does not know it."""
+    """Return the status of one actor, or an empty dict if the learner does not know it."""
     return next((actor for actor in status.get("actors", ()) if actor["actor"] == name), {})
 
 
@@ -47,8 +47,8 @@ def env_steps(status: dict, name: str) -> int:
     return actor_status(status, name).get("env_steps", 0)
 
 
-def plays_on(status: Status, name: str, at: str = "") -> None:
-    """Waits until rollouts of an actor are trained on that it has still to send."""
+def wait_for_training(status: Status, name: str, at: str = "") -> None:
+    """Wait until the learner has trained on new rollouts of an actor."""
     ask = (lambda: status(at)) if at else status
     until(ask)
     before = env_steps(ask(), name)
@@ -58,59 +58,59 @@ def plays_on(status: Status, name: str, at: str = "") -> None:
 # --------------------------------------------------------------------------------------------- actors
 
 
-def test_a_frozen_actor_is_missed_and_goes_on_where_it_was(
+def test_a_frozen_actor_is_noticed_as_gone_and_continues_afterwards(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     learner()
     frozen = start("actor", "--connect", address, "--name", "frozen")
     start("actor", "--connect", address, "--name", "other")
-    plays_on(status, "frozen")
+    wait_for_training(status, "frozen")
     frozen.process.send_signal(signal.SIGSTOP)
     try:
         until(lambda: actor_status(status(), "frozen")["alive"] is False)
-        plays_on(status, "other")
+        wait_for_training(status, "other")
     finally:
         frozen.process.send_signal(signal.SIGCONT)
-    plays_on(status, "frozen")
+    wait_for_training(status, "frozen")
     again = actor_status(status(), "frozen")
     assert (again["alive"], again["lives"]) == (True, 1)
     assert set(again["rollouts_rejected"]) <= {"stale", "duplicate"}
 
 
-def test_a2c_waits_for_a_frozen_actor_no_longer_than_it_is_there(
+def test_a2c_does_not_wait_for_a_frozen_actor_that_is_noticed_as_gone(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     learner("--algorithm", "a2c")
     frozen = start("actor", "--connect", address, "--name", "frozen")
     start("actor", "--connect", address, "--name", "other")
-    plays_on(status, "frozen")
+    wait_for_training(status, "frozen")
     frozen.process.send_signal(signal.SIGSTOP)
     try:
-        plays_on(status, "other")
+        wait_for_training(status, "other")
         assert actor_status(status(), "frozen")["alive"] is False
     finally:
         frozen.process.send_signal(signal.SIGCONT)
-    plays_on(status, "frozen")
+    wait_for_training(status, "frozen")
 
 
-def test_an_actor_whose_link_was_dead_goes_on_without_a_restart(
+def test_an_actor_continues_without_a_restart_after_its_link_stalled(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     learner()
     proxy = StallingProxy(address)
     try:
         start("actor", "--connect", proxy.address, "--name", "remote")
-        plays_on(status, "remote")
+        wait_for_training(status, "remote")
         proxy.stall()
         until(lambda: actor_status(status(), "remote")["alive"] is False)
         proxy.resume()
-        plays_on(status, "remote")
+        wait_for_training(status, "remote")
         assert actor_status(status(), "remote")["lives"] == 1
     finally:
         proxy.close()
 
 
-def test_an_actor_that_sends_what_no_healthy_one_would_is_shut_out_and_says_why(
+def test_an_actor_that_sends_nan_rewards_is_quarantined_and_prints_the_reason(
     start: Start, address: str, tmp_path: Path, status: Status
 ) -> None:
     source = (Path(__file__).parent.parent / "nan_environment.py").read_text()
@@ -119,20 +119,20 @@ def test_an_actor_that_sends_what_no_healthy_one_would_is_shut_out_and_says_why(
     actor = start("actor", "--connect", address, "--name", "broken")
     assert actor.wait() == 1
     assert "quarantined this actor: 3 unfit rollouts in a row, the last: rewards has a value" in actor.output
-    told = actor_status(status(), "broken")
-    assert told["quarantined"].endswith("rewards has a value that is not finite")
-    assert told["rollouts_rejected"]["unfit"] == 3  # beside what was in flight and not looked at
+    report = actor_status(status(), "broken")
+    assert report["quarantined"].endswith("rewards has a value that is not finite")
+    assert report["rollouts_rejected"]["unfit"] == 3  # rollouts in flight are not counted
     learner.process.terminate()
     assert learner.wait() == 1
     assert "Traceback" not in learner.output
 
 
-def test_poisoned_rollouts_harm_nobody_but_their_sender(
+def test_rollouts_with_nan_do_not_affect_the_weights_or_other_actors(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     serving = learner()
     start("actor", "--connect", address, "--name", "good")
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     sender = Sender(address, "rogue")
     try:
         answers = [sender.send(sender.poison(sequence, sender.version())) for sequence in range(4)]
@@ -140,7 +140,7 @@ def test_poisoned_rollouts_harm_nobody_but_their_sender(
         sender.close()
     assert [answer.verdict for answer in answers] == ["rejected", "rejected", "quarantined", "quarantined"]
     assert "rewards" in answers[0].reason
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     serving.process.terminate()
     assert serving.wait() == 1
     newest = max((tmp_path / "run" / "checkpoints").iterdir())
@@ -152,16 +152,16 @@ def test_poisoned_rollouts_harm_nobody_but_their_sender(
 
 
 def newest_checkpoint(directory: Path) -> str:
-    """Its name; empty if there is none yet."""
+    """Return the name of the newest checkpoint, or an empty string."""
     return max((entry.name for entry in (directory / "checkpoints").glob("0*")), default="")
 
 
 def learners(run: str) -> list[int]:
-    """The learner's process, as `daedalus train` starts it."""
+    """Return the ids of learner processes of a run that `daedalus train` started."""
     return sorted(set(processes_mentioning("--prepared")) & set(processes_mentioning(run)))
 
 
-def test_a_killed_learner_comes_back_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
+def test_a_killed_learner_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
     training = start("train", "cartpole", "--run-dir", "fallen-run", *ENDLESS[:2], "--env-steps", 3_000_000, *SAVING)
     for _ in range(2):
         saved = newest_checkpoint(tmp_path / "fallen-run")
@@ -171,38 +171,38 @@ def test_a_killed_learner_comes_back_and_training_reaches_its_end(start: Start, 
         until(lambda victim=victim: set(learners("fallen-run")) - {victim})
     assert training.wait() == 0, training.output
     assert training.output.count("the learner was killed by signal 9; started again") == 2
-    assert training.output.count("going on from checkpoint") == 2
+    assert training.output.count("resuming from checkpoint") == 2
     assert "Traceback" not in training.output
     summary = json.loads((tmp_path / "fallen-run" / "summary.json").read_text())
     assert summary["env_steps"] >= 3_000_000
     assert not processes_mentioning("fallen-run")
 
 
-def test_a_supervised_learner_goes_on_by_the_same_command(
+def test_the_same_command_with_resume_continues_a_killed_learner(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     first = learner("--resume", *SAVING)
     start("actor", "--connect", address, "--name", "loyal")
-    plays_on(status, "loyal")
+    wait_for_training(status, "loyal")
     until(lambda: status().get("checkpoint_age_seconds") is not None)
     first.process.kill()
     first.wait()
     second = learner("--resume", *SAVING)
-    version = int(second.expect(r"going on from checkpoint (\d+)").group(1))
+    version = int(second.expect(r"resuming from checkpoint (\d+)").group(1))
     assert version > 0
-    plays_on(status, "loyal")
+    wait_for_training(status, "loyal")
     assert status()["updates"] > version
     other = learner("--resume", "--seed", 99)
     assert other.wait() == 2
-    assert "begun with other settings" in other.output
+    assert "has other settings" in other.output
 
 
-def test_a_learner_leaves_in_good_order_beside_a_frozen_actor(
+def test_a_learner_writes_its_summary_on_sigterm_although_an_actor_is_frozen(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     leaving = learner()
     frozen = start("actor", "--connect", address, "--name", "frozen")
-    plays_on(status, "frozen")
+    wait_for_training(status, "frozen")
     frozen.process.send_signal(signal.SIGSTOP)
     leaving.process.terminate()
     leaving.process.terminate()
@@ -215,7 +215,7 @@ def test_a_learner_leaves_in_good_order_beside_a_frozen_actor(
 
 @pytest.fixture
 def router(start: Start, address: str) -> Callable[[], Running]:
-    """Starts a router of its own at the address."""
+    """Function that starts a router at the address."""
 
     def start_one() -> Running:
         running = start("router", "--listen", address)
@@ -225,24 +225,24 @@ def router(start: Start, address: str) -> Callable[[], Running]:
     return start_one
 
 
-def test_learner_and_actors_find_each_other_again_when_the_router_returns(
+def test_learner_and_actors_reconnect_when_the_router_is_restarted(
     start: Start, address: str, status: Status, router: Callable[[], Running]
 ) -> None:
     serving = start("learner", "cartpole", "--connect", address, "--run-dir", "run", *ENDLESS)
     serving.expect("waiting for it")
     first = router()
     actor = start("actor", "--connect", address, "--name", "loyal")
-    plays_on(status, "loyal")
+    wait_for_training(status, "loyal")
     first.process.kill()
     first.wait()
     assert status() == {}
     router()
-    plays_on(status, "loyal")
+    wait_for_training(status, "loyal")
     assert actor_status(status(), "loyal")["lives"] == 1
     assert (serving.process.poll(), actor.process.poll()) == (None, None)
 
 
-def test_a_learner_whose_link_to_the_router_was_dead_serves_again(
+def test_a_learner_serves_again_after_its_link_to_the_router_stalled(
     start: Start, address: str, status: Status, router: Callable[[], Running]
 ) -> None:
     router()
@@ -250,24 +250,24 @@ def test_a_learner_whose_link_to_the_router_was_dead_serves_again(
     try:
         start("learner", "cartpole", "--connect", proxy.address, "--run-dir", "run", *ENDLESS)
         start("actor", "--connect", address, "--name", "loyal")
-        plays_on(status, "loyal")
+        wait_for_training(status, "loyal")
         proxy.stall()
         until(lambda: status() == {})
         proxy.resume()
-        plays_on(status, "loyal")
+        wait_for_training(status, "loyal")
     finally:
         proxy.close()
 
 
-# ------------------------------------------------------------------------------- what anybody may send
+# ------------------------------------------------------------------------------- hostile senders
 
 
-def test_bytes_of_any_kind_on_any_key_change_nothing(
+def test_arbitrary_bytes_on_any_key_change_nothing(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     serving = learner()
     actor = start("actor", "--connect", address, "--name", "good")
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     run = status()["run"]
     sender = Sender(address, "stranger")
     genuine = sender.rollout(0, 0)
@@ -297,7 +297,7 @@ def test_bytes_of_any_kind_on_any_key_change_nothing(
                 assert len(sender.transport.query(key, payload, timeout=LIMIT)) == 1
             sender.transport.publish(keys.snapshots(run), payload)
         sender.transport.declare_presence(keys.presence(run, "nobody-ever-joined", 1))
-        plays_on(status, "good")
+        wait_for_training(status, "good")
     finally:
         sender.close()
     after = status()
@@ -309,13 +309,13 @@ def test_bytes_of_any_kind_on_any_key_change_nothing(
         assert "Traceback" not in process.output
 
 
-def test_more_than_the_learner_can_take_is_answered_busy_and_nothing_accepted_is_lost(
+def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
-    """Two hundred at once into a queue that holds a few, while an actor goes on playing."""
+    """Send two hundred rollouts at once to a queue that holds a few, while an actor plays."""
     learner("--set", "service.queue_megabytes=0.02", "--set", "training.max_policy_lag=1000000")
     start("actor", "--connect", address, "--name", "good")
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     sender = Sender(address, "flood")
     verdicts: list[bytes | None] = []
     try:
@@ -325,13 +325,13 @@ def test_more_than_the_learner_can_take_is_answered_busy_and_nothing_accepted_is
             sender.transport.query_async(sender.key, payload, timeout=LIMIT, on_answer=verdicts.append)
         until(lambda: len(verdicts) == 200)
         assert None not in verdicts
-        told = actor_status(status(), "flood")
-        assert told["busy_answers"] > 0
-        assert told["rollouts_accepted"] + told["busy_answers"] == 200
-        assert told["rollouts_rejected"] == {}
+        report = actor_status(status(), "flood")
+        assert report["busy_answers"] > 0
+        assert report["rollouts_accepted"] + report["busy_answers"] == 200
+        assert report["rollouts_rejected"] == {}
         rows = sender.welcome.spec.collection.rollout_length * sender.environments
         until(lambda: env_steps(status(), "flood") == actor_status(status(), "flood")["rollouts_accepted"] * rows)
-        plays_on(status, "good")
+        wait_for_training(status, "good")
     finally:
         sender.close()
 
@@ -339,12 +339,12 @@ def test_more_than_the_learner_can_take_is_answered_busy_and_nothing_accepted_is
 # ----------------------------------------------------------------------------------------------- disk
 
 
-def test_a_disk_that_takes_nothing_costs_a_warning_and_no_training(
+def test_training_continues_with_a_warning_while_no_checkpoint_can_be_saved(
     start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     serving = learner(*SAVING)
     start("actor", "--connect", address, "--name", "good")
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     until(lambda: status().get("checkpoint_age_seconds") is not None)
     _, hard = resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (0, hard))
@@ -352,7 +352,7 @@ def test_a_disk_that_takes_nothing_costs_a_warning_and_no_training(
     assert start("status", "--connect", address, "--quiet").wait() == 3
     assert "checkpoints cannot be saved: File too large" in status()["problems"]
     newest = newest_checkpoint(tmp_path / "run")
-    plays_on(status, "good")
+    wait_for_training(status, "good")
     assert newest_checkpoint(tmp_path / "run") == newest
     resource.prlimit(serving.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
     serving.expect("checkpoints are saved again")
@@ -361,7 +361,7 @@ def test_a_disk_that_takes_nothing_costs_a_warning_and_no_training(
     assert status()["problems"] == []
 
 
-def test_a_service_without_actors_says_so_by_its_exit_status(start: Start, address: str) -> None:
+def test_status_reports_a_learner_without_actors_as_unhealthy(start: Start, address: str) -> None:
     start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS).expect("actors join with")
 
     def unhealthy() -> bool:

@@ -1,4 +1,4 @@
-"""A task that only a policy with a memory can solve, and pixels with a memory, by real processes over a real router."""
+"""Test of policies with memory: a task that needs memory, and pixels with memory."""
 
 import csv
 import json
@@ -20,14 +20,12 @@ SETTINGS = (
     "training.learning_rate=0.003",
     "training.trace_lambda=0.95",
     "collection.envs_per_actor=32",
-    "collection.rollout_length=12",  # two episodes and more: the memory starts anew within a rollout
+    "collection.rollout_length=12",  # two episodes: the memory is reset within a rollout
 )
 
 
 @pytest.mark.parametrize(("memory", "status"), [("gru", 0), ("none", 3)])
-def test_a_cue_is_remembered_by_a_policy_with_a_memory_only(
-    start: Start, tmp_path: Path, memory: str, status: int
-) -> None:
+def test_only_a_policy_with_memory_solves_the_cue_task(start: Start, tmp_path: Path, memory: str, status: int) -> None:
     shutil.copy(cue_environment.__file__, tmp_path)
     options = [word for setting in (f"policy.memory={memory}", *SETTINGS) for word in ("--set", setting)]
     running = start("train", "--env", "cue_environment:Cue-v0", "--env-steps", 200_000, "--run-dir", "run", *options)
@@ -36,8 +34,8 @@ def test_a_cue_is_remembered_by_a_policy_with_a_memory_only(
     assert evaluation > 0.9 if memory == "gru" else abs(evaluation) < 0.5
 
 
-def test_pixels_are_learned_from_evaluated_and_the_best_policy_kept(start: Start, tmp_path: Path) -> None:
-    """Stacked frames, convolutions with a memory, appo, and an evaluator beside the actors."""
+def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start, tmp_path: Path) -> None:
+    """Use stacked frames, convolutions with a memory, appo, and an evaluator process."""
     (tmp_path / "pong.toml").write_text(
         """
         environment.id = "ALE/Pong-v5"

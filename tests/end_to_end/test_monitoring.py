@@ -1,4 +1,4 @@
-"""The exporter as a process, with a router, a learner and actors that come and go."""
+"""Test of the exporter process with a router, a learner and actors that join and die."""
 
 import urllib.request
 from collections.abc import Callable
@@ -11,13 +11,13 @@ ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 
 def scrape(url: str) -> dict[tuple[str, str], float]:
-    """Values by the sample's name and the actor's."""
+    """Return the values by the names of sample and actor."""
     with urllib.request.urlopen(url, timeout=60) as answer:
         families = text_string_to_metric_families(answer.read().decode())
         return {(each.name, each.labels.get("actor", "")): each.value for family in families for each in family.samples}
 
 
-def test_the_exporter_tells_of_who_is_there_now(start: Start, address: str) -> None:
+def test_the_exporter_serves_metrics_of_the_present_learner_and_actors_only(start: Start, address: str) -> None:
     exporter = start("exporter", "--connect", address, "--listen", "127.0.0.1:0")
     url = exporter.expect(r"http://\S+").group()
     assert scrape(url) == {("daedalus_up", ""): 0.0}

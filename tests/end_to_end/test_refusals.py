@@ -1,4 +1,4 @@
-"""Actors that do not fit, and bytes that no actor of ours sent, against a real learner over a real router."""
+"""Test of a real learner with mismatching actors and with arbitrary bytes."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -19,13 +19,13 @@ Start = Callable[..., Running]
 
 
 @pytest.fixture
-def stranger(start: Start, address: str) -> Iterator[Transport]:
-    """A client of a learner that runs and has an actor already."""
+def client(start: Start, address: str) -> Iterator[Transport]:
+    """Transport of a client that is connected to a running learner."""
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
     learner.expect("actors join with")
     transport = connect([address])
     try:
-        until(lambda: transport.query(keys.join("run"), timeout=30.0))  # the last key that is served
+        until(lambda: transport.query(keys.join("run"), timeout=30.0))  # the key that the learner serves last
         yield transport
         assert learner.process.poll() is None, learner.output
     finally:
@@ -38,30 +38,30 @@ def ask(transport: Transport, key: str, payload: bytes) -> Message:
 
 
 def join(**kwargs: object) -> bytes:
-    return encode(Join(actor="stranger", incarnation=1, **kwargs))  # type: ignore[arg-type] - fields of Join
+    return encode(Join(actor="client", incarnation=1, **kwargs))  # type: ignore[arg-type] - fields of Join
 
 
-def test_another_protocol_version_is_refused_with_both_named(stranger: Transport) -> None:
+def test_another_protocol_version_is_refused_and_both_versions_are_named(client: Transport) -> None:
     other = bytearray(join())
     struct.pack_into("<H", other, 4, 7)
-    answer = ask(stranger, keys.join("run"), bytes(other))
+    answer = ask(client, keys.join("run"), bytes(other))
     assert isinstance(answer, Refusal)
     assert answer.code == "mismatch"
     assert "protocol version 7" in answer.reason
     assert f"this one {PROTOCOL_VERSION}" in answer.reason
 
 
-def test_mismatching_spaces_are_refused_with_both_named(stranger: Transport) -> None:
-    first = ask(stranger, keys.join("*"), join(spaces=CARTPOLE, environments=2))
+def test_mismatching_spaces_are_refused_and_both_are_named(client: Transport) -> None:
+    first = ask(client, keys.join("*"), join(spaces=CARTPOLE, environments=2))
     assert isinstance(first, Welcome)
     other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
-    answer = ask(stranger, keys.join("run"), join(spaces=other, environments=2))
+    answer = ask(client, keys.join("run"), join(spaces=other, environments=2))
     assert isinstance(answer, Refusal)
     assert "3 choices" in answer.reason
     assert "2 choices" in answer.reason
 
 
-def test_the_learner_survives_bytes_of_any_kind_on_every_key(stranger: Transport) -> None:
+def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) -> None:
     for payload in (b"", b"\x00", b"DAED", b"\xff" * 5000, join()[:-3]):
         for key in (
             keys.join("run"),
@@ -70,18 +70,18 @@ def test_the_learner_survives_bytes_of_any_kind_on_every_key(stranger: Transport
             keys.snapshots("run"),
             keys.status("run"),
         ):
-            ask(stranger, key, payload)
-        stranger.publish(keys.snapshots("run"), payload)
-    answer = ask(stranger, keys.rollouts("run", "stranger"), b"\xff")
+            ask(client, key, payload)
+        client.publish(keys.snapshots("run"), payload)
+    answer = ask(client, keys.rollouts("run", "client"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "fenced"
-    ask(stranger, keys.join("run"), join(spaces=CARTPOLE, environments=2))
-    answer = ask(stranger, keys.rollouts("run", "stranger"), b"\xff")
+    ask(client, keys.join("run"), join(spaces=CARTPOLE, environments=2))
+    answer = ask(client, keys.rollouts("run", "client"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "rejected"
 
 
-def test_of_two_actors_of_one_name_the_second_is_refused_until_the_first_has_left(start: Start, address: str) -> None:
+def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
     learner.expect("actors join with")
@@ -97,7 +97,7 @@ def test_of_two_actors_of_one_name_the_second_is_refused_until_the_first_has_lef
     third.expect("joined run 'run' as 'arm'")
 
 
-def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address: str) -> None:
+def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str) -> None:
     router = listen([address])
     try:
         first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
@@ -111,9 +111,11 @@ def test_of_two_learners_of_one_run_the_second_is_refused(start: Start, address:
         router.close()
 
 
-def test_a_refused_actor_says_why_and_ends(start: Start, stranger: Transport, address: str) -> None:
+def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transport, address: str) -> None:
     other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
-    ask(stranger, keys.join("run"), join(spaces=other, environments=2))
+    ask(client, keys.join("run"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1
-    actor.expect("the learner refused this actor: its environment has .*2 choices; this run has .*3 choices")
+    actor.expect(
+        "the learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices"
+    )

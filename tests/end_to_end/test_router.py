@@ -1,4 +1,4 @@
-"""A router on its own, as a process."""
+"""Test of the router process."""
 
 import socket
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def other_address() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def test_a_router_says_where_it_listens_and_ends_when_told(start: Start, address: str) -> None:
+def test_a_router_prints_its_address_and_ends_on_sigterm(start: Start, address: str) -> None:
     router = start("router", "--listen", address)
     router.expect(f"listening on {address}")
     second = start("router", "--listen", address)
@@ -29,9 +29,7 @@ def test_a_router_says_where_it_listens_and_ends_when_told(start: Start, address
     assert len(router.lines) == 1
 
 
-def test_two_routers_carry_a_run_between_them_in_whatever_order_they_start(
-    start: Start, address: str, other_address: str
-) -> None:
+def test_a_run_works_over_two_routers_that_start_in_any_order(start: Start, address: str, other_address: str) -> None:
     start("router", "--listen", other_address, "--connect", address).expect("listening")
     learner = start("learner", "cartpole", "--connect", other_address, "--run-dir", "run", "--env-steps", 30000)
     start("actor", "--connect", address)
@@ -39,7 +37,7 @@ def test_two_routers_carry_a_run_between_them_in_whatever_order_they_start(
     assert learner.wait() == 3, learner.output
 
 
-def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, address: str, tmp_path: Path) -> None:
+def test_router_and_exporter_accept_only_certificates_of_their_ca(start: Start, address: str, tmp_path: Path) -> None:
     certificates = make_certificates(tmp_path / "certs")
     tls = address.replace("tcp/", "tls/")
     start("router", "--listen", tls, "--tls", certificates / "router").expect("listening")
@@ -62,7 +60,7 @@ def test_over_tls_a_router_and_an_exporter_let_in_whom_they_know(start: Start, a
         (("exporter", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
     ],
 )
-def test_what_is_not_secure_is_bad_usage(start: Start, arguments: tuple[str, ...], message: str) -> None:
+def test_an_insecure_address_is_bad_usage(start: Start, arguments: tuple[str, ...], message: str) -> None:
     refused = start(*arguments)
     assert refused.wait() == 2
     refused.expect(message)

@@ -1,4 +1,4 @@
-"""An actor whose link is slow: 1 Mbit/s up, 4 Mbit/s down, 100 ms each way. Real processes, a real router."""
+"""Test of an actor on a slow link: 1 Mbit/s up, 4 Mbit/s down, 100 ms in each direction."""
 
 import json
 from collections.abc import Callable
@@ -12,7 +12,7 @@ Start = Callable[..., Running]
 
 @pytest.fixture
 def far(start: Start, address: str) -> Callable[[], dict]:
-    """A learner that never ends by itself, and what its status tells of the actor `far`."""
+    """Start a learner with an endless run; return a function for the status of the actor `far`."""
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
 
@@ -24,7 +24,7 @@ def far(start: Start, address: str) -> Callable[[], dict]:
     return ask
 
 
-def test_an_actor_finds_out_that_its_link_is_slow_and_is_trained_on(
+def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(
     start: Start, address: str, far: Callable[[], dict]
 ) -> None:
     proxy = SlowProxy(address, up=125e3, down=500e3, delay=0.1)
@@ -41,12 +41,12 @@ def test_an_actor_finds_out_that_its_link_is_slow_and_is_trained_on(
         proxy.close()
 
 
-def test_an_actor_that_is_told_that_its_link_is_slow_follows_the_learner(
+def test_an_actor_with_link_wan_keeps_receiving_new_weights(
     start: Start, address: str, far: Callable[[], dict]
 ) -> None:
     start("actor", "--connect", address, "--name", "far", "--link", "wan")
     until(lambda: far().get("env_steps", 0) > 50_000)
-    # Of new weights all the time: what it played with its first would have grown too old by now.
+    # The actor received new weights: rollouts of its first weights would be stale by now.
     report = far()
     assert report["compact_snapshots"]
     assert sum(report["rollouts_rejected"].values()) < report["rollouts_accepted"]

@@ -1,4 +1,4 @@
-"""Learner, actors and status over TLS, as processes that were given nothing but addresses and folders."""
+"""Test of learner, actors and status over TLS."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ def tls(address: str) -> str:
     return address.replace("tcp/", "tls/")
 
 
-def test_a_run_over_tls_is_solved_by_actors_that_it_knows(start: Start, tls: str, certificates: Path) -> None:
+def test_authorised_actors_solve_cartpole_over_tls(start: Start, tls: str, certificates: Path) -> None:
     learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
     arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
     arm.expect(r"joined run 'run' as 'arm\.\d+'")
@@ -31,7 +31,7 @@ def test_a_run_over_tls_is_solved_by_actors_that_it_knows(start: Start, tls: str
     assert arm.wait() == 0, arm.output
 
 
-def test_train_lets_in_actors_of_other_machines_over_tls(start: Start, tls: str, certificates: Path) -> None:
+def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, tls: str, certificates: Path) -> None:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     training = ("--listen", tls, "--tls", certificates / "learner", "--actors", 1, *endless)
     train = start("train", "cartpole", *training)
@@ -43,10 +43,8 @@ def test_train_lets_in_actors_of_other_machines_over_tls(start: Start, tls: str,
     until(lambda: start(*asking, certificates / "operator").wait() == 0)
 
 
-def test_an_actor_that_is_not_on_the_list_is_told_what_may_be_the_matter(
-    start: Start, tls: str, certificates: Path
-) -> None:
-    """Its certificate is good; the learner started before it was issued."""
+def test_an_unauthorised_actor_gets_a_hint_about_the_list_of_names(start: Start, tls: str, certificates: Path) -> None:
+    """Issue a valid certificate after the start of the learner."""
     start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run").expect(
         "actors join with"
     )
@@ -56,7 +54,9 @@ def test_an_actor_that_is_not_on_the_list_is_told_what_may_be_the_matter(
     late.expect("no learner answered .* actor 'late' authorised by it .or by its router..* is read at start")
 
 
-def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certificates: Path, tmp_path: Path) -> None:
+def test_mistakes_with_certificates_are_reported_in_one_line(
+    start: Start, tls: str, certificates: Path, tmp_path: Path
+) -> None:
     strange = make_certificates(tmp_path / "strange")
     learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
     learner.expect("actors join with")
@@ -64,7 +64,7 @@ def test_strangers_and_mistakes_are_told_in_a_line(start: Start, tls: str, certi
     for arguments, status, message in (
         ((*to, "--tls", strange / "actor-arm"), 1, "the two ends use different CAs"),
         ((*to, "--tls", certificates / "learner"), 2, "holds the certificate of learner, but actor is required"),
-        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': --name arm or arm.ANY"),
+        ((*to, "--tls", certificates / "actor-arm", "--name", "box"), 2, "is not for 'box': use --name arm or arm.ANY"),
         (to, 2, "needs certificates: --tls DIR"),
         (("actor", "--connect", tls.replace("tls", "tcp"), "--timeout", 0.1), 1, "requires --tls"),
         (

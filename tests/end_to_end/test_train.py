@@ -1,8 +1,9 @@
-"""`daedalus train` from the command to the summary, with real processes over a real router."""
+"""Test of `daedalus train` and `daedalus resume`, with real processes."""
 
 import csv
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -31,7 +32,7 @@ def newest_checkpoint(directory: Path) -> Path:
     return max((directory / "checkpoints").iterdir())
 
 
-def nobody_listens(output: str) -> bool:
+def is_port_closed(output: str) -> bool:
     port = int(output.split("tcp/127.0.0.1:")[1].split(";")[0])
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) != 0
@@ -39,11 +40,10 @@ def nobody_listens(output: str) -> bool:
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A run of the main job, to its end; several tests look at it."""
+    """Train CartPole until it is solved. Several tests check this run."""
     folder = tmp_path_factory.mktemp("solved")
     words = ["-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-    # More than the preset's budget: no two asynchronous runs are alike, and these tests are not about how fast one
-    # learns.
+    # More than the budget of the preset: asynchronous runs differ, and these tests do not check the speed of learning.
     running = Running(
         [sys.executable, *words, "train", "cartpole", "--env-steps", "4000000", "--run-dir", "solved-run"], folder
     )
@@ -59,7 +59,9 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     result = summary(directory)
     assert result["solved"] is True
     assert result["episode_return_mean"] >= 475
-    assert result["evaluation_return_mean"] > 100  # an untrained policy has 10; greedy is not what was trained
+    assert (
+        result["evaluation_return_mean"] > 100
+    )  # an untrained policy has 10. Greedy actions differ from the sampled actions of training
     assert 0 < result["seconds_to_target"] <= result["wall_seconds"]
     assert result["rollouts_rejected"] == {}
     assert result["snapshots_published"] == result["updates"] + 1
@@ -84,9 +86,9 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     assert float(rows[-1]["entropy"]) > 0
 
 
-def test_nothing_is_left_behind(solved: tuple[Path, str]) -> None:
+def test_no_process_and_no_open_port_is_left(solved: tuple[Path, str]) -> None:
     assert not processes_mentioning("solved-run")
-    assert nobody_listens(solved[1])
+    assert is_port_closed(solved[1])
 
 
 def test_evaluate_plays_a_finished_run(solved: tuple[Path, str], start: Start) -> None:
@@ -103,8 +105,8 @@ def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: 
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_resume_continues_exactly(solved: tuple[Path, str], start: Start, tmp_path: Path) -> None:
-    """With the budget used up already, what is loaded is saved again: all of it must be as it was."""
+def test_resume_restores_the_exact_state_and_continues(solved: tuple[Path, str], start: Start, tmp_path: Path) -> None:
+    """Resume with a used-up budget: the loaded state is saved again and must be equal."""
     first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run")
     assert first.wait() == 3, first.output  # the budget ended without the target
     before = newest_checkpoint(tmp_path / "run")
@@ -128,7 +130,7 @@ def test_resume_continues_exactly(solved: tuple[Path, str], start: Start, tmp_pa
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_everything_with_a_checkpoint(start: Start, tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: Path, number: signal.Signals) -> None:
     running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS)
     running.expect(r"updates .*/s")
     running.process.send_signal(number)
@@ -136,10 +138,10 @@ def test_a_signal_ends_everything_with_a_checkpoint(start: Start, tmp_path: Path
     running.expect("continue with: daedalus resume stopped-run")
     assert newest_checkpoint(tmp_path / "stopped-run").name.isdigit()
     assert not processes_mentioning("stopped-run")
-    assert nobody_listens(running.output)
+    assert is_port_closed(running.output)
 
 
-def test_children_do_not_outlive_a_killed_launcher(start: Start) -> None:
+def test_the_child_processes_end_when_train_is_killed(start: Start) -> None:
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
     address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
     running.expect(r"updates .*/s")
@@ -147,7 +149,7 @@ def test_children_do_not_outlive_a_killed_launcher(start: Start) -> None:
     until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))
 
 
-def test_a_killed_actor_is_replaced_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
+def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
     running = start(
         "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 4_000_000
     )
@@ -162,7 +164,7 @@ def test_a_killed_actor_is_replaced_and_training_reaches_its_end(start: Start, t
     assert result["solved"]
 
 
-def test_an_environment_of_the_users_own_is_found_in_the_working_directory(start: Start, tmp_path: Path) -> None:
+def test_an_environment_module_in_the_working_directory_is_found(start: Start, tmp_path: Path) -> None:
     source = (Path(__file__).parent.parent / "counting_environment.py").read_text()
     (tmp_path / "my_module.py").write_text(source)
     running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, "--run-dir", "own")
@@ -172,3 +174,18 @@ def test_an_environment_of_the_users_own_is_found_in_the_working_directory(start
     assert result["solved"] is False
     parameters = safetensors.numpy.load_file(newest_checkpoint(tmp_path / "own") / "parameters.safetensors")
     assert all(np.isfinite(array).all() for array in parameters.values())
+
+
+def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: Start) -> None:
+    settings = ("--set", "evaluation.seconds=0.2", "--set", "evaluation.final_episodes=3")
+    running = start("train", "cartpole", "--log-json", "--env-steps", 200_000, "--run-dir", "run", *settings)
+    assert running.wait() in (0, 3), running.output
+    records = [json.loads(line) for line in running.lines if line.startswith("{")]
+    assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
+    assert {"daedalus.cli.local_run", "daedalus.learner.service"} <= {record["logger"] for record in records}
+    plain = [line for line in running.lines if not line.startswith("{")]
+    assert not {record["message"] for record in records} & set(plain)
+    *progress, outcome, evaluation, folder = plain
+    assert all(re.search(r"return .* env_steps .* actors \d+$", line) for line in progress), running.output
+    assert (outcome.split(":")[0] in ("solved", "done"), evaluation.split(":")[0]) == (True, "evaluation")
+    assert folder.startswith("run directory: run;")

@@ -1,4 +1,4 @@
-"""The TypeScript actor in examples/node: its own tests, a learner that looks closely, and one that learns from it."""
+"""Test of the TypeScript actor in examples/node: its own tests, a recording learner, and a real learner."""
 
 import json
 import socket
@@ -12,8 +12,8 @@ import node
 import numpy as np
 import pytest
 import torch
-from close_look import ONE_AT_A_TIME, SPEC, CloseLook
 from processes import LIMIT, Running, until
+from recording_learner import ONE_AT_A_TIME, SPEC, RecordingLearner
 
 from daedalus.bridge.service import Bridge
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -25,14 +25,14 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 Start = Callable[..., Running]
 
 
-def test_its_own_tests_pass() -> None:
+def test_the_tests_of_the_node_actor_pass() -> None:
     run = subprocess.run([node.program(), "--test"], cwd=node.FOLDER, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout + run.stderr
 
 
 @pytest.fixture
 def network() -> Iterator[tuple[MemoryNetwork, str]]:
-    """A network within this process, and a bridge to it."""
+    """Memory network and the address of a bridge to it."""
     inside, stop = MemoryNetwork(), threading.Event()
     listener = socket.create_server(("127.0.0.1", 0))
     address = f"127.0.0.1:{listener.getsockname()[1]}"
@@ -46,7 +46,7 @@ def network() -> Iterator[tuple[MemoryNetwork, str]]:
 
 @pytest.fixture
 def begin() -> Iterator[Callable[[str], Running]]:
-    """Starts an actor that connects to the bridge at HOST:PORT; one that still runs is killed afterwards."""
+    """Function that starts an actor with the bridge at HOST:PORT. Actors left are killed at the end."""
     running: list[Running] = []
 
     def begin_one(address: str) -> Running:
@@ -62,13 +62,13 @@ def begin() -> Iterator[Callable[[str], Running]]:
 @pytest.fixture
 def play(
     network: tuple[MemoryNetwork, str], begin: Callable[[str], Running]
-) -> Callable[..., tuple[CloseLook, Running]]:
-    """A learner that looks closely, and an actor that plays for it."""
+) -> Callable[..., tuple[RecordingLearner, Running]]:
+    """Function that starts a recording learner and an actor."""
     inside, address = network
 
-    def begin_both(spec: RunSpec = SPEC) -> tuple[CloseLook, Running]:
+    def begin_both(spec: RunSpec = SPEC) -> tuple[RecordingLearner, Running]:
         torch.manual_seed(0)
-        return CloseLook(MemoryTransport(inside), spec), begin(address)
+        return RecordingLearner(MemoryTransport(inside), spec), begin(address)
 
     return begin_both
 
@@ -81,8 +81,8 @@ def gymnasium_step(state: np.ndarray, action: int) -> tuple[np.ndarray, bool]:
     return seen, bool(terminated)
 
 
-def test_every_row_is_what_the_program_and_the_environment_make_of_it(
-    play: Callable[..., tuple[CloseLook, Running]],
+def test_every_row_agrees_with_the_program_and_with_gymnasium(
+    play: Callable[..., tuple[RecordingLearner, Running]],
 ) -> None:
     learner, process = play(ONE_AT_A_TIME)
     seen, ended, running = None, np.zeros(6, np.bool_), np.zeros(6)
@@ -113,8 +113,8 @@ def test_every_row_is_what_the_program_and_the_environment_make_of_it(
                     assert not rollout.terminated[row, e]
                     assert not rollout.truncated[row, e]
                     continue
-                there, terminated = gymnasium_step(seen[e], int(rollout.actions[row, e]))
-                assert np.allclose(after, there, atol=1e-4)
+                expected_frame, terminated = gymnasium_step(seen[e], int(rollout.actions[row, e]))
+                assert np.allclose(after, expected_frame, atol=1e-4)
                 assert rollout.terminated[row, e] == terminated
             running += rollout.valid[row]
             assert np.array_equal(rollout.truncated[row], (running >= 40) & ~ended)
@@ -125,35 +125,37 @@ def test_every_row_is_what_the_program_and_the_environment_make_of_it(
         tail = rollout.frames[-1]
         assert rollout.episode_lengths.tolist() == finished
         assert rollout.episode_returns.tolist() == finished
-    learner.bid_farewell()
+    learner.end_run()
     assert process.wait() == 0, process.output
-    process.expect("the run is over: enough")
+    process.expect("the run is over: the test is over")
 
 
 def acted(runtime: OnnxRuntime, observations: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Logits and the next state, straight from the program."""
+    """Run the program and return logits and next state."""
     outputs = runtime._session.run(None, {**runtime._feed, "observations": observations, "state": state})
     return np.asarray(outputs[0]), np.asarray(outputs[1])
 
 
-def test_it_does_what_each_verdict_obliges_it_to(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+def test_the_actor_obeys_each_verdict(play: Callable[..., tuple[RecordingLearner, Running]]) -> None:
     learner, process = play(ONE_AT_A_TIME)
     for verdict in ("busy", "busy", "rejected", "fenced"):
         learner.verdicts.put(Acknowledgement(verdict=verdict, policy_version=0))
-    again = [learner.next() for _ in range(3)]  # busy: the same once more
+    again = [learner.next() for _ in range(3)]  # busy: the actor sends the same rollout again
     assert [rollout.identity.sequence for rollout in again] == [0, 0, 0]
     assert all(np.array_equal(rollout.frames, again[0].frames) for rollout in again)
-    assert learner.next().identity.sequence == 1  # rejected: never again; and this one is fenced
+    assert (
+        learner.next().identity.sequence == 1
+    )  # a rejected rollout is not sent again; the answer to this one is fenced
     joined = len(learner.joins)
     until(lambda: len(learner.joins) > joined)
-    assert learner.next().identity.sequence == 2  # the same life of the learner, so it goes on counting
+    assert learner.next().identity.sequence == 2  # the same learner epoch, so the sequence numbers continue
     learner.verdicts.put(Acknowledgement(verdict="quarantined", reason="not finite"))
     assert process.wait() == 1
     process.expect("takes nothing more of this actor: not finite")
 
 
-def test_it_plays_with_the_newest_weights_and_joins_another_life_of_the_learner(
-    play: Callable[..., tuple[CloseLook, Running]],
+def test_the_actor_uses_the_newest_weights_and_joins_a_restarted_learner(
+    play: Callable[..., tuple[RecordingLearner, Running]],
 ) -> None:
     learner, process = play(ONE_AT_A_TIME)
     learner.next()
@@ -167,12 +169,14 @@ def test_it_plays_with_the_newest_weights_and_joins_another_life_of_the_learner(
     assert process.wait() == 0, process.output
 
 
-def test_damaged_news_is_ignored_and_another_version_named(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+def test_damaged_snapshots_are_ignored_and_another_protocol_version_is_reported(
+    play: Callable[..., tuple[RecordingLearner, Running]],
+) -> None:
     learner, process = play(ONE_AT_A_TIME)
     learner.next()
     for damaged in (b"", b"nonsense", learner.snapshot()[:-1], learner.snapshot().replace(b"kind", b"find")):
         learner.push(damaged)
-        time.sleep(0.05)  # so that each is the newest for a while
+        time.sleep(0.05)  # so that each message is the newest for a while
     learner.publish()
     learner.await_rollout(lambda rollout: rollout.policy_version == 1)
     learner.push(b"DAED" + (99).to_bytes(2, "little") + learner.snapshot()[6:])
@@ -180,11 +184,11 @@ def test_damaged_news_is_ignored_and_another_version_named(play: Callable[..., t
     process.expect(f"the other end speaks protocol version 99, this one {PROTOCOL_VERSION}")
 
 
-def test_it_waits_for_an_earlier_life_of_its_name_to_be_found_dead(
+def test_the_actor_waits_while_its_name_is_taken(
     network: tuple[MemoryNetwork, str], begin: Callable[[str], Running]
 ) -> None:
     inside, address = network
-    learner = CloseLook(MemoryTransport(inside))
+    learner = RecordingLearner(MemoryTransport(inside))
     for _ in range(2):
         learner.refusals.put(Refusal(code="name_taken", reason="wing-ts takes part already"))
     actor = begin(address)
@@ -200,23 +204,29 @@ def test_it_waits_for_an_earlier_life_of_its_name_to_be_found_dead(
     refused.expect("refused this actor: no room")
 
 
-def test_on_policy_it_sends_one_rollout_of_each_version(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+def test_with_a2c_the_actor_sends_one_rollout_of_each_policy_version(
+    play: Callable[..., tuple[RecordingLearner, Running]],
+) -> None:
     learner, process = play(SPEC.model_copy(update={"training": TrainingSpec(algorithm="a2c")}))
     for version in range(4):
         rollout = learner.next()
         assert rollout.policy_version == version
         learner.publish()
-    learner.bid_farewell()
+    learner.end_run()
     assert process.wait() == 0, process.output
 
 
-def test_what_it_cannot_play_it_refuses(play: Callable[..., tuple[CloseLook, Running]]) -> None:
+def test_the_actor_refuses_an_environment_that_it_cannot_play(
+    play: Callable[..., tuple[RecordingLearner, Running]],
+) -> None:
     _, process = play(RunSpec(environment=EnvironmentSpec(id="CartPole-v1", action_repeat=2)))
     assert process.wait() == 1
     process.expect("it plays CartPole-v1 as it is")
 
 
-def test_a_learner_trains_on_what_it_sends(start: Start, begin: Callable[[str], Running], address: str) -> None:
+def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
+    start: Start, begin: Callable[[str], Running], address: str
+) -> None:
     node.program()
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
@@ -240,7 +250,7 @@ def test_a_learner_trains_on_what_it_sends(start: Start, begin: Callable[[str], 
     assert seen["environments"] == 6
     assert seen["rollouts_accepted"] > 0
     assert set(seen["rollouts_rejected"]) <= {"stale"}
-    assert report["episode_return_mean"] > 5  # its episodes were counted
+    assert report["episode_return_mean"] > 5  # the statistics of its episodes arrived
     actor.process.kill()
     until(lambda: not status()["actors"][0]["alive"])
     learner.process.terminate()

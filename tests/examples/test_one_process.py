@@ -1,4 +1,4 @@
-"""examples/one_process.py: a learner and an actor in one process, as a reader would run them."""
+"""Test of examples/one_process.py: a learner and an actor in one process."""
 
 import re
 import sys
@@ -10,8 +10,10 @@ from processes import Running
 EXAMPLE = Path(__file__).parents[2] / "examples" / "one_process.py"
 
 
-def test_it_learns_cartpole_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where it keeps its run
+def test_the_example_learns_cartpole_and_prints_the_mean_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # the example saves its run in this folder
     running = Running([sys.executable, str(EXAMPLE)], tmp_path)
     try:
         assert running.wait() == 0, running.output

@@ -1,4 +1,4 @@
-"""A learner that trains on nothing: it keeps what it is sent, for a test to look at, and answers as it is told to."""
+"""Learner for tests: it does not train, keeps the received rollouts, and gives the answers that a test sets."""
 
 import queue
 import time
@@ -23,19 +23,23 @@ SPEC = RunSpec(
     policy=PolicySpec(memory="gru", memory_units=8, hidden=(16,)),
     collection=CollectionSpec(envs_per_actor=6, rollout_length=48),
 )
-# Of two rollouts under way, either may arrive first.
+# Two rollouts in flight may arrive in any order.
 ONE_AT_A_TIME = SPEC.model_copy(update={"collection": SPEC.collection.model_copy(update={"window": 1})})
 
 
-class CloseLook:
-    """One life of it, for the run `r`; change `epoch` and it is another."""
+class RecordingLearner:
+    """Learner of the run `r` that records messages. A test changes `epoch` to simulate a new learner process."""
 
     def __init__(self, transport: MemoryTransport, spec: RunSpec = SPEC) -> None:
         self.spec, self.epoch, self.version = spec, 2**62 + 5, 0
         self.joins: list[Join] = []
         self.rollouts: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
-        self.verdicts: queue.SimpleQueue[Acknowledgement] = queue.SimpleQueue()  # instead of accepting
-        self.refusals: queue.SimpleQueue[Refusal] = queue.SimpleQueue()  # instead of a welcome
+        self.verdicts: queue.SimpleQueue[Acknowledgement] = (
+            queue.SimpleQueue()
+        )  # answers to the next rollouts, instead of accepting them
+        self.refusals: queue.SimpleQueue[Refusal] = (
+            queue.SimpleQueue()
+        )  # answers to the next joins, instead of a welcome
         self.present: dict[tuple[str, int] | None, bool] = {}
         self._transport = transport
         self.model, self.weights = b"", {}
@@ -59,11 +63,11 @@ class CloseLook:
         self.weights = {name: (array * 1.01).astype(np.float32) for name, array in self.weights.items()}
         self.push(self.snapshot())
 
-    def push(self, news: bytes) -> None:
-        self._transport.publish(keys.snapshots("r"), news)
+    def push(self, message: bytes) -> None:
+        self._transport.publish(keys.snapshots("r"), message)
 
-    def bid_farewell(self) -> None:
-        self.push(encode(RunEnded(learner_epoch=self.epoch, reason="enough")))
+    def end_run(self) -> None:
+        self.push(encode(RunEnded(learner_epoch=self.epoch, reason="the test is over")))
 
     def _program(self) -> bytes:
         return encode(Program(hash=program_hash(self.model), model=np.frombuffer(self.model, np.uint8)))
@@ -78,7 +82,7 @@ class CloseLook:
         if not self.refusals.empty():
             request.reply(encode(self.refusals.get()))
             return
-        if join.spaces is not None:  # who is counted in is there already
+        if join.spaces is not None:  # an actor declares its presence before it joins
             assert self.present[join.actor, join.incarnation]
         if join.spaces is not None and not self.weights:
             network = ActorCritic(self.spec.policy, join.spaces)
@@ -104,5 +108,5 @@ class CloseLook:
     def await_rollout(self, wanted: Callable[[Rollout], bool]) -> Rollout:
         deadline = time.monotonic() + LIMIT
         while not wanted(rollout := self.next()):
-            assert time.monotonic() < deadline, "no such rollout came"
+            assert time.monotonic() < deadline, "no rollout fulfilled the condition in time"
         return rollout
