@@ -27,11 +27,10 @@ class Losses(NamedTuple):
 class Algorithm(Protocol):
     """The mathematics of one algorithm. Its scheduling is in daedalus/protocol/algorithms.py."""
 
-    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of each update of a batch, in order.
 
         The caller changes the parameters between two updates, so losses are computed only when the caller asks for
-        the next update. None means an update without valid rows: it increases the policy version, but takes no
-        optimiser step.
+        the next update. The number of updates is that of `TrainingSpec.updates_from`.
         """
         ...

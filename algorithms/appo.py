@@ -23,7 +23,7 @@ class Appo:
     def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
         self._spec, self._distribution = spec, distribution
 
-    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of each minibatch of each pass. See Algorithm."""
         with torch.no_grad():
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
@@ -31,8 +31,7 @@ class Appo:
             targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
         for _ in range(self._spec.passes):
             for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
-                # A batch with fewer rows than minibatches yields empty minibatches.
-                yield self._minibatch_losses(minibatch, forward) if minibatch.actions.numel() else None
+                yield self._minibatch_losses(minibatch, forward)
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
         parameters, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)

@@ -36,15 +36,12 @@ class GradientComputer:
         self._algorithm = build_algorithm(spec, network.distribution)
         self.parameters = FlatParameters(network.parameters())
 
-    def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms | None]:
+    def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next update. None means an update without valid rows.
+        The caller applies the gradient before it asks for the next update.
         """
         for losses in self._algorithm.losses(batch, self._forward):
-            if losses is None:
-                yield None
-                continue
             value_term = value_loss(losses.values, losses.targets, losses.valid, self._spec.value_loss)
             entropy = masked_mean(losses.entropies, losses.valid)
             loss = losses.policy_loss + self._spec.value_coefficient * value_term - entropy_bonus * entropy

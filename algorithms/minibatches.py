@@ -32,8 +32,8 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     """Yield one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
-    is split into single rows, and reset rows are omitted. In a batch with fewer parts than `count`, some minibatches
-    are empty.
+    is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
+    minibatches as it has parts, so that none is empty.
 
     Args:
       log_probs: [T, B], log pi(a_t | s_t) before the first update of the batch.
@@ -41,7 +41,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     """
     if batch.initial_state.shape[1]:
         order = torch.randperm(batch.actions.shape[1]).to(batch.actions.device)
-        for part in order.tensor_split(count):
+        for part in order.tensor_split(min(count, len(order))):
             yield Minibatch(
                 observations=batch.observations[:-1, part],
                 initial_state=batch.initial_state[part],
@@ -61,7 +61,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     def select(values: Tensor, part: Tensor) -> Tensor:
         return values.flatten(0, 1)[part].unsqueeze(0)
 
-    for part in order.tensor_split(count):
+    for part in order.tensor_split(min(count, len(order))) if len(order) else ():
         yield Minibatch(
             observations=observations[part].unsqueeze(0),
             initial_state=batch.initial_state.new_zeros((len(part), 0)),

@@ -18,7 +18,7 @@ class PolicyGradient:
     def __init__(self, spec: TrainingSpec, distribution: ActionDistribution, targets: TargetsFunction) -> None:
         self._spec, self._distribution, self._targets = spec, distribution, targets
 
-    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | None]:
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of the only update. See Algorithm."""
         parameters, values = forward(batch.observations, batch.initial_state, batch.starts)  # [T+1, B, ...]
         log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)

@@ -160,8 +160,15 @@ class TrainingSpec(Specification):
 
     @property
     def updates_per_batch(self) -> int:
-        """Number of policy versions that one batch produces."""
-        return self.passes * self.minibatches if ALGORITHMS[self.algorithm].passes_over_batch else 1
+        """Number of policy versions that one batch produces, if the batch is not smaller than its minibatches."""
+        return self.updates_from(self.minibatches)
+
+    def updates_from(self, parts: int) -> int:
+        """Return the number of policy versions that a batch of `parts` parts produces: no minibatch is empty.
+
+        A part is an environment where the policy has memory, else a valid row.
+        """
+        return self.passes * min(self.minibatches, parts) if ALGORITHMS[self.algorithm].passes_over_batch else 1
 
     @property
     def policy_lag_bound(self) -> int:

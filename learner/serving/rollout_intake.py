@@ -127,12 +127,18 @@ class RolloutIntake:
                 actors[rollout.identity.actor].rejected["stale"] += 1
         if not taken.rollouts:
             return
-        updates = self._spec.training.updates_per_batch
+        updates = self._updates_of(taken.rollouts)
         self._counters.trained(taken.rollouts, version, updates)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += int(np.count_nonzero(rollout.valid))
         self._version = version + updates
+
+    def _updates_of(self, rollouts: list[Rollout]) -> int:
+        """Return the number of policy versions that the learner makes of a batch of these rollouts."""
+        if self._intake.state_size:
+            return self._spec.training.updates_from(sum(rollout.environments for rollout in rollouts))
+        return self._spec.training.updates_from(sum(int(np.count_nonzero(rollout.valid)) for rollout in rollouts))
 
     # --------------------------------------------------------------------------------------- the intake thread
 

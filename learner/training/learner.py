@@ -62,8 +62,7 @@ class Learner:
         batch = self._assembler.join(rollouts).to(self._device)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             self.policy_version += 1
-            if terms is not None:
-                self._apply_gradients(terms, self.learning_rate(progress))
+            self._apply_gradients(terms, self.learning_rate(progress))
         self.metrics.add_batch(batch)
 
     def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import ENVIRONMENTS, EPOCH, SPACES, identity, make_rollout, run_spec
+from building import ENVIRONMENTS, EPOCH, POLICY, RECURRENT, SPACES, identity, make_rollout, run_spec
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -25,7 +26,7 @@ from daedalus.protocol.messages import (
     RunEnded,
     Snapshot,
 )
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -92,6 +93,30 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
     finally:
         server.close("the test is over")
     assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)
+
+
+@pytest.mark.parametrize(("state_size", "updates"), [(0, 3 * 4), (5, 3 * ENVIRONMENTS)])
+def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
+    network: MemoryNetwork, state_size: int, updates: int
+) -> None:
+    """With memory there are at most as many minibatches as environments."""
+    counters = RunCounters(10)
+    server = made(network, run_spec(actors=1, algorithm="appo", passes=3, minibatches=4), counters)
+    actor = MemoryTransport(network)
+    join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+    try:
+        server.offer_policy(b"program", state_size)
+        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        rollout = make_rollout(identity("a"), state_size=state_size)
+        actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        rollouts = server.rollouts.take_batch(0)
+        learner = Learner(
+            TrainingSpec(algorithm="appo", passes=3, minibatches=4), RECURRENT if state_size else POLICY, SPACES
+        )
+        learner.step(rollouts, 0.0)
+        assert counters.updates == learner.policy_version == updates
+    finally:
+        server.close("the test is over")
 
 
 class Asker:

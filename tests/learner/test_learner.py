@@ -159,24 +159,36 @@ def test_first_gradient_of_appo_equals_impala_off_policy(policy: PolicySpec) -> 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 @pytest.mark.parametrize(("passes", "count"), [(1, 1), (3, 4), (2, 50)])
 def test_batch_makes_one_version_for_each_minibatch_of_each_pass(policy: PolicySpec, passes: int, count: int) -> None:
+    """A batch has 6 environments and fewer than 36 valid rows: it cannot be split into 50 minibatches."""
     learner = make_learner(policy, algorithm="appo", passes=passes, minibatches=count)
-    for step in range(1, 4):  # of 50 minibatches most are empty: 6 environments, 36 rows
-        learner.step(make_rollouts(step, state_size=learner.state_size), 0.0)
-        assert learner.policy_version == step * passes * count
+    versions = 0
+    for step in range(1, 4):
+        rollouts = make_rollouts(step, state_size=learner.state_size)
+        valid_rows = sum(int(rollout.valid.sum()) for rollout in rollouts)
+        learner.step(rollouts, 0.0)
+        versions += passes * min(count, 6 if learner.state_size else valid_rows)
+        assert learner.policy_version == versions
     assert all(np.isfinite(array).all() for array in weights(learner).values())
     assert all(np.isfinite(value) for value in learner.metrics.take_means().values())
 
 
-def test_batch_of_one_row_makes_one_version_for_each_minibatch() -> None:
+def test_batch_of_one_row_makes_one_version_for_each_pass() -> None:
     learner = make_learner(algorithm="appo", passes=2, minibatches=4)
     before = weights(learner)
     learner.step([make_rollout(rows=1, environments=1, valid=np.ones((1, 1), np.bool_))], 0.0)
-    assert learner.policy_version == 8
+    assert learner.policy_version == 2
     assert learner.metrics.take_means()
     assert not np.array_equal(before["policy_head.weight"], weights(learner)["policy_head.weight"])
     learner.step([make_rollout(rows=1, environments=1, valid=np.zeros((1, 1), np.bool_))], 0.0)
-    assert learner.policy_version == 16
+    assert learner.policy_version == 2
     assert learner.metrics.take_means() == {}
+
+
+def test_memory_with_one_environment_makes_one_version_and_one_optimiser_step_for_each_pass() -> None:
+    learner = make_learner(RECURRENT, algorithm="appo", passes=3, minibatches=4)
+    learner.step([make_rollout(environments=1, state_size=learner.state_size)], 0.0)
+    assert learner.policy_version == 3
+    assert learner.state()["adam/steps"] == 3
 
 
 # --------------------------------------------------------------------------------------------- the rest
