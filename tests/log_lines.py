@@ -1,4 +1,4 @@
-"""What the daedalus loggers have recorded during the running test, as plain messages."""
+"""Messages that the daedalus loggers recorded during the current test."""
 
 import logging
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ class _Collector(logging.Handler):
 
 @contextmanager
 def collected() -> Iterator[None]:
-    """Collects into LINES, from empty, what is logged at INFO and above."""
+    """Collect messages at level INFO and above in LINES, which is cleared first."""
     LINES.clear()
     logger, collector = logging.getLogger("daedalus"), _Collector()
     level = logger.level
