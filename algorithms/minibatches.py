@@ -31,12 +31,8 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
     """Yield one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
-    is split into single rows, and reset rows are omitted. In a batch with fewer parts than `count`, some minibatches
-    are empty.
-
-    Args:
-      log_probs: [T, B], log pi(a_t | s_t) before the first update of the batch.
-      targets: value targets and advantages, [T, B].
+    is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` has empty minibatches.
+    `log_probs` [T, B] is log pi(a_t | s_t) before the first update of the batch.
     """
     if batch.initial_state.shape[1]:
         order = torch.randperm(batch.actions.shape[1]).to(batch.actions.device)

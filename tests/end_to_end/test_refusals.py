@@ -116,4 +116,4 @@ def test_a_refused_actor_says_why_and_ends(start: Start, stranger: Transport, ad
     ask(stranger, keys.join("run"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1
-    actor.expect("the learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")
+    actor.expect("learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")

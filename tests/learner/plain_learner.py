@@ -90,7 +90,7 @@ class PlainLearner:
         }
 
     def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
-        """Return log-probabilities, entropies and values by cell, with one forward pass per row, as an actor does."""
+        """Return log-probabilities, entropies and values by cell, from one forward pass per row."""
         log_probs, entropies, values = {}, {}, {}
         rows, environments = batch.actions.shape
         for b in range(environments):

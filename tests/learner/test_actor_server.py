@@ -130,9 +130,9 @@ def test_evaluator_messages_are_queued_until_the_learner_takes_them(
     evaluator.send(encode(EvaluationRequest(evaluator="e")))
     evaluator.send(encode(REPORT))
     assert evaluator.answers == []
-    (first, asked), (_, told) = server.evaluations.take()
+    (first, asked), (_, report) = server.evaluations.take()
     assert asked == EvaluationRequest(evaluator="e")
-    assert isinstance(told, EvaluationReport)
+    assert isinstance(report, EvaluationReport)
     assert server.evaluations.take() == []
     first.reply(server.publisher.newest())
     (answer,) = evaluator.answers
@@ -306,8 +306,8 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
         for sequence in range(held + 1, held + most + 3):
             payload = encode(make_rollout(identity("a", sequence)))
             actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
-        told = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
-        verdicts = [message.verdict for message in told if isinstance(message, Acknowledgement)]
+        messages = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
+        verdicts = [message.verdict for message in messages if isinstance(message, Acknowledgement)]
         assert verdicts == ["accepted"] * held + ["busy"] * 2
         assert answers.empty()
         assert server.fleet.actors["a"].busy == 2

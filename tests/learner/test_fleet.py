@@ -252,11 +252,11 @@ def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
     def seeds(run_seed: int) -> dict[tuple[str, int, int], int]:
         fleet = Fleet(run_seed, None)
         found = {}
-        for life in (1, 2):
+        for incarnation in (1, 2):
             for name in ("a", "b"):
-                fleet.join(Join(actor=name, incarnation=life, spaces=SPACES, environments=1), 0.0)
+                fleet.join(Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=1), 0.0)
                 for start in (0, 500):
-                    found[name, life, start] = fleet.seed_for(name, start)
+                    found[name, incarnation, start] = fleet.seed_for(name, start)
         return found
 
     assert seeds(1) == seeds(1)

@@ -85,8 +85,8 @@ def test_full_disk_logs_one_warning_and_writing_resumes_when_there_is_space(
     recording.record(row(4), Details())
     recording.record(row(5), Details())
     recording.close()
-    told = [line for line in LINES if "metrics" in line]
-    assert told == [
+    logged = [line for line in LINES if "metrics" in line]
+    assert logged == [
         "metrics not written: No space left on device; training continues, and writing is retried every 0 s",
         "metrics are written again",
     ]
