@@ -1,4 +1,4 @@
-"""Do the presets learn? Every algorithm on CartPole, and the other presets, over several seeds.
+"""Measure learning of the presets: every algorithm on CartPole, and the other presets, over several seeds.
 
 python benchmarks/algorithms.py                          (the whole table)
 python benchmarks/algorithms.py --only acrobot           (one preset)

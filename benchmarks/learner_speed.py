@@ -1,12 +1,13 @@
-"""Samples a second of the learner's networks alone: forward, backward, gradient's norm, Adam. No actors, no transport.
+"""Measure updates of the learner's networks, in samples per second: forward, backward, gradient norm, Adam.
 
     python benchmarks/learner_speed.py
     python benchmarks/learner_speed.py --networks nature article --threads 1 --seconds 10 --profile
     python benchmarks/learner_speed.py --networks nature --actors 2
 
-The fastest of several updates counts: what else runs on the machine only ever makes one slower. With --actors, as many
-processes that play Pong beside it, at the same priority: then all updates count, against the mean of those alone times
-what is the learner's by right: of C cores, with N actors and T threads, T or C T / (T + N), whichever is less.
+There are no actors and no transport. The result is the fastest of several updates, because other load on the machine
+can only slow an update down. With --actors N, the mean update is also measured while N processes play Pong at the same
+priority. It is compared with the mean update without them, scaled by the fair share of the learner: with C cores and T
+threads, the fair share is min(T, C T / (T + N)) cores.
 """
 
 import argparse
@@ -29,7 +30,7 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
-# Name: policy, observations, rows, environments.
+# By name: policy, observation space, rows, environments.
 NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {
     "nature": (PolicySpec(encoder="nature"), ArraySpace(shape=(84, 84), dtype="uint8", frames=4), 16, 16),
     "impala": (PolicySpec(encoder="impala"), ArraySpace(shape=(84, 84), dtype="uint8", frames=4), 16, 16),
@@ -46,7 +47,7 @@ NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {
 
 
 def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int, bfloat16: bool) -> Callable[[], None]:
-    """A function that learns once from the same random batch."""
+    """Return a function that makes one update from the same random batch."""
     network = ActorCritic(policy, Spaces(observation=space, action=DiscreteSpace(count=6)))
     flat = FlatParameters(network.parameters())
     optimizer = Adam(flat.values, 1e-5)
@@ -69,7 +70,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
 
 
 def fastest(update: Callable[[], None], seconds: float) -> float:
-    """Seconds of the fastest update within so many seconds, three at least."""
+    """Return the duration of the fastest update in seconds. Measure for `seconds`, and at least three updates."""
     return min(_durations(update, seconds))
 
 
@@ -86,7 +87,7 @@ def _durations(update: Callable[[], None], seconds: float) -> list[float]:
 
 @contextlib.contextmanager
 def busy_actors(count: int) -> Iterator[None]:
-    """So many processes play beside it."""
+    """Run `count` processes that play Pong."""
     command = [sys.executable, str(Path(__file__).parent / "busy_actor.py")]
     actors: list[subprocess.Popen[bytes]] = []
     try:
@@ -94,15 +95,15 @@ def busy_actors(count: int) -> Iterator[None]:
             actors.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
         for actor in actors:
             if actor.stdout is None or actor.stdout.readline() != b"busy\n":
-                raise SystemExit("an actor could not play: see what it said above")
+                raise SystemExit("an actor process failed: see its error message above")
         yield
     finally:
         for actor in actors:
-            actor.communicate()  # ends its standard input
+            actor.communicate()  # closes its standard input, which ends it
 
 
 def beside(update: Callable[[], None], threads: int, actors: int, seconds: float) -> tuple[float, float]:
-    """Seconds of the mean update beside busy actors; and of what a fair share of the cores would make of it."""
+    """Return the mean duration of an update with busy actors, and the duration expected from the fair share."""
     alone = statistics.mean(_durations(update, seconds))
     with busy_actors(actors):
         shared = statistics.mean(_durations(update, seconds))
@@ -111,7 +112,7 @@ def beside(update: Callable[[], None], threads: int, actors: int, seconds: float
 
 
 def profile(update: Callable[[], None]) -> str:
-    """Where three updates spend their time."""
+    """Return a table of the time spent in each operation, over three updates."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profiler:
         for _ in range(3):
             update()
@@ -123,14 +124,14 @@ def main() -> None:
     options.add_argument("--networks", nargs="+", choices=NETWORKS, default=list(NETWORKS))
     options.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     options.add_argument("--precisions", nargs="+", choices=("float32", "bfloat16"), default=["float32", "bfloat16"])
-    options.add_argument("--seconds", type=float, default=3.0, help="for each figure")
-    options.add_argument("--profile", action="store_true", help="say where the time goes")
-    options.add_argument("--actors", type=int, default=0, metavar="N", help="measure it beside N busy actors as well")
+    options.add_argument("--seconds", type=float, default=3.0, help="duration of each measurement")
+    options.add_argument("--profile", action="store_true", help="print the time of each operation")
+    options.add_argument("--actors", type=int, default=0, metavar="N", help="measure also with N busy actors")
     parsed = options.parse_args()
     keep_freed_memory()
     header = ("network", "rows x environments", "threads", "precision", "samples/s")
     if parsed.actors:
-        header += (f"beside {parsed.actors} actors", "its fair share", "of that")
+        header += (f"with {parsed.actors} actors", "fair share", "ratio")
     rows: list[tuple[object, ...]] = []
     for name in parsed.networks:
         policy, space, length, environments = NETWORKS[name]

@@ -1,4 +1,4 @@
-"""What the learner's tests are made of: small specifications, rollouts, batches, a fleet that has joined."""
+"""Builders for tests of the learner: small specifications, rollouts, batches, fleets."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,7 +35,7 @@ def identity(actor: str = "a", sequence: int = 0, incarnation: int = 1, epoch: i
 
 
 def make_rollout(
-    who: RolloutIdentity | None = None,
+    rollout_identity: RolloutIdentity | None = None,
     *,
     version: int = 0,
     rows: int = ROWS,
@@ -46,7 +46,7 @@ def make_rollout(
     seed: int = 0,
     **replaced: np.ndarray,
 ) -> Rollout:
-    """A rollout of random content, with ends of both kinds and the reset rows that follow them."""
+    """Return a rollout with random content: terminations, truncations and the reset rows after them."""
     random = np.random.default_rng(seed)
     terminated, truncated = np.zeros((2, rows, environments), np.bool_)
     valid = np.ones((rows, environments), np.bool_)
@@ -69,21 +69,21 @@ def make_rollout(
         "episode_returns": np.array([-1.5], np.float32),
         "episode_lengths": np.array([4], np.int32),
     }
-    return Rollout(identity=who or identity(), policy_version=version, **{**content, **replaced})
+    return Rollout(identity=rollout_identity or identity(), policy_version=version, **{**content, **replaced})
 
 
 def make_rollouts(seed: int, count: int = 2, state_size: int = 0) -> list[Rollout]:
-    """Those of one batch."""
+    """Return the rollouts of one batch."""
     return [make_rollout(seed=seed * 100 + number, state_size=state_size) for number in range(count)]
 
 
 def join(rollouts: Sequence[Rollout], observation: ArraySpace = SPACES.observation) -> Batch:
-    """One batch of them, in memory of its own."""
+    """Return a batch of rollouts in new memory."""
     return BatchAssembler(observation, torch.device("cpu")).join(rollouts)
 
 
 def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:
-    """A fleet in which the named actors have joined, in their incarnation 1, and are present."""
+    """Return a fleet in which incarnation 1 of each named actor has joined and is present."""
     fleet = Fleet(seed, None)
     for actor in actors:
         assert fleet.join(Join(actor=actor, incarnation=1, spaces=spaces, environments=environments), 0.0) is None

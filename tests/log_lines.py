@@ -1,4 +1,4 @@
-"""What the daedalus loggers have recorded during the running test, as plain messages."""
+"""Messages that the daedalus loggers recorded during the current test."""
 
 import logging
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ class _Collector(logging.Handler):
 
 @contextmanager
 def collected() -> Iterator[None]:
-    """Collect into LINES, from empty, what is logged at INFO and above; undo what the test configures."""
+    """Collect messages at level INFO and above in LINES, from empty; undo what the test configures."""
     LINES.clear()
     logger, collector = logging.getLogger("daedalus"), _Collector()
     level, handlers = logger.level, list(logger.handlers)

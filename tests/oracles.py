@@ -1,7 +1,7 @@
-"""The papers' sums written out, in plain Python, for one environment of one rollout. Slow and obvious.
+"""Slow reference implementations of the papers' sums, for one environment of one rollout.
 
-gamma is the discount factor, V the values [T+1] and r the rewards [T], as in the papers. Rows that only reset are
-no part of any sum: an episode's rows end where it ends.
+The notation is that of the papers: gamma is the discount factor, V the values [T+1] and r the rewards [T]. Reset rows
+are in no sum, because a sum stops at the end of its episode.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Stream:
-    """The rows of one environment."""
+    """Rows of one environment."""
 
     r: Sequence[float]  # [T]
     V: Sequence[float]  # [T+1]
@@ -22,40 +22,47 @@ class Stream:
 
     @property
     def rows(self) -> list[int]:
-        """The rows that count."""
+        """Indices of the valid rows."""
         return [t for t in range(len(self.r)) if self.valid[t]]
 
 
 def horizon(x: Stream, t: int) -> int:
-    """h: rows t to h - 1 are what the rollout holds of t's episode from t on."""
+    """Return h, such that rows t to h - 1 are the rest of the episode of row t in the rollout."""
     ends = [k for k in range(t, len(x.r)) if x.terminated[k] or x.truncated[k]]
     return ends[0] + 1 if ends else len(x.r)
 
 
 def bootstrap(x: Stream, k: int) -> float:
-    """V(s_k), which is 0 where the environment ended the episode at row k - 1."""
+    """Return V(s_k), or 0 if the episode terminated at row k - 1."""
     return 0.0 if x.terminated[k - 1] else x.V[k]
 
 
 def n_step_return(x: Stream, gamma: float, t: int, n: int) -> float:
-    """G_{t:t+n} = r_t + gamma r_{t+1} + ... + gamma^n V(s_{t+n}). Sutton & Barto (2018), equation 7.1."""
+    """Return G_{t:t+n} = r_t + gamma r_{t+1} + ... + gamma^n V(s_{t+n}). Sutton & Barto (2018), equation 7.1."""
     h = min(t + n, horizon(x, t))
     return math.fsum(gamma ** (k - t) * x.r[k] for k in range(t, h)) + gamma ** (h - t) * bootstrap(x, h)
 
 
 def lambda_return(x: Stream, gamma: float, lam: float, t: int) -> float:
-    """G_t = (1 - lambda) sum_n lambda^(n-1) G_{t:t+n} + lambda^(h-t-1) G_{t:h}. Sutton & Barto (2018), 12.3."""
+    """Return G_t = (1 - lambda) sum_n lambda^(n-1) G_{t:t+n} + lambda^(h-t-1) G_{t:h}.
+
+    Sutton & Barto (2018), equation 12.3.
+    """
     last = horizon(x, t) - t
     shorter = (1.0 - lam) * math.fsum(lam ** (n - 1) * n_step_return(x, gamma, t, n) for n in range(1, last))
     return shorter + lam ** (last - 1) * n_step_return(x, gamma, t, last)
 
 
 def rho(x: Stream, t: int, clip: float) -> float:
+    """Return min(clip, pi(a_t | s_t) / mu(a_t | s_t))."""
     return min(clip, math.exp(x.log_ratios[t]))
 
 
 def vtrace(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s: int) -> float:
-    """v_s = V(x_s) + sum_t gamma^(t-s) (prod_{i=s}^{t-1} c_i) delta_t V. Espeholt et al. (2018), equation 1."""
+    """Return v_s = V(x_s) + sum_t gamma^(t-s) (prod_{i=s}^{t-1} c_i) delta_t V.
+
+    Espeholt et al. (2018), equation 1.
+    """
 
     def delta(t: int) -> float:
         return rho(x, t, rho_bar) * (x.r[t] + gamma * bootstrap(x, t + 1) - x.V[t])
@@ -69,7 +76,10 @@ def vtrace(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s:
 
 
 def vtrace_advantage(x: Stream, gamma: float, lam: float, rho_bar: float, c_bar: float, s: int) -> float:
-    """r_s + gamma v_{s+1} - V(x_s), section 4.2 without its rho_s; v_{s+1} mixed with V(x_{s+1}) by lambda."""
+    """Return r_s + gamma v_{s+1} - V(x_s), with v_{s+1} mixed with V(x_{s+1}) by lambda: without the factor rho_s.
+
+    Espeholt et al. (2018), section 4.2.
+    """
     inside = s + 1 < horizon(x, s)
     following = vtrace(x, gamma, lam, rho_bar, c_bar, s + 1) if inside else bootstrap(x, s + 1)
     mixed = (1.0 - lam) * bootstrap(x, s + 1) + lam * following

@@ -1,4 +1,4 @@
-"""algorithms/batch.py: rollouts side by side, and in memory that is used again."""
+"""algorithms/batch.py: rollouts joined on the environment axis, in reused memory."""
 
 from typing import Any
 
@@ -17,15 +17,18 @@ PIXELS = ArraySpace(shape=(2, 3), dtype="uint8", frames=4)
 
 
 def pixels(seed: int, environments: int = ENVIRONMENTS, rows: int = ROWS, **replaced: Any) -> Rollout:
-    """A rollout of 4-stacks, its frames environment by environment in memory."""
+    """Return a rollout with stacks of 4 frames, in environment-first memory layout."""
     random = np.random.default_rng(seed)
     frames = random.integers(0, 256, (environments, rows + PIXELS.frames, *PIXELS.shape), np.uint8).swapaxes(0, 1)
     return make_rollout(environments=environments, rows=rows, seed=seed, **{"frames": frames, **replaced})
 
 
 def stack(rollout: Rollout, row: int, environment: int, depth: int) -> np.ndarray:
-    """The newest `depth` frames at a row, the first of its episode in place of those before it. The slow way."""
-    start = -depth  # frames of before row 0 were put in order by who collected them
+    """Return the newest `depth` frames at a row; the first frame of the episode replaces earlier ones.
+
+    Slow reference implementation.
+    """
+    start = -depth  # the actor prepared the frames before row 0
     for earlier in range(row):
         if not rollout.valid[earlier, environment]:
             start = earlier + 1
@@ -34,7 +37,7 @@ def stack(rollout: Rollout, row: int, environment: int, depth: int) -> np.ndarra
 
 
 def assert_holds(batch: Batch, rollouts: list[Rollout], depth: int) -> None:
-    """Every number of a batch is that of its rollout."""
+    """Assert that every value of a batch equals the value of its rollout."""
     first = 0
     for rollout in rollouts:
         part = slice(first, first + rollout.environments)

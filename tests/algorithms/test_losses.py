@@ -1,4 +1,4 @@
-"""algorithms/losses.py, element by element."""
+"""algorithms/losses.py against sums over single elements."""
 
 import math
 
@@ -100,7 +100,7 @@ def test_clipped_policy_loss_equals_a_hand_worked_example() -> None:
     # min(3, 2.4) + min(-3, -2.4) + min(1, 1.6) + min(-1, -1.6) + min(3.3, 3.3), over five rows
     assert loss.item() == pytest.approx(-(2.4 - 3.0 + 1.0 - 1.6 + 3.3) / 5.0)
     loss.backward()
-    # Where the ratio went too far already, nothing pulls it on; where it went the wrong way, it is pulled back.
+    # The gradient is 0 where the ratio left the range in the direction of the advantage, and not 0 in the other.
     expected = torch.tensor([[0.0, 3.0, -1.0, 0.0, -3.3, 0.0]]) / 5.0
     assert log_ratios.grad is not None
     assert_close(log_ratios.grad, expected)

@@ -1,4 +1,4 @@
-"""algorithms/returns.py against the papers' sums, against itself where one case is another, and by hand."""
+"""algorithms/returns.py against slow reference sums, by identities, and by hand-worked examples."""
 
 import pytest
 import torch
@@ -18,9 +18,9 @@ ENDS = st.sampled_from(["no", "no", "no", "terminated", "truncated", "both"])
 
 @st.composite
 def streams(draw: st.DrawFn, rows: int) -> Stream:
-    """The rows of one environment under NEXT_STEP resets; the rows that only reset hold large numbers."""
+    """Draw the rows of one environment under NEXT_STEP resets. Reset rows contain large numbers."""
     ends, valid = [], []
-    resets = draw(st.booleans())  # the rollout before may have ended with an episode
+    resets = draw(st.booleans())  # the previous rollout may have ended with an episode
     for _ in range(rows):
         valid.append(not resets)
         ends.append("no" if resets else draw(ENDS))
@@ -39,7 +39,7 @@ ROLLOUTS = st.integers(1, 7).flatmap(lambda rows: st.lists(streams(rows), min_si
 
 
 class Columns:
-    """Streams side by side, as the functions want them: [T, B] tensors."""
+    """Streams as the columns of [T, B] tensors, the arguments of the tested functions."""
 
     def __init__(self, columns: list[Stream], gamma: float) -> None:
         def stacked(name: str, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -55,7 +55,7 @@ class Columns:
 
 
 def assert_rows(result: Tensor, columns: list[Stream], expected) -> None:
-    """Holds every valid row of `result` [T, B] against `expected(stream, t)`."""
+    """Assert that every valid row of `result` [T, B] equals `expected(stream, t)`."""
     for number, column in enumerate(columns):
         for t in column.rows:
             assert result[t, number].item() == pytest.approx(expected(column, t), rel=1e-5, abs=1e-4)
@@ -223,9 +223,9 @@ def test_vtrace_equals_a_hand_worked_example() -> None:
 
 
 def test_truncation_bootstraps_and_termination_does_not_within_one_rollout() -> None:
-    # gamma = 1/2. Row 1 is truncated, row 2 only resets, row 4 terminates, row 5 only resets, row 6 plays on.
+    # gamma = 1/2. Row 1 is truncated, row 2 is a reset row, row 4 terminates, row 5 is a reset row, row 6 continues.
     #   G_0 = 1 + 1/2 * 12 = 7      G_1 = 2 + 1/2 * 20 = 12, of V(s_2) = 20
-    #   G_3 = 3 + 1/2 * 4  = 5      G_4 = 4, of V(s_5) = 50 nothing
+    #   G_3 = 3 + 1/2 * 4  = 5      G_4 = 4, without V(s_5) = 50
     #   G_6 = 6 + 1/2 * 70 = 41
     no, yes = False, True
     rewards = column(1, 2, 1000, 3, 4, 1000, 6)

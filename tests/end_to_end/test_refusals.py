@@ -116,6 +116,4 @@ def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transp
     ask(client, keys.join("run"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1
-    actor.expect(
-        "the learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices"
-    )
+    actor.expect("learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")

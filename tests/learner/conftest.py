@@ -1,4 +1,4 @@
-"""No property is to be finished within a time: machines differ."""
+"""Hypothesis profile without deadlines, because machines differ in speed."""
 
 from hypothesis import settings
 

@@ -1,4 +1,4 @@
-"""The learner once more, written out plainly: one row of one environment at a time, in the papers' terms."""
+"""Reference implementation of the learner: one row of one environment at a time, in the papers' notation."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ Played = dict[Cell, Tensor]
 
 
 class PlainLearner:
-    """One row at a time where the learner has vectors, torch's modules where it has its own."""
+    """Slow learner without vectorisation, with torch's optimisers and losses."""
 
     def __init__(self, spec: TrainingSpec, policy: PolicySpec, start: dict[str, np.ndarray]) -> None:
         self.spec = spec
@@ -28,7 +28,7 @@ class PlainLearner:
         self.squares = [torch.zeros_like(parameter) for parameter in self.parameters]
 
     def step(self, batch: Batch, rate: float, bonus: float) -> dict[str, float]:
-        """All updates from a batch; the mean of what they measured."""
+        """Make all updates of a batch, and return the means of their metrics."""
         with torch.no_grad():
             before, _, values = self._play_back(batch)
         streams = [self._stream(batch, b, before, values) for b in range(batch.actions.shape[1])]
@@ -37,7 +37,7 @@ class PlainLearner:
         return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
 
     def _parts(self, batch: Batch) -> list[list[Cell]]:
-        """The rows of each update, where nothing is shuffled."""
+        """Return the cells of each update, without shuffling."""
         cells = [(t, b) for t, b in batch.valid.nonzero().tolist()]
         if self.spec.algorithm != "appo":
             return [cells]
@@ -91,7 +91,7 @@ class PlainLearner:
         }
 
     def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
-        """Each environment on its own, as an actor steps it: log-probabilities, entropies, values [T+1] of its rows."""
+        """Return log-probabilities, entropies and values by cell, from one forward pass per row."""
         log_probs, entropies, values = {}, {}, {}
         rows, environments = batch.actions.shape
         for b in range(environments):
@@ -111,7 +111,7 @@ class PlainLearner:
 
     @staticmethod
     def _stream(batch: Batch, b: int, log_probs: Played, values: Played) -> Stream:
-        """The rows of an environment in the papers' terms."""
+        """Return the rows of an environment in the papers' notation."""
         rows = range(len(batch.actions))
         return Stream(
             r=batch.rewards[:, b].tolist(),
@@ -150,7 +150,7 @@ class PlainLearner:
 
 
 def evenly(items: list[Any], count: int) -> list[list[Any]]:
-    """`count` parts in order, the first ones longer by one where it does not come out even."""
+    """Split items into `count` parts in order; the first parts are longer by one if necessary."""
     size, longer = divmod(len(items), count)
     lengths = [size + 1] * longer + [size] * (count - longer)
     ends = np.cumsum(lengths)

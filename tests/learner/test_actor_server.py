@@ -1,4 +1,4 @@
-"""The actor server over the memory transport: which versions are welcome, what evaluators ask and tell."""
+"""learner/serving/actor_server.py over the memory transport: rollouts, evaluators, publication."""
 
 import queue
 import threading
@@ -41,11 +41,11 @@ REPORT = EvaluationReport(
 
 
 def no_status() -> RunStatus:
-    raise AssertionError("nobody asked for it")
+    raise AssertionError("the status was not queried")
 
 
-def made(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> ActorServer:
-    """One that is open."""
+def open_server(network: MemoryNetwork, spec: RunSpec, counters: RunCounters) -> ActorServer:
+    """Return an open server."""
     transport = MemoryTransport(network)
     server = ActorServer("r", spec, transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
     server.open()
@@ -59,7 +59,7 @@ def network() -> MemoryNetwork:
 
 @pytest.fixture
 def server(network: MemoryNetwork) -> Iterator[ActorServer]:
-    opened = made(network, run_spec(), RunCounters(10))
+    opened = open_server(network, run_spec(), RunCounters(10))
     yield opened
     opened.close("the test is over")
 
@@ -68,10 +68,10 @@ def server(network: MemoryNetwork) -> Iterator[ActorServer]:
 def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken(
     network: MemoryNetwork, algorithm: str, updates: int
 ) -> None:
-    """The snapshot of that version may be played before the next batch is complete."""
+    """Actors may play the snapshot of that version before the next batch is complete."""
     counters = RunCounters(10)
     spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
-    server = made(network, spec, counters)
+    server = open_server(network, spec, counters)
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
 
@@ -101,7 +101,7 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
 ) -> None:
     """With memory there are at most as many minibatches as environments."""
     counters = RunCounters(10)
-    server = made(network, run_spec(actors=1, algorithm="appo", passes=3, minibatches=4), counters)
+    server = open_server(network, run_spec(actors=1, algorithm="appo", passes=3, minibatches=4), counters)
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
     try:
@@ -119,8 +119,8 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
         server.close("the test is over")
 
 
-class Asker:
-    """Sends without waiting; keeps the answers as they come."""
+class FakeEvaluator:
+    """Evaluator that sends without waiting and keeps the answers."""
 
     def __init__(self, network: MemoryNetwork) -> None:
         self._transport = MemoryTransport(network)
@@ -128,15 +128,15 @@ class Asker:
 
     def send(self, payload: bytes, evaluator: str = "e") -> None:
         def on_answer(answer: bytes | None) -> None:
-            if answer is not None:  # None: the test took it and forgot it
+            if answer is not None:  # None: the test took the request without a reply
                 self.answers.append(decode(answer, Limits()))
 
         self._transport.query_async(keys.evaluations("r", evaluator), payload, timeout=1.0, on_answer=on_answer)
 
 
 @pytest.fixture
-def asker(network: MemoryNetwork, server: ActorServer) -> Asker:
-    return Asker(network)
+def evaluator(network: MemoryNetwork, server: ActorServer) -> FakeEvaluator:
+    return FakeEvaluator(network)
 
 
 def offer_policy(server: ActorServer) -> None:
@@ -144,38 +144,44 @@ def offer_policy(server: ActorServer) -> None:
     server.publisher.publish(3, {"w": np.zeros(2, np.float32)})
 
 
-def codes(asker: Asker) -> list[str]:
-    return [answer.code for answer in asker.answers if isinstance(answer, Refusal)]
+def codes(evaluator: FakeEvaluator) -> list[str]:
+    return [answer.code for answer in evaluator.answers if isinstance(answer, Refusal)]
 
 
-def test_evaluator_messages_are_queued_until_the_learner_takes_them(server: ActorServer, asker: Asker) -> None:
+def test_evaluator_messages_are_queued_until_the_learner_takes_them(
+    server: ActorServer, evaluator: FakeEvaluator
+) -> None:
     offer_policy(server)
-    asker.send(encode(EvaluationRequest(evaluator="e")))
-    asker.send(encode(REPORT))
-    assert asker.answers == []
-    (first, asked), (_, told) = server.evaluations.take()
+    evaluator.send(encode(EvaluationRequest(evaluator="e")))
+    evaluator.send(encode(REPORT))
+    assert evaluator.answers == []
+    (first, asked), (_, report) = server.evaluations.take()
     assert asked == EvaluationRequest(evaluator="e")
-    assert isinstance(told, EvaluationReport)
+    assert isinstance(report, EvaluationReport)
     assert server.evaluations.take() == []
     first.reply(server.publisher.newest())
-    (answer,) = asker.answers
+    (answer,) = evaluator.answers
     assert isinstance(answer, Snapshot)
     assert answer.policy_version == 3
 
 
-def test_evaluation_request_before_the_first_policy_is_refused_as_not_ready(server: ActorServer, asker: Asker) -> None:
-    asker.send(encode(EvaluationRequest(evaluator="e")))
-    assert codes(asker) == ["not_ready"]
+def test_evaluation_request_before_the_first_policy_is_refused_as_not_ready(
+    server: ActorServer, evaluator: FakeEvaluator
+) -> None:
+    evaluator.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(evaluator) == ["not_ready"]
     assert server.evaluations.take() == []
 
 
-def test_evaluation_requests_above_the_queue_limit_are_refused_as_not_ready(server: ActorServer, asker: Asker) -> None:
+def test_evaluation_requests_above_the_queue_limit_are_refused_as_not_ready(
+    server: ActorServer, evaluator: FakeEvaluator
+) -> None:
     offer_policy(server)
     for _ in range(64):
-        asker.send(encode(EvaluationRequest(evaluator="e")))
-    assert asker.answers == []
-    asker.send(encode(EvaluationRequest(evaluator="e")))
-    assert codes(asker) == ["not_ready"]
+        evaluator.send(encode(EvaluationRequest(evaluator="e")))
+    assert evaluator.answers == []
+    evaluator.send(encode(EvaluationRequest(evaluator="e")))
+    assert codes(evaluator) == ["not_ready"]
     assert len(server.evaluations.take()) == 64
 
 
@@ -190,17 +196,19 @@ def test_evaluation_requests_above_the_queue_limit_are_refused_as_not_ready(serv
     ],
     ids=["empty", "noise", "another message", "another's name", "no name"],
 )
-def test_invalid_evaluator_message_is_refused_as_malformed(server: ActorServer, asker: Asker, payload: bytes) -> None:
+def test_invalid_evaluator_message_is_refused_as_malformed(
+    server: ActorServer, evaluator: FakeEvaluator, payload: bytes
+) -> None:
     offer_policy(server)
-    asker.send(payload)
-    assert codes(asker) == ["malformed"]
+    evaluator.send(payload)
+    assert codes(evaluator) == ["malformed"]
     assert server.evaluations.take() == []
 
 
-def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer, asker: Asker) -> None:
+def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer, evaluator: FakeEvaluator) -> None:
     offer_policy(server)
     many = 200_000
-    asker.send(
+    evaluator.send(
         encode(
             EvaluationReport(
                 evaluator="e",
@@ -211,25 +219,25 @@ def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer
             )
         )
     )
-    assert codes(asker) == ["malformed"]
+    assert codes(evaluator) == ["malformed"]
 
 
 def test_waiting_and_later_evaluator_messages_are_refused_as_finished_after_close(
-    server: ActorServer, asker: Asker
+    server: ActorServer, evaluator: FakeEvaluator
 ) -> None:
     offer_policy(server)
-    asker.send(encode(EvaluationRequest(evaluator="e")))
+    evaluator.send(encode(EvaluationRequest(evaluator="e")))
     server.close("solved")
-    asker.send(encode(REPORT))
-    assert codes(asker) == ["finished", "finished"]
+    evaluator.send(encode(REPORT))
+    assert codes(evaluator) == ["finished", "finished"]
 
 
 def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, network: MemoryNetwork) -> None:
     offer_policy(server)
-    askers = [Asker(network) for _ in range(16)]
+    evaluators = [FakeEvaluator(network) for _ in range(16)]
     threads = [
-        threading.Thread(target=asker.send, args=(encode(EvaluationRequest(evaluator=f"e{number}")), f"e{number}"))
-        for number, asker in enumerate(askers)
+        threading.Thread(target=evaluator.send, args=(encode(EvaluationRequest(evaluator=f"e{number}")), f"e{number}"))
+        for number, evaluator in enumerate(evaluators)
     ]
     for thread in threads:
         thread.start()
@@ -239,8 +247,8 @@ def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, netw
     assert taken == {f"e{number}" for number in range(16)}
 
 
-class Silent(MemoryTransport):
-    """Keeps what it is asked to reopen, and cannot."""
+class UnreachableTransport(MemoryTransport):
+    """Transport that records calls of `reopen`, which always fails."""
 
     def __init__(self, network: MemoryNetwork) -> None:
         super().__init__(network)
@@ -248,12 +256,12 @@ class Silent(MemoryTransport):
 
     def reopen(self, unless_served: str | None = None) -> bool:
         self.reopened.put(unless_served)
-        raise TransportError("nothing answers there")
+        raise TransportError("no router is reachable")
 
 
 def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 0.02)
-    transport, counters = Silent(network), RunCounters(10)
+    transport, counters = UnreachableTransport(network), RunCounters(10)
     server = ActorServer(
         "r", run_spec(), transport, counters, no_status, learner_epoch=EPOCH, start_version=0, spaces=SPACES
     )
@@ -267,7 +275,7 @@ def test_session_is_reopened_when_no_request_arrives(network: MemoryNetwork, mon
 
 def test_request_resets_the_session_watchdog(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.serving.session_watchdog._SILENCE_SECONDS", 1000.0)
-    server = made(network, run_spec(), RunCounters(10))
+    server = open_server(network, run_spec(), RunCounters(10))
     try:
         before = server._watchdog._heard_at
         MemoryTransport(network).query(keys.snapshots("r"), timeout=LIMIT)
@@ -278,7 +286,7 @@ def test_request_resets_the_session_watchdog(network: MemoryNetwork, monkeypatch
 
 def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(network: MemoryNetwork) -> None:
     counters = RunCounters(10)
-    server = made(network, run_spec(actors=2, max_policy_lag=0), counters)
+    server = open_server(network, run_spec(actors=2, max_policy_lag=0), counters)
     actor = MemoryTransport(network)
     try:
         actor.query(
@@ -306,10 +314,10 @@ def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(net
 def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
     network: MemoryNetwork, training: dict[str, Any], most: int
 ) -> None:
-    """The buffer holds a batch, one is being judged, and the queue what can still be learned from after them."""
+    """The buffer holds a batch, one rollout is being judged, and `most` rollouts are queued behind them."""
     counters = RunCounters(10)
     spec = run_spec(actors=2, **training)
-    server = made(network, spec, counters)
+    server = open_server(network, spec, counters)
     actor = MemoryTransport(network)
     answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
@@ -323,8 +331,8 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
         for sequence in range(held + 1, held + most + 3):
             payload = encode(make_rollout(identity("a", sequence)))
             actor.query_async(keys.rollouts("r", "a"), payload, timeout=LIMIT, on_answer=answers.put)
-        told = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
-        verdicts = [message.verdict for message in told if isinstance(message, Acknowledgement)]
+        messages = [decode(answer, Limits()) for _ in range(held + 2) if (answer := answers.get(timeout=LIMIT))]
+        verdicts = [message.verdict for message in messages if isinstance(message, Acknowledgement)]
         assert verdicts == ["accepted"] * held + ["busy"] * 2
         assert answers.empty()
         assert server.fleet.actors["a"].busy == 2
@@ -332,11 +340,11 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
         server.close("the test is over")
 
 
-# ------------------------------------------------------------------------------------- how often it publishes
+# ------------------------------------------------------------------------------------ publication interval
 
 
 def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> MemoryTransport:
-    """So many actors that take part."""
+    """Add `count` live actors to the fleet."""
     actors = MemoryTransport(network)
     for number in range(count):
         join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
@@ -366,14 +374,14 @@ def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(
 ) -> None:
     with_fleet(network, server, 400)
     published = set()
-    for version in range(1, 41):  # of 32 batches at most
+    for version in range(1, 41):  # the policy lag bound is 32
         server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
         published.add(server.publisher.version)
     assert published == {0, 8, 16, 24, 32, 40}
 
 
 def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -> None:
-    server = made(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
+    server = open_server(network, run_spec(actors=1, algorithm="a2c"), RunCounters(10))
     try:
         with_fleet(network, server, 40)
         for version in (1, 2):
@@ -384,7 +392,7 @@ def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -
 
 
 def test_acknowledgement_contains_the_newest_published_version(network: MemoryNetwork, server: ActorServer) -> None:
-    """Of one that is not published an actor would ask for in vain."""
+    """An actor cannot fetch a version that is not published."""
     offer_policy(server)
     actors = with_fleet(network, server, 40)
     server.publisher.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)

@@ -1,4 +1,4 @@
-"""learner/training/checkpoint.py: what was saved comes back whole, or is not used."""
+"""learner/training/checkpoint.py: a checkpoint is loaded exactly as it was saved, or not at all."""
 
 import errno
 import os
@@ -131,7 +131,7 @@ def test_older_checkpoints_are_pruned(tmp_path: Path) -> None:
 def test_saved_checkpoint_is_kept_when_a_damaged_one_has_a_higher_version(tmp_path: Path) -> None:
     save(tmp_path, 10)
     flip(save(tmp_path, 20) / "seal", 0)
-    saved = save(tmp_path, 11, keep=1)  # a learner that went on from 10
+    saved = save(tmp_path, 11, keep=1)  # by a learner that resumed from version 10
     assert saved.is_dir()
     assert load_newest(tmp_path).policy.policy_version == 11
 
@@ -179,7 +179,7 @@ def test_failed_rename_leaves_only_the_previous_checkpoint(
     rename = os.replace
 
     def refusing(source: Path, target: Path) -> None:
-        """Puts no directory in the place of another: the one before it may be put aside and back."""
+        """Refuse to replace a directory. With `aside`, moving the previous directory away and back is allowed."""
         if source.name.endswith(".partial") or not aside:
             raise OSError(errno.EIO, "Input/output error")
         rename(source, target)

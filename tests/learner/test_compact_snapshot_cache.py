@@ -1,4 +1,4 @@
-"""learner/serving/compact_snapshot_cache.py: what actors on slow links are answered."""
+"""learner/serving/compact_snapshot_cache.py: compact snapshots for actors on slow links."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ FIRST = {"w": RANDOM.normal(size=(300, 200)).astype(np.float32), "b": np.zeros(7
 
 
 def snapshot(version: int) -> bytes:
-    """Weights that move a little with every version."""
+    """Return a snapshot whose weights change a little with every version."""
     weights = {name: array + np.float32(1e-3 * version) * np.sin(array) for name, array in FIRST.items()}
     return encode(Snapshot(learner_epoch=5, policy_version=version, program="p", weights=weights))
 
@@ -40,12 +40,12 @@ def ask(cache: CompactSnapshotCache, newest: bytes, actor: str = "a", **fields: 
 
 
 def fetch(cache: CompactSnapshotCache, newest: bytes, held: int | None = None, actor: str = "a") -> CompactSnapshot:
-    """All parts, put together."""
+    """Fetch all parts and return the decoded compact snapshot."""
     first = ask(cache, newest, actor, held_version=held)
     assert isinstance(first, SnapshotPart)
     parts = [first]
     for number in range(1, first.parts):
-        part = ask(cache, b"not looked at", actor, held_version=held, policy_version=first.policy_version, part=number)
+        part = ask(cache, b"unused", actor, held_version=held, policy_version=first.policy_version, part=number)
         assert isinstance(part, SnapshotPart)
         assert (part.part, part.parts, part.policy_version) == (number, first.parts, first.policy_version)
         parts.append(part)

@@ -1,4 +1,4 @@
-"""learner/run/counters.py: what a run has done, over its resumes."""
+"""learner/run/counters.py: counters of a run, also after a resume."""
 
 import json
 from typing import Any

@@ -1,4 +1,4 @@
-"""The learner on an accelerator does what it does on a processor. Skipped where there is none."""
+"""The learner on CUDA against the learner on the CPU. Skipped without a CUDA device."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device here")
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 
 IMAGES = Spaces(observation=ArraySpace(shape=(42, 42), dtype="uint8", frames=4), action=SPACES.action)
 KINDS: dict[str, tuple[PolicySpec, Spaces]] = {
@@ -42,11 +42,11 @@ def rollouts(seed: int, spaces: Spaces, state_size: int) -> list[Rollout]:
     return [replace(rollout, frames=random.integers(0, 256, shape, np.uint8)) for rollout in made]
 
 
-def taught(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> Learner:
-    one = learner(device, policy, spaces, **training)  # which seeds what batches are shuffled by
+def trained_learner(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> Learner:
+    trained = learner(device, policy, spaces, **training)  # seeds the order of minibatches
     for step in range(3):
-        one.step(rollouts(step, spaces, one.state_size), progress=0.0)
-    return one
+        trained.step(rollouts(step, spaces, trained.state_size), progress=0.0)
+    return trained
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -55,7 +55,7 @@ def test_updates_on_cuda_equal_updates_on_cpu(algorithm: str, kind: str, monkeyp
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     policy, spaces = KINDS[kind]
     start = {name: array.copy() for name, array in learner("cpu", policy, spaces).weights().items()}
-    there, here = (taught(device, policy, spaces, algorithm=algorithm) for device in ("cuda", "cpu"))
+    there, here = (trained_learner(device, policy, spaces, algorithm=algorithm) for device in ("cuda", "cpu"))
     for name, expected in here.weights().items():
         moved = np.abs(expected - start[name]).max()
         np.testing.assert_allclose(there.weights()[name], expected, atol=0.05 * moved + 1e-6, err_msg=name)

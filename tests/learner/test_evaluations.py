@@ -1,4 +1,4 @@
-"""learner/serving/evaluations.py: what was played is kept until it is reported on, the best for good."""
+"""learner/serving/evaluations.py: checkpoints are kept during their evaluation, the best permanently."""
 
 import errno
 import os
@@ -18,7 +18,7 @@ from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 
 
 class Run:
-    """A run's directory, and the evaluations of one life of its learner."""
+    """Run directory with the evaluations of one learner epoch."""
 
     def __init__(self, directory: Path, epoch: int = EPOCH) -> None:
         self.directory = directory
@@ -57,7 +57,7 @@ class Run:
         )
 
     def play(self, version: int, *returns: float) -> str:
-        """One evaluation from its beginning to its end; what the user is told."""
+        """Run one evaluation from request to report, and return its log message."""
         self.begin(version)
         answer, text = self.report(version, *returns)
         assert answer.verdict == "accepted"
@@ -125,7 +125,7 @@ def test_resumed_run_compares_with_the_best_of_the_previous_process(run: Run) ->
 
 @pytest.mark.parametrize(("first", "second"), [(5.01, 5.04), (5.04, 5.01), (5.0, 5.0)])
 def test_score_equal_to_the_best_after_rounding_is_not_kept(run: Run, first: float, second: float) -> None:
-    """Two evaluators of one version among them: the name is taken, and what is kept is the same."""
+    """Two evaluators may play the same version: its best checkpoint is kept once."""
     for evaluator in ("e", "f"):
         run.begin(1, evaluator)
     assert "the best so far" in run.report(1, first)[1]
@@ -150,12 +150,12 @@ def test_previous_best_is_kept_when_the_disk_is_full(run: Run, monkeypatch: pyte
     best = best_checkpoints(run.directory)[0]
     assert best.name == "best_5.0_0000000001"
     run.save(3)
-    assert not [name for name in run.names if name.startswith(".")]  # what was half done is cleared away
+    assert not [name for name in run.names if name.startswith(".")]  # unfinished files are removed
     assert "the best so far" in run.play(4, 9.0)
     assert run.names[-1] == "best_9.0_0000000004"
 
 
-# ---------------------------------------------------------------------------------------------- what is kept
+# -------------------------------------------------------------------------------------- checkpoints in use
 
 
 def test_checkpoint_under_evaluation_is_not_pruned(run: Run) -> None:
@@ -189,10 +189,10 @@ def test_new_request_of_an_evaluator_replaces_its_previous_evaluation(run: Run) 
     assert run.report(2, 3.0)[0].verdict == "accepted"
 
 
-# ---------------------------------------------------------------------------------------------- what is refused
+# ---------------------------------------------------------------------------------------- rejected reports
 
 
-def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str, reason: str) -> None:
+def assert_not_accepted(run: Run, answer: Acknowledgement, text: str, verdict: str, reason: str) -> None:
     assert answer.verdict == verdict
     assert reason in answer.reason
     assert text == ""
@@ -202,12 +202,12 @@ def assert_not_taken(run: Run, answer: Acknowledgement, text: str, verdict: str,
 
 def test_report_without_an_evaluation_in_progress_is_rejected(run: Run) -> None:
     run.save(1)
-    assert_not_taken(run, *run.report(1, 9.0), "rejected", "evaluator 'e' has no evaluation of policy version 1")
+    assert_not_accepted(run, *run.report(1, 9.0), "rejected", "evaluator 'e' has no evaluation of policy version 1")
 
 
 def test_report_of_a_wrong_version_is_rejected_and_the_evaluation_stays_open(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(2, 9.0), "rejected", "no evaluation of policy version 2")
+    assert_not_accepted(run, *run.report(2, 9.0), "rejected", "no evaluation of policy version 2")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 
@@ -220,14 +220,14 @@ def test_second_report_of_an_evaluation_is_rejected(run: Run) -> None:
 
 def test_report_for_another_learner_epoch_is_fenced(run: Run) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another learner epoch")
+    assert_not_accepted(run, *run.report(1, 9.0, epoch=EPOCH + 1), "fenced", "another learner epoch")
     assert run.report(1, 9.0)[0].verdict == "accepted"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_report_with_returns_that_are_not_finite_is_rejected(run: Run, value: float) -> None:
     run.begin(1)
-    assert_not_taken(run, *run.report(1, 3.0, value), "rejected", "not finite")
+    assert_not_accepted(run, *run.report(1, 3.0, value), "rejected", "not finite")
     assert run.report(1, 3.0)[0].verdict == "accepted"
 
 

@@ -1,4 +1,4 @@
-"""learner/serving/fleet.py: who takes part, under which identity, and what was taken of them."""
+"""learner/serving/fleet.py: joins, presence, incarnations and sequence numbers."""
 
 import pytest
 from building import SPACES, identity, joined_fleet
@@ -14,14 +14,14 @@ HUGE = 2**62
 
 
 class NaiveWindow:
-    """Every number ever taken, in one set."""
+    """Reference implementation: one set of all received numbers."""
 
     def __init__(self) -> None:
         self.taken: set[int] = set()
 
     @property
     def low(self) -> int:
-        """All below are taken or given up for lost."""
+        """All numbers below were received or given up."""
         return max(0, max(self.taken, default=-1) - WINDOW + 1)
 
     def __contains__(self, sequence: int) -> bool:
@@ -54,7 +54,7 @@ def test_sequence_window_equals_a_set_of_all_numbers(steps: list[tuple[int, bool
 
 def test_sequence_window_is_bounded_by_the_reordering_distance() -> None:
     window = SequenceWindow()
-    for sequence in range(0, 20 * WINDOW, 2):  # every second one is lost
+    for sequence in range(0, 20 * WINDOW, 2):  # every second number is lost
         window.add(sequence)
     assert len(window._above) <= WINDOW
     in_order = SequenceWindow()
@@ -126,7 +126,7 @@ def test_new_incarnation_replaces_an_absent_one_and_starts_without_sequence_numb
     actor.sequences.add(0)
     fleet.set_present("a", 1, False)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
-    assert fleet.find(identity("a")) is actor  # who only asks what is played replaces nobody
+    assert fleet.find(identity("a")) is actor  # a Join without spaces replaces no incarnation
     assert fleet.find(identity("a", incarnation=2)) is None
     assert fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=3), 0.0) is None
     assert fleet.find(identity("a")) is None
@@ -205,8 +205,10 @@ def test_name_is_refused_while_its_incarnation_is_live() -> None:
         refusal = fleet.join(asking, 1.0)
         assert refusal is not None
         assert (refusal.code, "'a'" in refusal.reason) == ("name_taken", True)
-    assert fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=5), 2.0) is None  # itself
-    fleet.set_present("a", 2, True)  # it may be announced before it is let in
+    assert (
+        fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=5), 2.0) is None
+    )  # the same incarnation
+    fleet.set_present("a", 2, True)  # its token may be present before it joins
     assert fleet.join(other, 3.0) is not None
     fleet.set_present("a", 1, False)
     assert fleet.join(other, 4.0) is None
@@ -250,11 +252,11 @@ def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
     def seeds(run_seed: int) -> dict[tuple[str, int, int], int]:
         fleet = Fleet(run_seed, None)
         found = {}
-        for life in (1, 2):
+        for incarnation in (1, 2):
             for name in ("a", "b"):
-                fleet.join(Join(actor=name, incarnation=life, spaces=SPACES, environments=1), 0.0)
+                fleet.join(Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=1), 0.0)
                 for start in (0, 500):
-                    found[name, life, start] = fleet.seed_for(name, start)
+                    found[name, incarnation, start] = fleet.seed_for(name, start)
         return found
 
     assert seeds(1) == seeds(1)

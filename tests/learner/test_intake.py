@@ -1,4 +1,4 @@
-"""learner/serving/intake.py: every way in which a rollout can be wrong, and that each is taken at most once."""
+"""learner/serving/intake.py: every cause of rejection, and acceptance at most once."""
 
 import dataclasses
 from typing import Any
@@ -20,7 +20,7 @@ VERSION, MAX_LAG = 10, 4
 
 
 class Harness:
-    """An intake with its fleet of `a` and `b`, at one policy version."""
+    """Intake with a fleet of actors `a` and `b`, at one policy version."""
 
     def __init__(self, **training: Any) -> None:
         self.fleet = joined_fleet("a", "b")
@@ -30,11 +30,11 @@ class Harness:
         return self.intake.judge(sender, self.intake.read(sender, data), VERSION, now)
 
     def memory(self) -> list[Any]:
-        """All that the fleet knows, but for what a rejection is to leave: when it was, and the count of it."""
-        told = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
+        """Return the state of the fleet, without the fields that a rejection may change."""
+        actors = [dataclasses.asdict(actor) for actor in self.fleet.actors.values()]
         return [
             self.fleet.spaces,
-            [{**each, "last_seen": None, "rejected": None, "consecutive_unfit": None} for each in told],
+            [{**each, "last_seen": None, "rejected": None, "consecutive_unfit": None} for each in actors],
         ]
 
 
@@ -48,7 +48,7 @@ def good(**replaced: Any) -> Rollout:
 
 
 def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "", sender: str = "a") -> Rejected:
-    """Rejected for that cause and counted under it, with no other trace; the right rollout is welcome after it."""
+    """Assert that a message is rejected and counted under `cause`, and that a valid rollout is accepted afterwards."""
     before = harness.memory()
     verdict = harness.receive(data, sender)
     assert isinstance(verdict, Rejected)
@@ -57,12 +57,12 @@ def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "",
     assert harness.memory() == before
     if sender in harness.fleet.actors:
         assert harness.fleet.actors[sender].rejected == {cause: 1}
-    assert isinstance(harness.receive(encode(good(who=identity(sequence=1000)))), Rollout)
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=1000)))), Rollout)
     return verdict
 
 
 def with_value(name: str, value: float) -> Rollout:
-    """A good rollout, but for one number of one array."""
+    """Return a valid rollout with one value of one array replaced."""
     array = getattr(good(), name).copy()
     array.flat[-1] = value
     return good(**{name: array})
@@ -86,7 +86,7 @@ def test_valid_rollout_is_accepted_unchanged(harness: Harness) -> None:
 
 def test_same_sequence_number_from_two_actors_is_accepted_from_both(harness: Harness) -> None:
     for actor in ("a", "b"):
-        assert isinstance(harness.receive(encode(good(who=identity(actor))), actor), Rollout)
+        assert isinstance(harness.receive(encode(good(rollout_identity=identity(actor))), actor), Rollout)
 
 
 def test_rollout_with_policy_lag_at_the_bound_is_accepted(harness: Harness) -> None:
@@ -124,7 +124,7 @@ def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> N
         good(rows=ROWS + 1),
         good(environments=ENVIRONMENTS - 1),
         good(environments=ENVIRONMENTS + 1),
-        good(rows=ROWS - 1, stack=2),  # as many frames as there should be
+        good(rows=ROWS - 1, stack=2),  # the expected number of frames
     ],
     ids=["T too small", "T too large", "E too small", "E too large", "a stack for a row"],
 )
@@ -223,7 +223,7 @@ def stacked_harness(state_size: int = 0) -> Harness:
 
 
 def pixels(length: int = ROWS + 4, shape: tuple[int, ...] = STACKED.shape) -> np.ndarray:
-    """Noise, which no compression makes smaller."""
+    """Return noise, which is not compressible."""
     return np.random.default_rng(0).integers(0, 256, (length, ENVIRONMENTS, *shape), np.uint8)
 
 
@@ -284,16 +284,19 @@ def test_corrupted_bytes_always_get_a_verdict(data: st.DataObject) -> None:
     assert isinstance(Harness().receive(bytes(message[:cut])), Rollout | Rejected)
 
 
-# ------------------------------------------------------------------------- whose it is, and when it was made
+# ------------------------------------------------------------------------------- identity and policy version
 
 
 def test_rollout_for_another_learner_epoch_is_fenced(harness: Harness) -> None:
-    verdict = assert_rejected(harness, encode(good(who=identity(epoch=EPOCH - 1))), "epoch")
+    verdict = assert_rejected(harness, encode(good(rollout_identity=identity(epoch=EPOCH - 1))), "epoch")
     assert acknowledgement(verdict, VERSION).verdict == "fenced"
 
 
 def test_rollout_of_an_actor_that_never_joined_is_fenced(harness: Harness) -> None:
-    assert assert_rejected(harness, encode(good(who=identity("z"))), "unknown_actor", sender="z").verdict == "fenced"
+    assert (
+        assert_rejected(harness, encode(good(rollout_identity=identity("z"))), "unknown_actor", sender="z").verdict
+        == "fenced"
+    )
     assert "z" not in harness.fleet.actors
 
 
@@ -306,7 +309,9 @@ def test_rollout_is_fenced_before_the_first_actor_has_joined() -> None:
 
 @pytest.mark.parametrize("incarnation", [0, 2])
 def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness, incarnation: int) -> None:
-    verdict = assert_rejected(harness, encode(good(who=identity(incarnation=incarnation))), "unknown_actor")
+    verdict = assert_rejected(
+        harness, encode(good(rollout_identity=identity(incarnation=incarnation))), "unknown_actor"
+    )
     assert verdict.verdict == "fenced"
 
 
@@ -316,7 +321,7 @@ def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
     verdict = harness.receive(encode(good()))
     assert isinstance(verdict, Rejected)
     assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
-    assert isinstance(harness.receive(encode(good(who=identity(incarnation=2)))), Rollout)
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity(incarnation=2)))), Rollout)
 
 
 def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_again(harness: Harness) -> None:
@@ -328,10 +333,10 @@ def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_aga
 
 
 def test_rollout_with_the_identity_of_another_actor_is_fenced(harness: Harness) -> None:
-    verdict = assert_rejected(harness, encode(good(who=identity("b"))), "unknown_actor", sender="a")
+    verdict = assert_rejected(harness, encode(good(rollout_identity=identity("b"))), "unknown_actor", sender="a")
     assert verdict.verdict == "fenced"
     assert not harness.fleet.actors["b"].rejected
-    assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity("b"))), "b"), Rollout)
 
 
 def test_duplicate_rollout_is_rejected(harness: Harness) -> None:
@@ -351,7 +356,7 @@ def test_a2c_rejects_older_versions_regardless_of_max_policy_lag() -> None:
     late = harness.receive(encode(good(version=VERSION - 1)))
     assert isinstance(late, Rejected)
     assert late.cause == "stale"
-    assert isinstance(harness.receive(encode(good(who=identity(sequence=1)))), Rollout)
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=1)))), Rollout)
 
 
 # ------------------------------------------------------------------------------------------- quarantine
@@ -366,34 +371,34 @@ def verdicts(harness: Harness, *messages: bytes) -> list[str]:
 
 
 def test_actor_is_quarantined_after_three_unfit_rollouts_in_a_row(harness: Harness) -> None:
-    fit = encode(good(who=identity(sequence=9)))
+    fit = encode(good(rollout_identity=identity(sequence=9)))
     assert verdicts(harness, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
     actor = harness.fleet.actors["a"]
     assert actor.quarantined == "3 unfit rollouts in a row, the last: rewards has a value that is not finite"
     assert actor.rejected == {"unfit": 3, "quarantined": 1}
     assert harness.fleet.live == {"b"}
-    assert isinstance(harness.receive(encode(good(who=identity("b"))), "b"), Rollout)
+    assert isinstance(harness.receive(encode(good(rollout_identity=identity("b"))), "b"), Rollout)
 
 
 def test_valid_rollout_in_between_resets_the_count_of_unfit_rollouts(harness: Harness) -> None:
-    fit = [encode(good(who=identity(sequence=sequence))) for sequence in (10, 11)]
+    fit = [encode(good(rollout_identity=identity(sequence=sequence))) for sequence in (10, 11)]
     assert "quarantined" not in verdicts(harness, broken(0), broken(1), fit[0], broken(2), broken(3), fit[1])
 
 
 def test_quarantine_ends_with_a_new_incarnation_but_not_with_a_second_join(harness: Harness) -> None:
     verdicts(harness, broken(0), broken(1), broken(2))
     harness.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    assert verdicts(harness, encode(good(who=identity(sequence=5)))) == ["quarantined"]
+    assert verdicts(harness, encode(good(rollout_identity=identity(sequence=5)))) == ["quarantined"]
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     harness.fleet.set_present("a", 2, True)
     assert harness.fleet.live == {"a", "b"}
-    assert verdicts(harness, encode(good(who=identity(incarnation=2)))) == ["accepted"]
+    assert verdicts(harness, encode(good(rollout_identity=identity(incarnation=2)))) == ["accepted"]
 
 
 def test_malformed_or_foreign_rollouts_do_not_quarantine_an_actor(harness: Harness) -> None:
-    """Who does not know an actor's incarnation and the learner's epoch cannot have it shut out."""
-    strangers = [identity(incarnation=8), identity(epoch=EPOCH + 1)]
-    noise = [b"noise", encode(good())[:-1], *(encode(good(who=who, rows=ROWS - 1)) for who in strangers)]
+    """A sender that does not know the incarnation and the learner epoch cannot quarantine an actor."""
+    foreign = [identity(incarnation=8), identity(epoch=EPOCH + 1)]
+    noise = [b"noise", encode(good())[:-1], *(encode(good(rollout_identity=each, rows=ROWS - 1)) for each in foreign)]
     assert "quarantined" not in verdicts(harness, *noise, *noise)
     assert verdicts(harness, encode(good())) == ["accepted"]
 
@@ -403,7 +408,7 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
     harness.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
     within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5, np.float32))
-    beyond = good(who=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
+    beyond = good(rollout_identity=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
     assert isinstance(harness.receive(encode(within)), Rollout)
     verdict = harness.receive(encode(beyond))
     assert isinstance(verdict, Rejected)
@@ -422,29 +427,29 @@ SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([
 
 
 class Traffic(RuleBasedStateMachine):
-    """Rollouts that come late, twice, out of order, broken, from lives that are over; held against all taken."""
+    """Model test with stale, duplicate, reordered and unfit rollouts, also from replaced incarnations."""
 
     def __init__(self) -> None:
         super().__init__()
         self.fleet = Fleet(1, None)
         self.intake = Intake(run_spec(rows=1, max_policy_lag=2), EPOCH, self.fleet)
         self.version = 0
-        self.lives = {"a": 0, "b": 0}  # incarnations count up from 1
-        self.incarnations = {"a": 0, "b": 0}  # the one that joined last
-        self.unfit = {"a": 0, "b": 0}  # in a row, of the life that joined last
+        self.newest = {"a": 0, "b": 0}  # the highest incarnation that joined; they count from 1
+        self.incarnations = {"a": 0, "b": 0}  # the incarnation that joined last
+        self.unfit = {"a": 0, "b": 0}  # in a row, of the incarnation that joined last
         self.taken: dict[tuple[str, int], set[int]] = {}
         self.accepted: list[tuple[str, int, int]] = []
-        self.sent: list[tuple[str, Rollout]] = []  # those that were accepted
+        self.sent: list[tuple[str, Rollout]] = []  # accepted rollouts, with their senders
 
     @rule(name=NAMES)
-    def a_new_life_joins(self, name: str) -> None:
-        self.lives[name] += 1
-        self._join(name, self.lives[name])
+    def new_incarnation_joins(self, name: str) -> None:
+        self.newest[name] += 1
+        self._join(name, self.newest[name])
 
     @rule(name=NAMES, older=st.integers(0, 2))
-    def a_life_joins_again(self, name: str, older: int) -> None:
-        if self.lives[name] > older:
-            self._join(name, self.lives[name] - older)
+    def older_incarnation_joins_again(self, name: str, older: int) -> None:
+        if self.newest[name] > older:
+            self._join(name, self.newest[name] - older)
 
     def _join(self, name: str, incarnation: int) -> None:
         if self.incarnations[name] != incarnation:
@@ -454,7 +459,7 @@ class Traffic(RuleBasedStateMachine):
         assert self.fleet.join(join, 0.0) is None
 
     @rule()
-    def an_update_is_made(self) -> None:
+    def learner_makes_an_update(self) -> None:
         self.version += 1
 
     @rule(
@@ -466,25 +471,25 @@ class Traffic(RuleBasedStateMachine):
         epoch=st.sampled_from([EPOCH, EPOCH, EPOCH, EPOCH + 1]),
         reward=st.sampled_from([1.0, 1.0, 1.0, np.nan, np.inf]),
     )
-    def a_rollout_comes(
+    def rollout_arrives(
         self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int, reward: float
     ) -> None:
-        who = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
+        sent = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
         version = max(self.version - lag, 0)
         rewards = np.full((1, 1), reward, np.float32)
-        rollout = make_rollout(who, version=version, rows=1, environments=1, shape=(1,), rewards=rewards)
+        rollout = make_rollout(sent, version=version, rows=1, environments=1, shape=(1,), rewards=rewards)
         self._deliver(name if key == "own" else key, rollout)
 
     @precondition(lambda self: self.sent)
     @rule(data=st.data())
-    def an_accepted_one_comes_again(self, data: st.DataObject) -> None:
+    def accepted_rollout_arrives_again(self, data: st.DataObject) -> None:
         self._deliver(*data.draw(st.sampled_from(self.sent)))
 
     def _deliver(self, sender: str, rollout: Rollout) -> None:
         verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, 0.0)
         expected = self._expected(sender, rollout)
         assert (verdict.cause if isinstance(verdict, Rejected) else "") == expected
-        who = rollout.identity
+        sent = rollout.identity
         if expected == "unfit":
             self.unfit[sender] += 1
             assert isinstance(verdict, Rejected)
@@ -492,26 +497,26 @@ class Traffic(RuleBasedStateMachine):
         if expected == "":
             self.unfit[sender] = 0
         if expected in ("", "stale"):
-            self.taken.setdefault((who.actor, who.incarnation), set()).add(who.sequence)
+            self.taken.setdefault((sent.actor, sent.incarnation), set()).add(sent.sequence)
         if isinstance(verdict, Rollout):
-            self.accepted.append((who.actor, who.incarnation, who.sequence))
+            self.accepted.append((sent.actor, sent.incarnation, sent.sequence))
             self.sent.append((sender, rollout))
 
     def _expected(self, sender: str, rollout: Rollout) -> str:
-        """The cause for which it must be rejected, or nothing."""
-        who = rollout.identity
+        """Return the expected cause of rejection, or an empty string."""
+        sent = rollout.identity
         if not self.incarnations[sender]:
             return "unknown_actor"
         if self.unfit[sender] == 3:
             return "quarantined"
-        if who.learner_epoch != EPOCH:
+        if sent.learner_epoch != EPOCH:
             return "epoch"
-        if who.actor != sender or who.incarnation != self.incarnations[sender]:
+        if sent.actor != sender or sent.incarnation != self.incarnations[sender]:
             return "unknown_actor"
         if not np.isfinite(rollout.rewards).all():
             return "unfit"
-        taken = self.taken.get((who.actor, who.incarnation), set())
-        if who.sequence in taken or who.sequence <= max(taken, default=0) - 1024:
+        taken = self.taken.get((sent.actor, sent.incarnation), set())
+        if sent.sequence in taken or sent.sequence <= max(taken, default=0) - 1024:
             return "duplicate"
         if rollout.policy_version > self.version:
             return "unfit"

@@ -1,4 +1,4 @@
-"""learner/training/learner.py against the same update written out plainly, and against itself after a restart."""
+"""learner/training/learner.py against a reference implementation, and against itself after a restart."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,13 +37,13 @@ def weights(learner: Learner) -> dict[str, np.ndarray]:
 
 
 def assert_same(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> None:
-    """To the bit."""
+    """Assert that all arrays are identical."""
     assert ours.keys() == theirs.keys()
     for name, array in ours.items():
         np.testing.assert_array_equal(array, theirs[name])
 
 
-# --------------------------------------------------------------------------- the update, written plainly
+# ------------------------------------------------------------------------------ reference implementation
 
 KINDS = {
     "a2c": {"algorithm": "a2c", "trace_lambda": 0.9, "max_gradient_norm": 0.1},
@@ -102,7 +102,7 @@ def test_updates_equal_those_of_the_reference_implementation(
 
 
 def first_gradient(learner: Learner, rollouts: list[Rollout]) -> Tensor:
-    """That of the first update, as Adam took it in: a tenth of it is the mean that begins at 0."""
+    """Return the gradient of the first update, from Adam's mean: 0.1 times the gradient, because it starts at 0."""
     learner.step(rollouts, 0.0)
     return learner.state()["adam/mean"] * 10.0
 
@@ -121,7 +121,7 @@ def test_recurrent_gradient_over_all_rows_equals_the_gradient_row_by_row(algorit
 
 
 def on_policy(policy: PolicySpec, start: dict[str, np.ndarray], rollouts: list[Rollout]) -> list[Rollout]:
-    """The same, as if chosen by the policy with these weights."""
+    """Return the rollouts with the behaviour log-probabilities of the policy with these weights."""
     network = ActorCritic(policy, SPACES)
     network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
     chosen = []
@@ -149,7 +149,7 @@ def test_first_gradient_is_equal_for_all_algorithms_on_policy(policy: PolicySpec
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
 def test_first_gradient_of_appo_equals_impala_off_policy(policy: PolicySpec) -> None:
-    """Its ratios compare with the policy that the batch found; how far that was from the actors' is V-trace's."""
+    """Ratios of appo are relative to the policy before the batch; V-trace corrects for the behaviour policy."""
     common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1}
     impala, appo = (make_learner(policy, algorithm=name, **common) for name in ("impala", "appo"))
     rollouts = make_rollouts(1, state_size=appo.state_size)
@@ -191,7 +191,7 @@ def test_memory_with_one_environment_makes_one_version_and_one_optimiser_step_fo
     assert learner.state()["adam/steps"] == 3
 
 
-# --------------------------------------------------------------------------------------------- the rest
+# ------------------------------------------------------------------------------------- rates and metrics
 
 
 def test_rates_are_annealed_over_the_budget_and_constant_outside() -> None:
@@ -263,7 +263,7 @@ def test_metrics_are_means_since_the_last_call() -> None:
 
 
 def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
-    # Without discounting to come, A = r - V; and V starts as 0 where the observation is 0.
+    # With a discount factor of 0, A = r - V, and V is initially 0 for an observation of 0.
     rewards = torch.linspace(4.0, 6.0, 18).reshape(6, 3).numpy()
     nothing, everything = np.zeros((6, 3), np.bool_), np.ones((6, 3), np.bool_)
     rollout = make_rollout(
@@ -284,7 +284,7 @@ def test_action_counts_are_over_batches_since_the_last_call() -> None:
     rollouts = make_rollouts(1) + make_rollouts(2)
     learner.step(rollouts[:2], 0.0)
     learner.step(rollouts[2:], 0.0)
-    actions = np.concatenate([rollout.actions[rollout.valid] for rollout in rollouts])  # the others were ignored
+    actions = np.concatenate([rollout.actions[rollout.valid] for rollout in rollouts])  # reset rows have no action
     assert learner.metrics.take_action_counts() == np.bincount(actions, minlength=4).tolist()
     assert learner.metrics.take_action_counts() == [0] * 4
 
@@ -352,7 +352,7 @@ def test_restored_learner_continues_identically(
     first = make_learner(policy, **settings)
     learn(first, range(5))
     checkpoint = saved(first, tmp_path)
-    learn(first, range(99, 100))  # what was saved is no view of what goes on
+    learn(first, range(99, 100))  # the checkpoint must not share memory with the learner
     second = restored(make_learner(policy, **settings, seed=99), checkpoint)
     assert second.policy_version == 5 * updates
     learn(second, range(5, 10))
@@ -360,7 +360,7 @@ def test_restored_learner_continues_identically(
     assert second.policy_version == 10 * updates
     assert_same(weights(through), weights(second))
     assert second.state().keys() == state.keys()
-    for name, value in second.state().items():  # how the next batch would be shuffled among them
+    for name, value in second.state().items():  # including the random state, which shuffles the next batch
         assert torch.equal(value, state[name])
 
 
@@ -386,13 +386,13 @@ def test_restore_refuses_statistics_of_another_optimiser(wrote: str, reads: str,
         restored(make_learner(optimizer=reads), checkpoint)
 
 
-# --------------------------------------------------------------------------------- gradients beyond all numbers
+# -------------------------------------------------------------------------- gradients that are not finite
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala", "appo"])
 @pytest.mark.parametrize("reward", [3e38, np.nan])
 def test_update_is_skipped_and_counted_when_its_gradient_is_not_finite(algorithm: str, reward: float) -> None:
-    """Intake lets no nan in; what is finite may still be too large to learn from."""
+    """Intake rejects nan, but finite rewards may still be too large for a finite gradient."""
     learner = make_learner(algorithm=algorithm, passes=2, minibatches=1)
     learner.step(make_rollouts(1), 0.0)
     learner.metrics.take_means()

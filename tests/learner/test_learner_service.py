@@ -1,4 +1,4 @@
-"""A learner, an actor and an evaluator in one process, over the memory transport."""
+"""learner/service.py with an actor and an evaluator in one process, over the memory transport."""
 
 import csv
 import io
@@ -25,8 +25,8 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
 
 
-class House:
-    """What a run is made of, each on a thread of its own."""
+class TrainingRun:
+    """Learner, actor and evaluator of one run, each on its own thread."""
 
     def __init__(self, directory: Path, **sections: Any) -> None:
         self.directory = directory / "run"
@@ -95,58 +95,61 @@ FEW_UPDATES = {"passes": 2, "minibatches": 2}
 
 
 def test_evaluations_are_in_the_metrics_and_the_best_policy_is_kept(tmp_path: Path) -> None:
-    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
+    training_run = TrainingRun(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
         until(lambda: sum("evaluation at" in line for line in LINES) >= 3)
     finally:
-        house.end()
-    best = best_checkpoints(house.directory)[0]
+        training_run.end()
+    best = best_checkpoints(training_run.directory)[0]
     assert read_policy(best).policy_version % 4 == 0  # passes x minibatches
-    evaluated = [row for row in house.rows() if row["evaluation_return_mean"]]
+    evaluated = [row for row in training_run.rows() if row["evaluation_return_mean"]]
     assert evaluated
-    # The newest evaluation of a row is written, so the best may be one that another overtook.
+    # A row contains only the newest evaluation, so the best evaluation may be missing.
     assert max(float(row["evaluation_return_mean"]) for row in evaluated) <= best_score(best) + 0.05
     assert all(int(row["evaluation_env_steps"]) <= int(row["env_steps"]) for row in evaluated)
-    # What evaluators were given was kept while they played it, and is pruned when the run ends.
-    assert len(checkpoints(house.directory)) <= 2
+    # Checkpoints under evaluation are kept, and pruned at the end of the run.
+    assert len(checkpoints(training_run.directory)) <= 2
 
 
 def test_checkpoint_under_evaluation_is_not_pruned_by_later_checkpoints(tmp_path: Path) -> None:
-    """A checkpoint after every update, of which one is kept, while the evaluator plays an older one."""
+    """The learner saves after every update and keeps one checkpoint, while an older one is evaluated."""
     often = {**FAST, "checkpoint_seconds": 1e-6}
-    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 400}, service=often)
+    training_run = TrainingRun(tmp_path, evaluation={"seconds": 0.01, "episodes": 400}, service=often)
     try:
         until(lambda: "\n".join(LINES).count("evaluation at") >= 2)
     finally:
-        house.end()
+        training_run.end()
     assert "the best so far" in "\n".join(LINES)
     assert "was not kept" not in "\n".join(LINES)
 
 
 def test_evaluator_is_not_counted_as_an_actor(tmp_path: Path) -> None:
-    house = House(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
+    training_run = TrainingRun(tmp_path, evaluation={"seconds": 0.01, "episodes": 3})
     try:
         until(lambda: "evaluation at" in "\n".join(LINES))
     finally:
-        house.end()
-    assert {row["actors"] for row in house.rows()} <= {"0", "1"}
-    summary = json.loads((house.directory / "summary.json").read_text())
-    assert summary["policy_lag_max"] <= house.spec.training.policy_lag_bound
+        training_run.end()
+    assert {row["actors"] for row in training_run.rows()} <= {"0", "1"}
+    summary = json.loads((training_run.directory / "summary.json").read_text())
+    assert summary["policy_lag_max"] <= training_run.spec.training.policy_lag_bound
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala", "appo"])
 def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path: Path, algorithm: str) -> None:
     training = {"env_steps": 10**9, "stop_when_solved": False, "algorithm": algorithm, **FEW_UPDATES}
-    house = House(tmp_path, training=training)
+    training_run = TrainingRun(tmp_path, training=training)
     try:
         until(
-            lambda: (house.directory / "metrics.csv").exists() and any(row.get("policy_loss") for row in house.rows())
+            lambda: (
+                (training_run.directory / "metrics.csv").exists()
+                and any(row.get("policy_loss") for row in training_run.rows())
+            )
         )
     finally:
-        house.end()
-    last = house.rows()[-1]
-    updates, versions = int(last["updates"]), read_policy(checkpoints(house.directory)[0]).policy_version
+        training_run.end()
+    last = training_run.rows()[-1]
+    updates, versions = int(last["updates"]), read_policy(checkpoints(training_run.directory)[0]).policy_version
     assert updates == versions > 0
     assert updates % (4 if algorithm == "appo" else 1) == 0
-    summary = json.loads((house.directory / "summary.json").read_text())
+    summary = json.loads((training_run.directory / "summary.json").read_text())
     assert "malformed" not in summary["rollouts_rejected"]

@@ -1,4 +1,4 @@
-"""learner/reporting/metrics.py: rows that can be read again by those who read them."""
+"""Metrics writers: the files are readable by csv and by TensorBoard."""
 
 import csv
 from pathlib import Path
@@ -23,7 +23,7 @@ def read(path: Path) -> list[dict[str, str]]:
 def test_csv_has_a_header_and_a_line_for_each_row_with_blank_unknown_values(tmp_path: Path) -> None:
     writer = CsvWriter(tmp_path / "metrics.csv")
     writer.write({"env_steps": 12_345_678, "wall_seconds": 1.23456789, "policy_loss": -1e-9}, NONE)
-    (row,) = read(tmp_path / "metrics.csv")  # there before the writer is closed
+    (row,) = read(tmp_path / "metrics.csv")  # the line is on disk before the writer is closed
     writer.close()
     assert tuple(row) == COLUMNS
     known = {name: text for name, text in row.items() if text}
@@ -76,7 +76,7 @@ def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Pat
     details = Details(returns=[1.0, 1.0, 5.0], lengths=[3, 4, 4], action_counts=[2, 0, 5], picture=picture)
     writer = TensorBoardWriter(tmp_path)
     writer.write({"env_steps": 100}, details)
-    writer.write({"env_steps": 200}, Details(action_counts=[0, 0, 0]))  # nothing new
+    writer.write({"env_steps": 200}, Details(action_counts=[0, 0, 0]))  # no new values
     writer.close()
     events = EventAccumulator(str(tmp_path))
     events.Reload()

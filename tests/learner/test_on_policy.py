@@ -1,4 +1,4 @@
-"""What the learner computes from a rollout under the weights that made it is what the actor computed: ratios of 1."""
+"""Log-probabilities of learner and actor are equal under the same weights, so on-policy ratios are 1."""
 
 import copy
 from typing import Any
@@ -39,14 +39,14 @@ def make_runtime(kind: str, policy: PolicySpec, spaces: Spaces, network: ActorCr
 def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
     policy: str, stack: int, runtime: str
 ) -> None:
-    # Episodes of 3, 2 and 1 steps: some begin, end and go on in every rollout of 5 rows.
+    # Episodes have 3, 2 and 1 steps, so every rollout of 5 rows contains starts and ends of episodes.
     spec = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=stack)
     environments = make_environments(spec, 4)
     spaces = environments.spaces
     torch.manual_seed(1)
     network = ActorCritic(POLICIES[policy], spaces)
     with torch.no_grad():
-        network.policy_head.weight.mul_(100.0)  # far from uniform, so that what was seen shows
+        network.policy_head.weight.mul_(100.0)  # far from uniform, so that log-probabilities depend on the observation
     weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
     collector = started_collector(
         spec,

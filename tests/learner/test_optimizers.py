@@ -1,4 +1,4 @@
-"""learner/training/optimizers.py against torch's own, and against the paper's formula written out."""
+"""learner/training/optimizers.py against torch's optimisers and against the formula of the paper."""
 
 import copy
 import math
@@ -18,7 +18,7 @@ def network() -> nn.Sequential:
 
 
 def gradients(steps: int, size: int) -> list[torch.Tensor]:
-    """Of very different sizes, and none in some places for a while."""
+    """Return gradients of very different sizes, with zeros at random places."""
     random = torch.Generator().manual_seed(9)
     scales = 10.0 ** torch.linspace(-6.0, 2.0, size)
     return [

@@ -1,4 +1,4 @@
-"""learner/reporting/progress.py: one line on a terminal, lines now and then elsewhere."""
+"""learner/reporting/progress.py: one rewritten line on a terminal, a line every few seconds elsewhere."""
 
 import io
 from types import SimpleNamespace
@@ -11,14 +11,14 @@ CLEAR = "\r\x1b[K"
 
 
 class Screen(io.StringIO):
-    """A terminal."""
+    """Stream that is a terminal."""
 
     def isatty(self) -> bool:
         return True
 
 
 class Clock:
-    """Stands where the test puts it."""
+    """Clock that the test sets."""
 
     now = 100.0
 

@@ -1,4 +1,4 @@
-"""What those who ask are told, before, during and after a run."""
+"""learner/serving/query_responses.py: answers before, during and after a run."""
 
 import threading
 

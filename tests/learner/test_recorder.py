@@ -1,4 +1,4 @@
-"""learner/reporting/recorder.py: rows reach the disk, and a disk that refuses them costs nothing but those rows."""
+"""learner/reporting/recorder.py: rows are written in order, and a disk error loses only its rows."""
 
 import csv
 import errno
@@ -85,8 +85,8 @@ def test_full_disk_logs_one_warning_and_writing_resumes_when_there_is_space(
     recording.record(row(4), Details())
     recording.record(row(5), Details())
     recording.close()
-    told = [line for line in LINES if "metrics" in line]
-    assert told == [
+    logged = [line for line in LINES if "metrics" in line]
+    assert logged == [
         "metrics not written: No space left on device; training continues, and writing is retried every 0 s",
         "metrics are written again",
     ]
@@ -99,15 +99,15 @@ def test_partly_written_line_is_removed_when_the_disk_is_full(tmp_path: Path, mo
     whole = (tmp_path / "metrics.csv").read_bytes()
 
     class Filling:
-        """The same file on a disk with room for three more bytes."""
+        """File on a disk with space for three more bytes."""
 
         def __init__(self, file: io.FileIO) -> None:
-            self._file, self._room = file, 3
+            self._file, self._space = file, 3
 
         def write(self, data: bytes) -> int:
-            if not self._room:
+            if not self._space:
                 raise OSError(errno.ENOSPC, "No space left on device")
-            written, self._room = self._room, 0
+            written, self._space = self._space, 0
             return self._file.write(data[:written])
 
         def __getattr__(self, name: str) -> object:

@@ -1,4 +1,4 @@
-"""learner/reporting/report.py: what a run tells of itself."""
+"""learner/reporting/report.py: metrics rows, status, summary."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ EVERYTHING = np.ones((6, 3), np.bool_)
 
 
 def trained_counters(*returns: float) -> RunCounters:
-    """After one update from 18 env_steps, 2 versions late."""
+    """Return counters after one update from 18 env_steps with a policy lag of 2."""
     counters = RunCounters(100)
     episodes = {
         "episode_returns": np.array(returns, np.float32),

@@ -1,4 +1,4 @@
-"""learner/serving/request_queue.py: bounded by bytes and by number, first in, first out."""
+"""learner/serving/request_queue.py: first in, first out, bounded by bytes and by number."""
 
 import threading
 
@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from daedalus.learner.serving.request_queue import RequestQueue
 
 
-class Asked:
-    """A request that nobody waits for."""
+class UnansweredRequest:
+    """Request that must not be answered."""
 
     key = "rollouts/a"
 
@@ -17,48 +17,48 @@ class Asked:
         self.payload, self.size = bytes(size), size
 
     def reply(self, payload: bytes) -> None:
-        raise AssertionError("a queue answers nothing")
+        raise AssertionError("the queue must not reply")
 
 
 def test_requests_are_taken_in_order_of_arrival() -> None:
-    queue, requests = RequestQueue(100, 100), [Asked(size) for size in (3, 0, 9)]
+    queue, requests = RequestQueue(100, 100), [UnansweredRequest(size) for size in (3, 0, 9)]
     assert all(queue.offer(request) for request in requests)
     assert [queue.take() for _ in requests] == requests
 
 
 def test_request_above_the_byte_limit_is_refused_until_there_is_room() -> None:
     queue = RequestQueue(10, 100)
-    assert queue.offer(Asked(6))
-    assert queue.offer(Asked(4))
-    assert not queue.offer(Asked(1))
+    assert queue.offer(UnansweredRequest(6))
+    assert queue.offer(UnansweredRequest(4))
+    assert not queue.offer(UnansweredRequest(1))
     queue.take()
-    assert not queue.offer(Asked(7))
-    assert queue.offer(Asked(6))
+    assert not queue.offer(UnansweredRequest(7))
+    assert queue.offer(UnansweredRequest(6))
 
 
 def test_request_above_the_number_limit_is_refused_until_one_is_taken() -> None:
     queue = RequestQueue(100, 2)
-    assert queue.offer(Asked(0))
-    assert queue.offer(Asked(1))
-    assert not queue.offer(Asked(1))
+    assert queue.offer(UnansweredRequest(0))
+    assert queue.offer(UnansweredRequest(1))
+    assert not queue.offer(UnansweredRequest(1))
     queue.take()
-    assert queue.offer(Asked(1))
+    assert queue.offer(UnansweredRequest(1))
 
 
 def test_empty_queue_accepts_a_request_of_any_size() -> None:
     queue = RequestQueue(10, 100)
-    assert queue.offer(Asked(1000))
-    assert not queue.offer(Asked(1))
+    assert queue.offer(UnansweredRequest(1000))
+    assert not queue.offer(UnansweredRequest(1))
     queue.take()
-    assert queue.offer(Asked(1))
+    assert queue.offer(UnansweredRequest(1))
 
 
 @given(st.lists(st.integers(0, 12) | st.none(), max_size=40))
 def test_queue_equals_a_bounded_list_model(steps: list[int | None]) -> None:
-    queue, held = RequestQueue(20, 5), list[Asked]()
+    queue, held = RequestQueue(20, 5), list[UnansweredRequest]()
     for size in steps:
         if size is not None:
-            request, before = Asked(size), sum(len(each.payload) for each in held)
+            request, before = UnansweredRequest(size), sum(len(each.payload) for each in held)
             fits = not held or (before + size <= 20 and len(held) < 5)
             assert queue.offer(request) == fits
             held += [request] if fits else []
@@ -67,7 +67,7 @@ def test_queue_equals_a_bounded_list_model(steps: list[int | None]) -> None:
 
 
 def test_take_returns_queued_requests_and_then_none_after_close() -> None:
-    queue, request = RequestQueue(10, 100), Asked(1)
+    queue, request = RequestQueue(10, 100), UnansweredRequest(1)
     queue.offer(request)
     queue.close()
     assert queue.take() is request
@@ -75,7 +75,7 @@ def test_take_returns_queued_requests_and_then_none_after_close() -> None:
 
 
 def test_take_blocks_until_a_request_or_close() -> None:
-    queue, request, taken = RequestQueue(10, 100), Asked(1), []
+    queue, request, taken = RequestQueue(10, 100), UnansweredRequest(1), []
 
     def work() -> None:
         while (one := queue.take()) is not None:

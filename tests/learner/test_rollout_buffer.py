@@ -1,4 +1,4 @@
-"""learner/serving/rollout_buffer.py: when a batch is complete, and of what."""
+"""learner/serving/rollout_buffer.py: when a batch is complete, and which rollouts it contains."""
 
 import pytest
 from building import identity, make_rollout

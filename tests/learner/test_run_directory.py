@@ -1,4 +1,4 @@
-"""learner/run/run_directory.py: what is written there reproduces the run."""
+"""learner/run/run_directory.py: files of the run directory, and config.toml that reproduces the run."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ JSON = st.recursive(
 @st.composite
 def specs(draw: st.DrawFn) -> RunSpec:
     def some(**strategies: st.SearchStrategy[Any]) -> dict[str, Any]:
-        """Any of the settings; the others have their defaults."""
+        """Draw any subset of the settings; the others have their defaults."""
         return draw(st.fixed_dictionaries({}, optional=strategies))
 
     return RunSpec.model_validate(

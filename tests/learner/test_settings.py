@@ -1,4 +1,4 @@
-"""learner/run/settings.py: what makes a run, and one line that helps where it makes none."""
+"""learner/run/settings.py: presets, assignments, and error messages of one line."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ def settings(*assignments: str, **sections: Any) -> dict[str, Any]:
     return made
 
 
-def complaint(*assignments: str, **sections: Any) -> str:
-    """What is said of the settings: one line."""
+def error_message(*assignments: str, **sections: Any) -> str:
+    """Return the error message of invalid settings, which is one line."""
     with pytest.raises(SettingsError) as caught:
         run_spec(settings(*assignments, **sections))
     assert "\n" not in str(caught.value)
@@ -109,17 +109,17 @@ def test_assignment_below_a_value_is_refused() -> None:
         settings("environment.id.x=1")
 
 
-# ------------------------------------------------------------------------------------------- complaints
+# --------------------------------------------------------------------------------------- error messages
 
 
 def test_unknown_setting_error_suggests_similar_names() -> None:
-    said = complaint("training.learning_rte=0.1")
-    assert said.startswith("unknown setting training.learning_rte: did you mean learning_rate")
-    assert complaint("trainin.seed=1") == "unknown setting trainin: did you mean training?"
+    message = error_message("training.learning_rte=0.1")
+    assert message.startswith("unknown setting training.learning_rte: did you mean learning_rate")
+    assert error_message("trainin.seed=1") == "unknown setting trainin: did you mean training?"
 
 
 def test_unknown_setting_error_lists_the_section_when_none_is_similar() -> None:
-    assert "the settings are activation, encoder, hidden" in complaint("policy.zzz=1")
+    assert "the settings are activation, encoder, hidden" in error_message("policy.zzz=1")
 
 
 @pytest.mark.parametrize(
@@ -134,10 +134,10 @@ def test_unknown_setting_error_lists_the_section_when_none_is_similar() -> None:
     ],
 )
 def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) -> None:
-    said, (name, _, value) = complaint(assignment), assignment.partition("=")
-    assert said.startswith(f"setting {name} ")
-    assert f"not {value}" in said
-    assert f"(it must be {range_})" in said
+    message, (name, _, value) = error_message(assignment), assignment.partition("=")
+    assert message.startswith(f"setting {name} ")
+    assert f"not {value}" in message
+    assert f"(it must be {range_})" in message
 
 
 @pytest.mark.parametrize(
@@ -150,14 +150,14 @@ def test_value_out_of_range_error_names_the_range(assignment: str, range_: str) 
     ],
 )
 def test_value_that_is_not_finite_is_refused(assignment: str) -> None:
-    assert complaint(assignment).startswith(f"setting {assignment.partition('=')[0]} ")
+    assert error_message(assignment).startswith(f"setting {assignment.partition('=')[0]} ")
 
 
 def test_value_of_wrong_type_is_refused() -> None:
-    assert complaint("training.learning_rate=fast").startswith("setting training.learning_rate should be")
-    assert "one of a2c, a3c, impala, appo, not 'ppo'" in complaint("training.algorithm=ppo")
-    assert complaint("policy.hidden=[64, 0]").startswith("setting policy.hidden.1 should be")
-    assert complaint(training=3).startswith("setting training should be")
+    assert error_message("training.learning_rate=fast").startswith("setting training.learning_rate should be")
+    assert "one of a2c, a3c, impala, appo, not 'ppo'" in error_message("training.algorithm=ppo")
+    assert error_message("policy.hidden=[64, 0]").startswith("setting policy.hidden.1 should be")
+    assert error_message(training=3).startswith("setting training should be")
 
 
 def test_settings_without_an_environment_are_refused() -> None:
@@ -166,8 +166,8 @@ def test_settings_without_an_environment_are_refused() -> None:
 
 
 def test_batch_rollouts_for_a2c_is_refused_with_the_reason() -> None:
-    said = complaint("training.algorithm=a2c", "training.batch_rollouts=2")
-    assert said == "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
+    message = error_message("training.algorithm=a2c", "training.batch_rollouts=2")
+    assert message == "training.batch_rollouts has no meaning for a2c: its batch is one rollout of every live actor"
 
 
 def test_for_algorithm_settings_apply_only_to_the_chosen_algorithm() -> None:
