@@ -31,7 +31,9 @@ ALGORITHMS = {
     algorithm.name: algorithm
     for algorithm in (
         AlgorithmRecord(name="a2c", summary="synchronous", synchronous=True),
-        AlgorithmRecord(name="a3c", summary="asynchronous", batch_rollouts=1),
+        AlgorithmRecord(
+            name="a3c", summary="asynchronous, uncorrected: not the paper's, see docs/concepts.md", batch_rollouts=1
+        ),
         AlgorithmRecord(name="impala", summary="asynchronous, corrected for policy lag", corrected=True),
         AlgorithmRecord(
             name="appo", summary="as impala, several passes over each batch", corrected=True, passes_over_batch=True

@@ -1,4 +1,4 @@
-"""Connecting with retries, so that processes may start in any order."""
+"""How a process opens its transport. This file chooses Zenoh; all others know only the interface."""
 
 import logging
 import threading
@@ -6,7 +6,9 @@ import time
 
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import RefusedError, Transport, TransportError
-from daedalus.transport.zenoh_transport import connect
+from daedalus.transport.zenoh_transport import connect, listen
+
+__all__ = ["connect", "connect_with_retry", "listen"]
 
 _logger = logging.getLogger(__name__)
 

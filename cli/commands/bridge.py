@@ -13,8 +13,8 @@ from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_p
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, stop_on_signals
 from daedalus.transport.addresses import AddressError, check_listening
+from daedalus.transport.connecting import connect
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
-from daedalus.transport.zenoh_transport import connect
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 

@@ -28,11 +28,10 @@ from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
-from daedalus.transport.zenoh_transport import listen
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 

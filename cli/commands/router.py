@@ -9,10 +9,10 @@ from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
 from daedalus.transport.addresses import check_connecting
+from daedalus.transport.connecting import listen
 from daedalus.transport.credentials import CredentialsError
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
-from daedalus.transport.zenoh_transport import listen
 
 _logger = logging.getLogger(__name__)
 

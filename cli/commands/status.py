@@ -9,9 +9,9 @@ from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import STATUS_LIMITS
 from daedalus.protocol.messages import StatusReport
 from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.transport.connecting import connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
-from daedalus.transport.zenoh_transport import connect
 
 HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
 
