@@ -5,7 +5,7 @@ import { Bridge, BridgeError } from "./bridge.ts";
 import { ID, SPACES, VectorCartPole } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
 import * as link from "./link.ts";
-import { type EnvironmentSpec, LearnerLostError, NameTakenError, RunOverError, RefusedError, type Welcome } from "./link.ts";
+import { LearnerLostError, NameTakenError, RunOverError, RefusedError } from "./link.ts";
 import { Policy } from "./policy.ts";
 import { seeded } from "./random.ts";
 import { type Acknowledgement, Uploader } from "./uploader.ts";
@@ -36,7 +36,7 @@ export class Actor {
   #snapshotAt = 0; // when the last snapshot was received or requested; times are of performance.now()
   #publishedVersion = 0; // the newest policy version in an acknowledgement
   #heardAt = 0; // when the last message of the learner was received
-  #rejected = false; // whether the last rollout was rejected: a2c then needs another of the same policy version
+  #rejected = false; // whether the last answer was a rejection: a2c then collects another rollout of that version
   #stopReason?: Error; // why collecting must stop; `run` decides by its type what follows
   #stopped = false; // whether `stop` was called
   #wake: () => void = () => {}; // ends the present wait for an event
@@ -46,10 +46,7 @@ export class Actor {
     this.#log = log;
   }
 
-  /**
-   * Collect until `stop` or until the run is over. Throws RefusedError, PolicyError or ProtocolError if the actor cannot
-   * take part.
-   */
+  /** Collect until `stop` or the run's end. Throws RefusedError, PolicyError or ProtocolError if the actor cannot. */
   async run(): Promise<void> {
     let lastLogged = "";
     let nameInUseDeadline = performance.now() + NAME_IN_USE_MILLISECONDS;
@@ -109,7 +106,7 @@ export class Actor {
   // ----------------------------------------------------------------------------------------- collecting
 
   /** Collect and upload until an error ends the session. */
-  async #collect(bridge: Bridge, welcome: Welcome, environments: number): Promise<never> {
+  async #collect(bridge: Bridge, welcome: link.Welcome, environments: number): Promise<never> {
     const { run, spec, seed, learner_epoch } = welcome;
     const uploader = this.#uploader;
     // The same learner epoch was joined again: send the rollouts without a final acknowledgement once more.
@@ -128,11 +125,8 @@ export class Actor {
         const due = () => this.#version > loaded || this.#rejected;
         await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
-      } else if (
-        this.#publishedVersion > this.#version &&
-        performance.now() > this.#snapshotAt + MISSED_PUSH_MILLISECONDS
-      ) {
-        await this.#requestSnapshot(bridge, run);
+      } else if (this.#publishedVersion > this.#version) {
+        if (performance.now() > this.#snapshotAt + MISSED_PUSH_MILLISECONDS) await this.#requestSnapshot(bridge, run);
       }
       if (this.#version !== loaded) policy.bind(weightsOf(this.#snapshot!));
       loaded = this.#version;
@@ -156,12 +150,10 @@ export class Actor {
       this.#publishedVersion = Math.max(this.#publishedVersion, answer.policy_version);
       this.#rejected = answer.verdict === "rejected";
       if (answer.verdict === "finished") this.#stopCollecting(new RunOverError("the run is over"));
-      if (answer.verdict === "fenced") {
-        this.#stopCollecting(new LearnerLostError("the learner fenced a rollout: its epoch or incarnation is not current"));
-      }
+      if (answer.verdict === "fenced") this.#stopCollecting(new LearnerLostError("the learner fenced a rollout"));
       if (answer.verdict === "quarantined") {
-        const advice = "fix the cause and restart the actor";
-        this.#stopCollecting(new RefusedError(`the learner quarantined this actor: ${answer.reason}; ${advice}`));
+        const cause = `${answer.reason}; fix the cause and restart the actor`;
+        this.#stopCollecting(new RefusedError(`the learner quarantined this actor: ${cause}`));
       }
     } catch (error) {
       this.#stopCollecting(error as Error); // the connection ended, or the answer has another protocol version
@@ -204,8 +196,8 @@ export class Actor {
   // -------------------------------------------------------------------------------------------- waiting
 
   /**
-   * Wait until `ready` returns true. Request a snapshot if none came for `snapshotTimeout` milliseconds, or no message at
-   * all for SILENCE_MILLISECONDS. Throws the reason if collecting must stop.
+   * Wait until `ready` returns true. Throws the reason if collecting must stop. Requests a snapshot if none came for
+   * `snapshotTimeout` milliseconds, or no message at all for SILENCE_MILLISECONDS.
    */
   async #waitUntil(bridge: Bridge, run: string, ready: () => boolean, snapshotTimeout = Infinity): Promise<void> {
     for (;;) {
@@ -236,7 +228,7 @@ export class Actor {
 }
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
-function checkSupported(spec: EnvironmentSpec): void {
+function checkSupported(spec: link.EnvironmentSpec): void {
   const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,

@@ -8,7 +8,7 @@ import { connect, type Socket } from "node:net";
 const GREETING = Buffer.from("DBR1");
 const HEADER_BYTES = 12;
 const MAX_PAYLOAD_BYTES = 2 ** 30;
-const [QUERY, FOLLOW, ANNOUNCE, WATCH, ANSWER, END, NEWS, PRESENT, ABSENT, ERROR] = Array.from({ length: 10 }, (_, i) => i + 1);
+const [QUERY, FOLLOW, ANNOUNCE, WATCH, ANSWER, END, NEWS, PRESENT, ABSENT, ERROR] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10];
 
 /** The connection could not be opened, or has ended; the message states the reason. */
 export class BridgeError extends Error {}
@@ -61,7 +61,7 @@ export class Bridge {
     });
   }
 
-  /** Subscribe to a key. `onNews` receives the published values; a slow reader misses values that are not the newest. */
+  /** Subscribe to a key: `onNews` receives the published values. A slow reader may receive only the newest. */
   follow(key: string, onNews: (value: Buffer) => void): void {
     this.#follows.set(this.#send(FOLLOW, key), onNews);
   }

@@ -20,10 +20,7 @@ Collect rollouts of CartPole for a learner, through \`daedalus bridge\`.
 exit status: 0 the run is over or a signal arrived, 1 failed, 2 bad usage`;
 
 const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$/;
-
-function invalidName(value: string): string {
-  return `must be 1 to 64 letters, digits, '.', '_' or '-', the first a letter or a digit, not ${value}`;
-}
+const NAME_RULE = "must have 1 to 64 letters, digits, '.', '_' or '-', and start with a letter or a digit";
 
 /** Return the checked configuration, or undefined after --help. Throws TypeError for an invalid option. */
 function parseOptions(): ActorConfig | undefined {
@@ -39,8 +36,8 @@ function parseOptions(): ActorConfig | undefined {
   if (values.help) return undefined;
   const [, host, port] = values.bridge.match(/^(.+):(\d{1,5})$/) ?? [];
   if (!host || Number(port) > 65535) throw new TypeError(`--bridge must be HOST:PORT, not ${values.bridge}`);
-  if (!NAME.test(values.name)) throw new TypeError(`--name ${invalidName(values.name)}`);
-  if (values.run !== "*" && !NAME.test(values.run)) throw new TypeError(`--run ${invalidName(values.run)}`);
+  if (!NAME.test(values.name)) throw new TypeError(`--name ${NAME_RULE}, not ${values.name}`);
+  if (values.run !== "*" && !NAME.test(values.run)) throw new TypeError(`--run ${NAME_RULE}, not ${values.run}`);
   const environments = values.envs === undefined ? undefined : Number(values.envs);
   if (environments !== undefined && !(Number.isInteger(environments) && environments >= 1 && environments <= 4096)) {
     throw new TypeError(`--envs must be from 1 to 4096, not ${values.envs}`);

@@ -4,7 +4,7 @@ import { createHash } from "node:crypto";
 import { InferenceSession, Tensor } from "onnxruntime-node";
 import type { WireArray } from "./wire.ts";
 
-/** The program or the weights cannot be used: a fault of the learner, or a feature that this actor does not support. */
+/** This actor cannot use the program or the weights. */
 export class PolicyError extends Error {}
 
 /** Sampled actions of one row. */
@@ -36,7 +36,7 @@ export class Policy implements BehaviourPolicy {
     const session = await InferenceSession.create(model, {
       intraOpNumThreads: 1,
       interOpNumThreads: 1,
-      // A model may name external files for its tensors. This folder has none: the sender must not be able to read files.
+      // A model may name external files for its tensors. The sender must not be able to read files: use no folder.
       extra: { session: { model_external_initializers_file_folder_path: "/dev/null" } },
     });
     return new Policy(session);
@@ -59,7 +59,7 @@ export class Policy implements BehaviourPolicy {
     this.stateSize = stateSize;
   }
 
-  /** Use these weights from the next `act` on. Throws PolicyError if weights of the program are missing or unsuitable. */
+  /** Use these weights from the next `act` on. Throws PolicyError if they do not match the program's inputs. */
   bind(weights: Record<string, WireArray>): void {
     const bound: Record<string, Tensor> = {};
     for (const [name, shape] of this.#weightShapes) {
@@ -72,7 +72,12 @@ export class Policy implements BehaviourPolicy {
     this.#weights = bound;
   }
 
-  async act(observations: Float32Array, shape: number[], state: Float32Array, random: () => number): Promise<SampledRow> {
+  async act(
+    observations: Float32Array,
+    shape: number[],
+    state: Float32Array,
+    random: () => number,
+  ): Promise<SampledRow> {
     const rows = observations.length / shape.reduce((product, side) => product * side, 1);
     const feeds: Record<string, Tensor> = {
       ...this.#weights,
@@ -101,7 +106,7 @@ export function sample(logits: Float32Array, rows: number, random: () => number)
     const total = weights.reduce((sum, weight) => sum + weight, 0);
     let left = random() * total;
     let action = 0;
-    // Because of rounding, `left` may exceed the sum of all weights: the last action is then chosen.
+    // Stop at the last action: because of rounding, the weights may sum to less than `left`.
     while (action < choices - 1 && left >= weights[action]) left -= weights[action++];
     actions[row] = action;
     logProbs[row] = shifted[action] - largest - Math.log(total);

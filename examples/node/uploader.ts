@@ -1,4 +1,4 @@
-/** Collected rollouts without a final acknowledgement. A rollout may be sent twice: the learner applies it at most once. */
+/** Rollouts without a final acknowledgement. They may be sent twice: the learner applies each at most once. */
 
 import { setTimeout as sleep } from "node:timers/promises";
 
@@ -34,7 +34,7 @@ export class Uploader {
     return this.#sequence++;
   }
 
-  /** Send a pending rollout until its final acknowledgement, and return that. `send` returns undefined without an answer. */
+  /** Send a pending rollout until its final acknowledgement, and return it. `send` returns undefined if none came. */
   async deliver(
     sequence: number,
     send: (rollout: Uint8Array) => Promise<Acknowledgement | undefined>,

@@ -73,7 +73,7 @@ test("differences of a compact snapshot are added as docs/wire.md specifies", ()
       return new Float32Array(Uint32Array.of((bits & 0xffff) << 16).buffer)[0];
     });
   };
-  // The weights change from the 3 x 3 identity to 1.01 times it, the biases from 1 to 0. In bfloat16, 1.01 is 1.0078125.
+  // The weights change from the 3 x 3 identity to 1.01 times it (1.0078125 in bfloat16), the biases from 1 to 0.
   const diagonal = (i: number) => Number(i % 4 === 0);
   assert.deepEqual(added("body.weight", diagonal), Array.from({ length: 9 }, (_, i) => 1.0078125 * diagonal(i)));
   assert.deepEqual(added("body.bias", () => 1), [0, 0, 0]);

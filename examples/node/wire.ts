@@ -89,7 +89,9 @@ export function encode(message: Message): Buffer {
 /** Decode a message. Throws ProtocolError unless `bytes` are exactly one complete message within the limits. */
 export function decode(bytes: Uint8Array, maxBodyBytes = MAX_BODY_BYTES): Message {
   const view = Buffer.from(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  if (view.length < PREFIX_BYTES || view.readUInt32LE(0) !== MAGIC) throw new ProtocolError("not a message of this protocol");
+  if (view.length < PREFIX_BYTES || view.readUInt32LE(0) !== MAGIC) {
+    throw new ProtocolError("not a message of this protocol");
+  }
   const version = view.readUInt16LE(4);
   if (version !== PROTOCOL_VERSION) {
     throw new VersionMismatchError(
@@ -124,7 +126,7 @@ export function decode(bytes: Uint8Array, maxBodyBytes = MAX_BODY_BYTES): Messag
   return message;
 }
 
-/** Decode a message, or return undefined if it is damaged. Throws VersionMismatchError if another version wrote it. */
+/** Decode a message; return undefined if it is damaged. Throws VersionMismatchError if another version wrote it. */
 export function tryDecode(bytes: Uint8Array): Message | undefined {
   try {
     return decode(bytes);
@@ -157,7 +159,7 @@ function readHeader(bytes: Uint8Array): { kind: string; fields: Message["fields"
     throw new ProtocolError("the header's kind, fields or size are missing or have the wrong type");
   }
   if (!Array.isArray(arrays) || arrays.length > MAX_ARRAYS || !arrays.every(isEntry)) {
-    throw new ProtocolError(`the header must list at most ${MAX_ARRAYS} arrays, each with name, dtype, shape and swapped`);
+    throw new ProtocolError(`the header must list up to ${MAX_ARRAYS} arrays by name, dtype, shape and swapped`);
   }
   return { kind, fields, arrays, size };
 }
