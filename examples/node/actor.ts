@@ -1,206 +1,216 @@
-/** Joins a learner, collects, uploads, follows its snapshots, leaves. */
+/** The actor's service: join a learner, collect rollouts and upload them, follow its snapshots, leave. */
 
 import { setTimeout as sleep } from "node:timers/promises";
 import { Bridge, BridgeError } from "./bridge.ts";
-import { CartPoles, ID, SPACES } from "./cartpole.ts";
+import { ID, SPACES, VectorCartPole } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
 import * as link from "./link.ts";
-import { type EnvironmentSpec, LearnerLostError, NameTakenError, RunOverError, RefusedError, type Welcome } from "./link.ts";
+import { LearnerLostError, NameTakenError, RunOverError, RefusedError } from "./link.ts";
 import { Policy } from "./policy.ts";
 import { seeded } from "./random.ts";
 import { type Acknowledgement, Uploader } from "./uploader.ts";
-import { decodeWhole, encode, type Message } from "./wire.ts";
+import { encode, type Message, tryDecode } from "./wire.ts";
 
-const RETRY_MILLISECONDS = 500; // between looks for the learner
-const HEARTBEAT_MILLISECONDS = 200; // how soon a wait looks at the clock
-const DOUBT_MILLISECONDS = 1_000; // so long without the snapshot that it needs, the actor asks for it
-const SILENCE_MILLISECONDS = 10_000; // nothing heard for so long, the learner is asked whether it is there
-const TAKEN_MILLISECONDS = 10_000; // for an earlier life of this actor to be found dead
+const RETRY_MILLISECONDS = 500; // between attempts to join
+const HEARTBEAT_MILLISECONDS = 200; // how soon a wait notices a deadline
+const MISSED_PUSH_MILLISECONDS = 1_000; // without the awaited snapshot for so long, request it
+const SILENCE_MILLISECONDS = 10_000; // without any message for so long, check that the learner answers
+const NAME_IN_USE_MILLISECONDS = 10_000; // until the network notices that an earlier incarnation of this actor is dead
 const ACKNOWLEDGE_SECONDS = 30; // a saturated learner answers late
 
 export interface ActorConfig {
-  host: string;
+  host: string; // of the bridge
   port: number; // of the bridge
-  run: string; // `*`: whichever there is
-  name: string; // survives restarts
-  incarnation: bigint; // this life of the process
-  environments?: number; // unset: as many as the learner asks for
+  run: string; // `*`: any run
+  name: string; // the same after a restart
+  incarnation: bigint; // identifies this process
+  environments?: number; // E; undefined: envs_per_actor of the run's specification
 }
 
+/** One actor. Its state about the learner is of the learner epoch that it joined last. */
 export class Actor {
   readonly #config: ActorConfig;
-  readonly #say: (text: string) => void;
-  #uploader = new Uploader(-1, 1); // of the learner epoch that was joined last
-  #snapshot?: Message; // the newest of that epoch
-  #newsAt = 0; // when it came
-  #toldVersion = 0; // the newest that an answer told of
-  #heardAt = 0; // when the learner last said anything
-  #rejected = false; // the last answer: collect another in its place
-  #reason?: Error; // to stop playing, once there is one
-  #stopped = false;
-  #wake: () => void = () => {};
+  readonly #log: (text: string) => void;
+  #uploader = new Uploader(-1, 1);
+  #snapshot?: Message; // the newest received
+  #snapshotAt = 0; // when the last snapshot was received or requested; times are of performance.now()
+  #publishedVersion = 0; // the newest policy version in an acknowledgement
+  #heardAt = 0; // when the last message of the learner was received
+  #rejected = false; // whether the last answer was a rejection: a2c then collects another rollout of that version
+  #stopReason?: Error; // why collecting must stop; `run` decides by its type what follows
+  #stopped = false; // whether `stop` was called
+  #wake: () => void = () => {}; // ends the present wait for an event
 
-  constructor(config: ActorConfig, say: (text: string) => void) {
+  constructor(config: ActorConfig, log: (text: string) => void) {
     this.#config = config;
-    this.#say = say;
+    this.#log = log;
   }
 
-  /** Plays until stopped or until the run is over; throws RefusedError, PolicyError or ProtocolError if it cannot. */
+  /** Collect until `stop` or the run's end. Throws RefusedError, PolicyError or ProtocolError if the actor cannot. */
   async run(): Promise<void> {
-    let told = "";
-    let takenUntil = performance.now() + TAKEN_MILLISECONDS;
+    let lastLogged = "";
+    let nameInUseDeadline = performance.now() + NAME_IN_USE_MILLISECONDS;
     while (!this.#stopped) {
       try {
-        await this.#takePart(() => (told = ""));
+        await this.#joinAndCollect(() => (lastLogged = ""));
       } catch (error) {
-        if (error instanceof RunOverError) return this.#say(error.message);
-        const passing = error instanceof LearnerLostError || error instanceof BridgeError;
-        if (passing) takenUntil = performance.now() + TAKEN_MILLISECONDS;
-        else if (!(error instanceof NameTakenError && performance.now() < takenUntil)) throw error;
-        if (told !== error.message) this.#say(`${error.message}; looking for a learner`);
-        told = error.message;
+        if (error instanceof RunOverError) return this.#log(error.message);
+        const temporary = error instanceof LearnerLostError || error instanceof BridgeError;
+        if (temporary) nameInUseDeadline = performance.now() + NAME_IN_USE_MILLISECONDS;
+        else if (!(error instanceof NameTakenError && performance.now() < nameInUseDeadline)) throw error;
+        if (lastLogged !== error.message) this.#log(`${error.message}; looking for a learner`);
+        lastLogged = error.message;
       }
       await sleep(RETRY_MILLISECONDS);
     }
   }
 
-  /** Ends `run` soon. */
+  /** End `run` soon. */
   stop(): void {
     this.#stopped = true;
-    this.#end(new RunOverError("stopped"));
+    this.#stopCollecting(new RunOverError("stopped"));
   }
 
-  /** Over a connection of its own: asks what to play, is counted in, and plays until there is a reason to stop. */
-  async #takePart(onJoined: () => void): Promise<never> {
+  /** Connect to the bridge, join, and collect until an error ends the session. */
+  async #joinAndCollect(onJoined: () => void): Promise<never> {
     const { host, port, name, incarnation } = this.#config;
     const bridge = await Bridge.open(host, port);
     try {
       this.#snapshot = undefined;
-      this.#reason = this.#stopped ? new RunOverError("stopped") : undefined;
-      bridge.onClosed = (error) => this.#end(error);
-      const asked = { actor: name, incarnation, spaces: null, environments: 0 };
-      const { run, spec, learner_epoch } = await link.join(bridge, this.#config.run, asked);
-      checkPlayable(spec.environment);
+      this.#stopReason = this.#stopped ? new RunOverError("stopped") : undefined;
+      bridge.onClosed = (error) => this.#stopCollecting(error);
+      const inquiry = { actor: name, incarnation, spaces: null, environments: 0 };
+      const { run, spec, learner_epoch } = await link.join(bridge, this.#config.run, inquiry);
+      checkSupported(spec.environment);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
-        this.#toldVersion = 0;
+        this.#publishedVersion = 0;
       }
-      bridge.follow(`daedalus/${run}/snapshots`, (news) => this.#takeNews(news));
+      bridge.follow(`daedalus/${run}/snapshots`, (bytes) => this.#onSnapshotMessage(bytes));
       bridge.watch(`daedalus/${run}/learner`, (_key, present) => {
-        if (!present) this.#end(new LearnerLostError("the learner went away"));
+        if (!present) this.#stopCollecting(new LearnerLostError("the learner went away"));
       });
       bridge.announce(`daedalus/${run}/actors/${name}/${incarnation}`);
       const environments = this.#config.environments ?? spec.collection.envs_per_actor;
       const welcome = await link.join(bridge, run, { actor: name, incarnation, spaces: SPACES, environments });
-      if (welcome.learner_epoch !== learner_epoch) throw new LearnerLostError("the learner was started again");
+      if (welcome.learner_epoch !== learner_epoch) throw new LearnerLostError("the learner was restarted");
       this.#heardAt = performance.now();
       onJoined();
-      this.#say(`joined run '${run}' as '${name}': ${environments} x ${ID}`);
-      return await this.#play(bridge, welcome, environments);
+      this.#log(`joined run '${run}' as '${name}': ${environments} x ${ID}`);
+      return await this.#collect(bridge, welcome, environments);
     } finally {
       bridge.close();
     }
   }
 
-  // -------------------------------------------------------------------------------------------- playing
+  // ----------------------------------------------------------------------------------------- collecting
 
-  async #play(bridge: Bridge, welcome: Welcome, environments: number): Promise<never> {
+  /** Collect and upload until an error ends the session. */
+  async #collect(bridge: Bridge, welcome: link.Welcome, environments: number): Promise<never> {
     const { run, spec, seed, learner_epoch } = welcome;
     const uploader = this.#uploader;
-    // What was never answered goes out once more: only the network may have failed, and not the learner.
+    // The same learner epoch was joined again: send the rollouts without a final acknowledgement once more.
     for (const sequence of uploader.pending.keys()) void this.#upload(bridge, run, sequence);
-    this.#newsAt = 0; // it may be there already: to be asked for at once
-    await this.#until(bridge, run, () => this.#snapshot !== undefined, DOUBT_MILLISECONDS);
+    this.#snapshotAt = 0; // request the first snapshot at once: it may have been published earlier
+    await this.#waitUntil(bridge, run, () => this.#snapshot !== undefined, MISSED_PUSH_MILLISECONDS);
     const hash = String(this.#snapshot!.fields.program);
     const policy = await Policy.load(await link.program(bridge, run, hash), hash);
     const random = seeded(seed);
-    const { reward_clip, reward_scale, bootstrap_terminations, max_episode_steps } = spec.environment;
-    const carts = new CartPoles(environments, random, max_episode_steps ?? undefined);
-    const shaping = { clip: reward_clip, scale: reward_scale, bootstrap_terminations };
-    const collector = new Collector(carts, policy, shaping, spec.collection.rollout_length, random);
-    const synchronous = spec.training.algorithm === "a2c"; // it takes one rollout of each version
+    const vector = new VectorCartPole(environments, random, spec.environment.max_episode_steps ?? undefined);
+    const collector = new Collector(vector, policy, spec.environment, spec.collection.rollout_length, random);
+    const synchronous = spec.training.algorithm === "a2c"; // it uses one rollout of each policy version
     for (let loaded = -1; ; ) {
-      await this.#until(bridge, run, () => uploader.hasRoom); // before playing: what is played now is of the newest
+      await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {
-        await this.#until(bridge, run, () => this.#version > loaded || this.#rejected, DOUBT_MILLISECONDS);
+        const due = () => this.#version > loaded || this.#rejected;
+        await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
-      } else if (this.#toldVersion > this.#version && performance.now() > this.#newsAt + DOUBT_MILLISECONDS) {
-        await this.#askNews(bridge, run);
+      } else if (this.#publishedVersion > this.#version) {
+        if (performance.now() > this.#snapshotAt + MISSED_PUSH_MILLISECONDS) await this.#requestSnapshot(bridge, run);
       }
       if (this.#version !== loaded) policy.bind(weightsOf(this.#snapshot!));
       loaded = this.#version;
-      const sequence = uploader.next();
+      const sequence = uploader.nextSequence();
       const identity = { actor: this.#config.name, incarnation: this.#config.incarnation, sequence, learner_epoch };
       uploader.pending.set(sequence, encode(await collector.collect(identity, loaded)));
       void this.#upload(bridge, run, sequence);
     }
   }
 
+  /** Send a rollout until its final acknowledgement, and do what the verdict requires. Never throws. */
   async #upload(bridge: Bridge, run: string, sequence: number): Promise<void> {
     try {
       const answer = await this.#uploader.deliver(sequence, async (rollout) => {
         const key = `daedalus/${run}/rollouts/${this.#config.name}`;
-        const [bytes] = await bridge.ask(key, rollout, ACKNOWLEDGE_SECONDS);
+        const [bytes] = await bridge.query(key, rollout, ACKNOWLEDGE_SECONDS);
         if (bytes) this.#heardAt = performance.now();
-        const answer = bytes && decodeWhole(bytes);
+        const answer = bytes && tryDecode(bytes);
         return answer?.kind === "Acknowledgement" ? (answer.fields as unknown as Acknowledgement) : undefined;
       });
-      this.#toldVersion = Math.max(this.#toldVersion, answer.policy_version);
+      this.#publishedVersion = Math.max(this.#publishedVersion, answer.policy_version);
       this.#rejected = answer.verdict === "rejected";
-      if (answer.verdict === "finished") this.#end(new RunOverError("the run is over"));
-      if (answer.verdict === "fenced") this.#end(new LearnerLostError("the learner lives another life"));
+      if (answer.verdict === "finished") this.#stopCollecting(new RunOverError("the run is over"));
+      if (answer.verdict === "fenced") this.#stopCollecting(new LearnerLostError("the learner fenced a rollout"));
       if (answer.verdict === "quarantined") {
-        this.#end(new RefusedError(`the learner takes nothing more of this actor: ${answer.reason}`));
+        const cause = `${answer.reason}; fix the cause and restart the actor`;
+        this.#stopCollecting(new RefusedError(`the learner quarantined this actor: ${cause}`));
       }
     } catch (error) {
-      this.#end(error as Error); // the connection has gone, or what came over it was no message
+      this.#stopCollecting(error as Error); // the connection ended, or the answer has another protocol version
     }
     this.#wake();
   }
 
   // ------------------------------------------------------------------------------------------ snapshots
 
+  /** The policy version of the newest snapshot, or -1 before the first. */
   get #version(): number {
     return this.#snapshot ? Number(this.#snapshot.fields.policy_version) : -1;
   }
 
-  #takeNews(bytes: Uint8Array): void {
+  /** Receive a Snapshot or RunEnded, published or in answer to a request. Ignore any other message. Never throws. */
+  #onSnapshotMessage(bytes: Uint8Array): void {
     try {
-      const news = decodeWhole(bytes);
-      if (!news || (news.kind !== "RunEnded" && news.kind !== "Snapshot")) return;
-      if (news.fields.learner_epoch !== this.#uploader.learnerEpoch) throw new LearnerLostError("another learner is here");
-      if (news.kind === "RunEnded") throw new RunOverError(`the run is over: ${news.fields.reason}`);
-      if (Number(news.fields.policy_version) > this.#version) this.#snapshot = news;
-      this.#heardAt = this.#newsAt = performance.now();
+      const message = tryDecode(bytes);
+      if (!message || (message.kind !== "RunEnded" && message.kind !== "Snapshot")) return;
+      const { learner_epoch, reason, policy_version } = message.fields;
+      if (learner_epoch !== this.#uploader.learnerEpoch) throw new LearnerLostError("another learner epoch began");
+      if (message.kind === "RunEnded") throw new RunOverError(`the run is over: ${reason}`);
+      if (Number(policy_version) > this.#version) this.#snapshot = message;
+      this.#heardAt = this.#snapshotAt = performance.now();
       this.#wake();
     } catch (error) {
-      this.#end(error as Error);
+      this.#stopCollecting(error as Error);
     }
   }
 
-  /** Asks for the newest snapshot: it may not have come, or the learner may have gone without a word. */
-  async #askNews(bridge: Bridge, run: string): Promise<void> {
-    this.#newsAt = performance.now();
-    const answers = await bridge.ask(`daedalus/${run}/snapshots`);
-    if (answers.length === 0) throw new LearnerLostError("the learner is silent");
+  /** Request the newest snapshot in case a push was lost. Throws LearnerLostError without an answer. */
+  async #requestSnapshot(bridge: Bridge, run: string): Promise<void> {
+    this.#snapshotAt = performance.now();
+    const answers = await bridge.query(`daedalus/${run}/snapshots`);
+    if (answers.length === 0) throw new LearnerLostError("the learner did not answer a request for its snapshot");
     this.#heardAt = performance.now();
-    for (const answer of answers) this.#takeNews(answer);
+    for (const answer of answers) this.#onSnapshotMessage(answer);
   }
 
   // -------------------------------------------------------------------------------------------- waiting
 
-  /** Waits until `ready`; meanwhile asks for news where silence, or a snapshot that is `due`, gives reason to. */
-  async #until(bridge: Bridge, run: string, ready: () => boolean, due = Infinity): Promise<void> {
+  /**
+   * Wait until `ready` returns true. Throws the reason if collecting must stop. Requests a snapshot if none came for
+   * `snapshotTimeout` milliseconds, or no message at all for SILENCE_MILLISECONDS.
+   */
+  async #waitUntil(bridge: Bridge, run: string, ready: () => boolean, snapshotTimeout = Infinity): Promise<void> {
     for (;;) {
-      if (this.#reason) throw this.#reason;
+      if (this.#stopReason) throw this.#stopReason;
       if (ready()) return;
       const now = performance.now();
-      if (now > this.#newsAt + due || now > this.#heardAt + SILENCE_MILLISECONDS) await this.#askNews(bridge, run);
-      else await this.#somethingNew();
+      const overdue = now > this.#snapshotAt + snapshotTimeout || now > this.#heardAt + SILENCE_MILLISECONDS;
+      await (overdue ? this.#requestSnapshot(bridge, run) : this.#nextEvent());
     }
   }
 
-  #somethingNew(): Promise<void> {
+  /** Wait for a message or a reason to stop, at most one heartbeat. */
+  #nextEvent(): Promise<void> {
     return new Promise((resolve) => {
       const timer = setTimeout(resolve, HEARTBEAT_MILLISECONDS);
       this.#wake = () => {
@@ -210,23 +220,32 @@ export class Actor {
     });
   }
 
-  /** There is a reason to stop playing; the first one counts. */
-  #end(reason: Error): void {
-    this.#reason ??= reason;
+  /** Make the next wait throw `reason`. Only the first reason counts. */
+  #stopCollecting(reason: Error): void {
+    this.#stopReason ??= reason;
     this.#wake();
   }
 }
 
-/** Throws RefusedError unless the run asks for CartPole as it is: nothing here changes pixels or actions. */
-function checkPlayable(spec: EnvironmentSpec): void {
+/** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
+function checkSupported(spec: link.EnvironmentSpec): void {
   const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
-  const plain = !(action_table || no_reward_limit || crop || grey || resize || Object.keys(kwargs).length);
-  if (id !== ID || !plain || action_repeat !== 1 || frame_stack !== 1) {
-    throw new RefusedError(`the run asks for ${id}, or for more than this actor can do to it: it plays ${ID} as it is`);
-  }
+  const settings = {
+    id: id !== ID,
+    kwargs: Object.keys(kwargs).length > 0,
+    action_repeat: action_repeat !== 1,
+    frame_stack: frame_stack !== 1,
+    ...{ action_table, no_reward_limit, crop, grey, resize },
+  };
+  const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
+  if (unsupported.length === 0) return;
+  throw new RefusedError(
+    `the run's environment ${id} has unsupported settings (${unsupported.join(", ")}): ` +
+      `this actor supports only ${ID} without kwargs and transforms; use a Python actor`,
+  );
 }
 
-/** The weights of a snapshot, by the names of the program's inputs. */
+/** Return the weights of a snapshot by the names of the program's inputs. */
 function weightsOf(snapshot: Message): Message["arrays"] {
   const weights = Object.entries(snapshot.arrays).map(([name, array]) => [name.replace(/^weights\//, ""), array]);
   return Object.fromEntries(weights);

@@ -1,6 +1,6 @@
 /**
- * The client's end of `daedalus bridge`: queries, followed keys and presence over one TCP connection, as docs/wire.md
- * has them. This file knows no message.
+ * Client of `daedalus bridge`: queries, subscriptions and presence over one TCP connection. docs/wire.md specifies the
+ * packets. This file does not know the messages in their payloads.
  */
 
 import { connect, type Socket } from "node:net";
@@ -8,35 +8,38 @@ import { connect, type Socket } from "node:net";
 const GREETING = Buffer.from("DBR1");
 const HEADER_BYTES = 12;
 const MAX_PAYLOAD_BYTES = 2 ** 30;
-const [QUERY, FOLLOW, ANNOUNCE, WATCH, ANSWER, END, NEWS, PRESENT, ABSENT, ERROR] = Array.from({ length: 10 }, (_, i) => i + 1);
+const [QUERY, FOLLOW, ANNOUNCE, WATCH, ANSWER, END, NEWS, PRESENT, ABSENT, ERROR] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10];
 
-/** The connection is no more, or could not be made; the message says why. */
+/** The connection could not be opened, or has ended; the message states the reason. */
 export class BridgeError extends Error {}
 
-interface Question {
+interface PendingQuery {
   answers: Buffer[];
   resolve: (answers: Buffer[]) => void;
   reject: (error: Error) => void;
 }
 
+/** One connection to a bridge. */
 export class Bridge {
   readonly #socket: Socket;
-  readonly #questions = new Map<number, Question>();
+  readonly #queries = new Map<number, PendingQuery>(); // this and the next two by packet number
   readonly #follows = new Map<number, (value: Buffer) => void>();
   readonly #watches = new Map<number, (key: string, present: boolean) => void>();
-  #number = 0;
-  #received: Buffer[] = [];
+  #number = 0; // of the last packet sent
+  #received: Buffer[] = []; // not parsed yet
   #receivedBytes = 0;
-  #awaitedBytes = GREETING.length; // no use to look before so many are there
+  #neededBytes = GREETING.length; // received bytes before which parsing cannot succeed
   #greeted = false;
   #failure?: BridgeError;
 
-  /** Connects to a bridge; throws BridgeError if none is there. */
+  /** Connect to a bridge. Throws BridgeError if the connection cannot be opened. */
   static async open(host: string, port: number): Promise<Bridge> {
     const socket = connect({ host, port, noDelay: true });
     await new Promise<void>((resolve, reject) => {
       socket.once("connect", resolve);
-      socket.once("error", (error) => reject(new BridgeError(`no bridge at ${host}:${port}: ${error.message}`)));
+      socket.once("error", (error) =>
+        reject(new BridgeError(`cannot connect to the bridge at ${host}:${port}: ${error.message}`)),
+      );
     });
     return new Bridge(socket);
   }
@@ -45,39 +48,40 @@ export class Bridge {
     this.#socket = socket;
     socket.removeAllListeners("error");
     socket.on("data", (data) => this.#onData(data));
-    socket.on("error", (error) => this.#fail(error.message));
+    socket.on("error", (error) => this.#fail(`the connection to the bridge failed: ${error.message}`));
     socket.on("close", () => this.#fail("the bridge closed the connection"));
     socket.write(GREETING);
   }
 
-  /** Every answer to a query within `seconds`; none if nobody serves the key. */
-  ask(key: string, payload: Uint8Array = new Uint8Array(), seconds = 5): Promise<Buffer[]> {
+  /** Return every answer to a query that arrives within `seconds`. The list is empty if no process serves the key. */
+  query(key: string, payload: Uint8Array = new Uint8Array(), seconds = 5): Promise<Buffer[]> {
     if (this.#failure) return Promise.reject(this.#failure);
     return new Promise((resolve, reject) => {
-      this.#questions.set(this.#send(QUERY, key, payload, seconds), { answers: [], resolve, reject });
+      this.#queries.set(this.#send(QUERY, key, payload, seconds), { answers: [], resolve, reject });
     });
   }
 
-  /** Calls `onNews` with what is published under a key; the newest only, where it comes faster than it is taken. */
+  /** Subscribe to a key: `onNews` receives the published values. A slow reader may receive only the newest. */
   follow(key: string, onNews: (value: Buffer) => void): void {
     this.#follows.set(this.#send(FOLLOW, key), onNews);
   }
 
-  /** Is present under a key for as long as the connection lasts. */
+  /** Declare presence under a key until the connection ends. */
   announce(key: string): void {
     this.#send(ANNOUNCE, key);
   }
 
-  /** Calls `onChange` for all who are present under a key, and whenever somebody comes or goes. */
+  /** Watch presence under a key. `onChange` is called for each key that is present already, and for each change. */
   watch(key: string, onChange: (key: string, present: boolean) => void): void {
     this.#watches.set(this.#send(WATCH, key), onChange);
   }
 
-  /** Ends the connection, and all that was declared over it. */
+  /** Close the connection. Its queries, subscriptions and presence end with it. */
   close(): void {
-    this.#fail("closed");
+    this.#fail("the actor closed the connection");
   }
 
+  /** Send one packet and return its number. */
   #send(kind: number, key: string, payload: Uint8Array = new Uint8Array(), seconds = 0): number {
     this.#number = (this.#number + 1) >>> 0;
     const header = Buffer.alloc(HEADER_BYTES);
@@ -93,53 +97,58 @@ export class Bridge {
   #onData(data: Buffer): void {
     this.#received.push(data);
     this.#receivedBytes += data.length;
-    while (!this.#failure && this.#receivedBytes >= this.#awaitedBytes) {
-      // Joined only when a whole packet is there, so a large one is copied once.
+    while (!this.#failure && this.#receivedBytes >= this.#neededBytes) {
+      // Concatenate only when a whole packet has arrived, so that a large packet is copied once.
       const bytes = this.#received.length === 1 ? this.#received[0] : Buffer.concat(this.#received);
-      const used = this.#take(bytes);
+      const used = this.#parse(bytes);
       this.#received = [bytes.subarray(used)];
       this.#receivedBytes = bytes.length - used;
     }
   }
 
-  /** Takes what stands at the start of `bytes` if it is whole; how many bytes that were. */
-  #take(bytes: Buffer): number {
+  /** Process the greeting or packet at the start of `bytes`. Return its length, or 0 if it is incomplete. */
+  #parse(bytes: Buffer): number {
     if (!this.#greeted) {
-      if (!bytes.subarray(0, GREETING.length).equals(GREETING)) this.#fail("no bridge of ours answers there");
+      if (!bytes.subarray(0, GREETING.length).equals(GREETING)) {
+        this.#fail("the server at this address is not a bridge of this protocol: check --bridge");
+      }
       this.#greeted = true;
-      this.#awaitedBytes = HEADER_BYTES;
+      this.#neededBytes = HEADER_BYTES;
       return GREETING.length;
     }
     const payloadBytes = bytes.readUInt32LE(0);
     const keyEnd = HEADER_BYTES + bytes.readUInt8(5);
-    if (payloadBytes > MAX_PAYLOAD_BYTES) this.#fail(`a payload of ${payloadBytes} bytes`);
-    this.#awaitedBytes = keyEnd + payloadBytes;
-    if (bytes.length < this.#awaitedBytes) return 0;
-    const used = this.#awaitedBytes;
-    this.#awaitedBytes = HEADER_BYTES;
+    if (payloadBytes > MAX_PAYLOAD_BYTES) {
+      this.#fail(`the bridge sent a payload of ${payloadBytes} bytes, the limit is ${MAX_PAYLOAD_BYTES}`);
+    }
+    this.#neededBytes = keyEnd + payloadBytes;
+    if (bytes.length < this.#neededBytes) return 0;
+    const used = this.#neededBytes;
+    this.#neededBytes = HEADER_BYTES;
     const key = bytes.toString("ascii", HEADER_BYTES, keyEnd);
-    this.#onParcel(bytes.readUInt8(4), bytes.readUInt32LE(8), key, bytes.subarray(keyEnd, used));
+    this.#onPacket(bytes.readUInt8(4), bytes.readUInt32LE(8), key, bytes.subarray(keyEnd, used));
     return used;
   }
 
-  #onParcel(kind: number, number: number, key: string, payload: Buffer): void {
-    if (kind === ANSWER) this.#questions.get(number)?.answers.push(payload);
+  #onPacket(kind: number, number: number, key: string, payload: Buffer): void {
+    if (kind === ANSWER) this.#queries.get(number)?.answers.push(payload);
     else if (kind === NEWS) this.#follows.get(number)?.(payload);
     else if (kind === PRESENT || kind === ABSENT) this.#watches.get(number)?.(key, kind === PRESENT);
     else if (kind === ERROR) this.#fail(payload.toString());
     else if (kind === END) {
-      const question = this.#questions.get(number);
-      this.#questions.delete(number);
-      question?.resolve(question.answers);
-    } else this.#fail(`a packet of kind ${kind}`);
+      const pending = this.#queries.get(number);
+      this.#queries.delete(number);
+      pending?.resolve(pending.answers);
+    } else this.#fail(`the bridge sent a packet of unknown kind ${kind}`);
   }
 
+  /** End the connection and reject all pending queries. Only the first call has an effect. */
   #fail(reason: string): void {
     if (this.#failure) return;
     this.#failure = new BridgeError(reason);
     this.#socket.destroy();
-    for (const question of this.#questions.values()) question.reject(this.#failure);
-    this.#questions.clear();
+    for (const pending of this.#queries.values()) pending.reject(this.#failure);
+    this.#queries.clear();
     this.onClosed?.(this.#failure);
   }
 

@@ -1,8 +1,6 @@
 /**
- * CartPole: a pole on a cart, balanced by pushing the cart left or right. Barto, Sutton & Anderson (1983), with the
+ * CartPole: an agent pushes a cart left or right to balance a pole on it. Barto, Sutton & Anderson (1983), with the
  * constants, limits and rewards of gymnasium's CartPole-v1.
- *
- * E of them, reset by the NEXT_STEP rule: the step after an episode's end ignores its action and only resets.
  */
 
 export const ID = "CartPole-v1";
@@ -10,31 +8,36 @@ export const SPACES = {
   observation: { kind: "array", shape: [4], dtype: "float32", frames: 1 },
   action: { kind: "discrete", count: 2 },
 };
-export const SIZE = 4; // numbers in an observation: position, velocity, angle, angular velocity
+export const SIZE = 4; // of an observation: position, velocity, angle, angular velocity
 
 const GRAVITY = 9.8;
 const POLE_MASS = 0.1;
 const TOTAL_MASS = 1.0 + POLE_MASS;
 const POLE_HALF_LENGTH = 0.5;
 const FORCE = 10.0;
-const SECONDS = 0.02; // of a step
-const MAX_ANGLE = (12 * 2 * Math.PI) / 360;
+const STEP_SECONDS = 0.02;
+const MAX_ANGLE = (12 * 2 * Math.PI) / 360; // 12 degrees, in radians
 const MAX_POSITION = 2.4;
 const MAX_STEPS = 500;
 
+/** Outcome of one step of E environments. */
 export interface Step {
   rewards: Float32Array; // [E]
   terminated: Uint8Array; // [E]
   truncated: Uint8Array; // [E]
 }
 
-export class CartPoles {
-  readonly count: number;
-  readonly #random: () => number;
-  readonly #maxSteps: number;
+/**
+ * E environments, reset by gymnasium's NEXT_STEP rule: the step after the end of an episode ignores its action and only
+ * resets.
+ */
+export class VectorCartPole {
+  readonly count: number; // E
+  readonly #random: () => number; // uniform in [0, 1)
+  readonly #maxSteps: number; // of an episode
   readonly #state: Float64Array; // [E, 4]
-  readonly #steps: Int32Array; // [E] of the episode
-  readonly #ended: Uint8Array; // [E] whether the last step ended its episode
+  readonly #steps: Int32Array; // [E] taken in the running episode
+  readonly #ended: Uint8Array; // [E] whether the last step ended the episode
 
   constructor(count: number, random: () => number, maxSteps = MAX_STEPS) {
     this.count = count;
@@ -46,12 +49,12 @@ export class CartPoles {
     for (let e = 0; e < count; e++) this.#reset(e);
   }
 
-  /** [E, 4] what is seen now. */
+  /** The current observations [E, 4]. */
   get observations(): Float32Array {
     return Float32Array.from(this.#state);
   }
 
-  /** One step of each under its action [E]. */
+  /** Step every environment with its action [E]: 1 pushes right, any other left. */
   step(actions: ArrayLike<number>): Step {
     const step = {
       rewards: new Float32Array(this.count),
@@ -79,19 +82,20 @@ export class CartPoles {
     this.#ended[e] = 0;
   }
 
+  /** Integrate the equations of motion over one step, by Euler's method. */
   #move(e: number, force: number): void {
     const state = this.#state.subarray(e * SIZE, (e + 1) * SIZE);
-    const [position, velocity, angle, spin] = state;
+    const [position, velocity, angle, angularVelocity] = state;
     const [sine, cosine] = [Math.sin(angle), Math.cos(angle)];
-    const push = (force + POLE_MASS * POLE_HALF_LENGTH * spin ** 2 * sine) / TOTAL_MASS;
-    const angular =
+    const push = (force + POLE_MASS * POLE_HALF_LENGTH * angularVelocity ** 2 * sine) / TOTAL_MASS;
+    const angularAcceleration =
       (GRAVITY * sine - cosine * push) / (POLE_HALF_LENGTH * (4 / 3 - (POLE_MASS * cosine ** 2) / TOTAL_MASS));
-    const linear = push - (POLE_MASS * POLE_HALF_LENGTH * angular * cosine) / TOTAL_MASS;
+    const acceleration = push - (POLE_MASS * POLE_HALF_LENGTH * angularAcceleration * cosine) / TOTAL_MASS;
     state.set([
-      position + SECONDS * velocity,
-      velocity + SECONDS * linear,
-      angle + SECONDS * spin,
-      spin + SECONDS * angular,
+      position + STEP_SECONDS * velocity,
+      velocity + STEP_SECONDS * acceleration,
+      angle + STEP_SECONDS * angularVelocity,
+      angularVelocity + STEP_SECONDS * angularAcceleration,
     ]);
   }
 }

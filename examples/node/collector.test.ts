@@ -1,44 +1,44 @@
-/** What is played and what is gathered of it, without a learner. */
+/** Tests of the environments, the collector and the sampling, without a learner. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { CartPoles, SIZE } from "./cartpole.ts";
+import { SIZE, VectorCartPole } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
-import { type Acting, sample } from "./policy.ts";
+import { type BehaviourPolicy, sample } from "./policy.ts";
 import { seeded } from "./random.ts";
 
-const AS_IT_IS = { clip: null, scale: 1, bootstrap_terminations: false };
+const UNCHANGED = { reward_clip: null, reward_scale: 1, bootstrap_terminations: false };
 
-/** Always pushes right, and remembers how many rows of its episode it has seen. */
-const pusher: Acting = {
+/** A policy that always pushes right. Its state counts the rows of the episode. */
+const pusher: BehaviourPolicy = {
   stateSize: 1,
   async act(observations, _shape, state) {
     const rows = observations.length / SIZE;
     return {
       actions: new Uint8Array(rows).fill(1),
       logProbs: new Float32Array(rows),
-      state: state.map((seen) => seen + 1),
+      state: state.map((count) => count + 1),
     };
   },
 };
 
-test("the cart moves as gymnasium's does", () => {
-  const carts = new CartPoles(1, () => 0.5); // starts at rest
-  for (const action of [1, 1, 0, 1, 1, 1, 1, 1]) assert.equal(carts.step([action]).terminated[0], 0);
-  // From gymnasium 1.4: CartPole-v1 at rest, under the same actions.
+test("the environment moves as gymnasium's CartPole-v1", () => {
+  const environments = new VectorCartPole(1, () => 0.5); // the initial state is zero
+  for (const action of [1, 1, 0, 1, 1, 1, 1, 1]) assert.equal(environments.step([action]).terminated[0], 0);
+  // From CartPole-v1 of gymnasium 1.4, with the same initial state and actions.
   const expected = [0.07032239331784457, 1.1733332604275875, -0.10718632601076401, -1.8208258223678069];
-  carts.observations.forEach((number, i) => assert.ok(Math.abs(number - expected[i]) < 1e-6));
+  environments.observations.forEach((number, i) => assert.ok(Math.abs(number - expected[i]) < 1e-6));
 });
 
-test("an episode that lasts is cut at its limit", () => {
-  const carts = new CartPoles(1, () => 0.5, 3);
-  const cut = [1, 0, 1].map((action) => carts.step([action]).truncated[0]);
-  assert.deepEqual(cut, [0, 0, 1]);
+test("an episode is truncated at its limit of steps", () => {
+  const environments = new VectorCartPole(1, () => 0.5, 3);
+  const truncated = [1, 0, 1].map((action) => environments.step([action]).truncated[0]);
+  assert.deepEqual(truncated, [0, 0, 1]);
 });
 
-test("the row after an episode's end only resets, and nothing is remembered beyond it", async () => {
+test("the row after an episode's end only resets, and clears the state of the memory", async () => {
   const [rows, count] = [64, 3];
-  const collector = new Collector(new CartPoles(count, seeded(1)), pusher, AS_IT_IS, rows, seeded(2));
+  const collector = new Collector(new VectorCartPole(count, seeded(1)), pusher, UNCHANGED, rows, seeded(2));
   const first = await collector.collect({}, 0);
   const second = await collector.collect({}, 0);
   const of = (name: string) => [...first.arrays[name].data, ...second.arrays[name].data] as number[];
@@ -59,9 +59,9 @@ test("the row after an episode's end only resets, and nothing is remembered beyo
   assert.ok(ends.length > 2 * count);
   assert.deepEqual([...lengths].sort(), [...ends].sort());
   assert.deepEqual(returns, lengths);
-  // The second rollout begins where the first ended, with what was remembered since the last reset.
-  const tail = first.arrays.frames.data.slice(rows * count * SIZE);
-  assert.deepEqual(second.arrays.frames.data.slice(0, count * SIZE), tail);
+  // The second rollout begins with the last frame of the first, and with the state since the last reset.
+  const lastFrame = first.arrays.frames.data.slice(rows * count * SIZE);
+  assert.deepEqual(second.arrays.frames.data.slice(0, count * SIZE), lastFrame);
   for (let e = 0; e < count; e++) {
     let since = 0;
     for (let row = 0; row < rows; row++) since = valid[row * count + e] ? since + 1 : 0;
@@ -69,9 +69,9 @@ test("the row after an episode's end only resets, and nothing is remembered beyo
   }
 });
 
-test("learning's rewards and ends are not the true ones where the run says so", async () => {
-  const shaping = { clip: 0.5, scale: 0.5, bootstrap_terminations: true };
-  const collector = new Collector(new CartPoles(2, seeded(1)), pusher, shaping, 64, seeded(2));
+test("a rollout has clipped and scaled rewards and bootstraps terminations if the run requires it", async () => {
+  const settings = { reward_clip: 0.5, reward_scale: 0.5, bootstrap_terminations: true };
+  const collector = new Collector(new VectorCartPole(2, seeded(1)), pusher, settings, 64, seeded(2));
   const { arrays } = await collector.collect({}, 0);
   assert.deepEqual(new Set(arrays.rewards.data as Float32Array), new Set([0.25, 0]));
   assert.ok(!(arrays.terminated.data as Uint8Array).includes(1));

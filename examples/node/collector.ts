@@ -1,33 +1,46 @@
-/** Plays the policy in the environments and gathers rollouts. No connection. */
+/** Rollouts from environments and a policy. No network. */
 
-import { type CartPoles, SIZE } from "./cartpole.ts";
-import type { Acting } from "./policy.ts";
+import { SIZE, type VectorCartPole } from "./cartpole.ts";
+import type { BehaviourPolicy } from "./policy.ts";
 import type { Message } from "./wire.ts";
 
-/** What learning does to rewards and ends, from the run's specification. */
-export interface Shaping {
-  clip: number | null;
-  scale: number;
-  bootstrap_terminations: boolean; // a terminated episode counts as cut
+/** How a rollout records rewards and ends of episodes for training, from the run's specification. */
+export interface OutcomeSettings {
+  reward_clip: number | null; // clip rewards to +- this value; null: do not clip
+  reward_scale: number; // multiply the clipped rewards by this value
+  bootstrap_terminations: boolean; // mark terminated rows as truncated
 }
 
-export class Collector {
-  readonly #environments: CartPoles;
-  readonly #policy: Acting;
-  readonly #shaping: Shaping;
-  readonly #length: number; // T
-  readonly #random: () => number;
-  readonly #returns: Float64Array; // [E] of the running episodes
-  readonly #lengths: Int32Array; // [E]
-  #state: Float32Array<ArrayBufferLike>; // [E, S] the policy's memory
-  #ended: Uint8Array; // [E] whether the last row ended an episode: the next one only resets
+/** Returns and lengths of episodes that ended, in the same order. */
+interface FinishedEpisodes {
+  returns: number[];
+  lengths: number[];
+}
 
-  constructor(environments: CartPoles, policy: Acting, shaping: Shaping, rolloutLength: number, random: () => number) {
+/** The state that E environments carry from rollout to rollout. */
+export class Collector {
+  readonly #environments: VectorCartPole;
+  readonly #policy: BehaviourPolicy;
+  readonly #settings: OutcomeSettings;
+  readonly #rolloutLength: number; // T
+  readonly #random: () => number; // uniform in [0, 1)
+  readonly #returns: Float64Array; // [E] true returns of the running episodes
+  readonly #lengths: Int32Array; // [E] valid rows of the running episodes
+  #state: Float32Array<ArrayBufferLike>; // [E, S] state of the policy's memory
+  #ended: Uint8Array; // [E] whether the last row ended an episode: the next row only resets
+
+  constructor(
+    environments: VectorCartPole,
+    policy: BehaviourPolicy,
+    settings: OutcomeSettings,
+    rolloutLength: number,
+    random: () => number,
+  ) {
     const count = environments.count;
     this.#environments = environments;
     this.#policy = policy;
-    this.#shaping = shaping;
-    this.#length = rolloutLength;
+    this.#settings = settings;
+    this.#rolloutLength = rolloutLength;
     this.#random = random;
     this.#returns = new Float64Array(count);
     this.#lengths = new Int32Array(count);
@@ -35,62 +48,62 @@ export class Collector {
     this.#ended = new Uint8Array(count);
   }
 
-  /** T rows more under the weights bound last, as a Rollout. */
+  /** Collect the next T rows under the weights that the policy holds, and return them as a Rollout message. */
   async collect(identity: Record<string, unknown>, policyVersion: unknown): Promise<Message> {
-    const [rows, count] = [this.#length, this.#environments.count];
+    const [rows, count] = [this.#rolloutLength, this.#environments.count];
     const frames = new Float32Array((rows + 1) * count * SIZE); // [T+1, E, 4]; row T bootstraps
-    const actions = new Uint8Array(rows * count); // this and all below [T, E]
+    const actions = new Uint8Array(rows * count); // this and the next five [T, E]
     const logProbs = new Float32Array(rows * count);
     const rewards = new Float32Array(rows * count);
     const terminated = new Uint8Array(rows * count);
     const truncated = new Uint8Array(rows * count);
     const valid = new Uint8Array(rows * count);
-    const finished: { returns: number[]; lengths: number[] } = { returns: [], lengths: [] };
+    const finished: FinishedEpisodes = { returns: [], lengths: [] };
     const initialState = this.#state.slice();
     frames.set(this.#environments.observations);
     for (let row = 0; row < rows; row++) {
-      const at = row * count;
-      const seen = frames.subarray(at * SIZE, (at + count) * SIZE);
-      const acted = await this.#policy.act(seen, [SIZE], this.#state, this.#random);
+      const start = row * count;
+      const observations = frames.subarray(start * SIZE, (start + count) * SIZE);
+      const acted = await this.#policy.act(observations, [SIZE], this.#state, this.#random);
       const step = this.#environments.step(acted.actions);
-      valid.set(this.#ended.map((ended) => 1 - ended), at);
-      this.#count(step.rewards, step.terminated, step.truncated, finished);
-      frames.set(this.#environments.observations, (at + count) * SIZE);
-      actions.set(acted.actions, at);
-      logProbs.set(acted.logProbs, at);
-      rewards.set(step.rewards.map((reward) => this.#shape(reward)), at);
-      const { bootstrap_terminations } = this.#shaping; // then no end is a loss
-      terminated.set(bootstrap_terminations ? new Uint8Array(count) : step.terminated, at);
-      truncated.set(bootstrap_terminations ? this.#ended : step.truncated, at);
-      // The row after one that only reset is the first of its episode: nothing before it is remembered.
+      valid.set(this.#ended.map((ended) => 1 - ended), start);
+      this.#countEpisodes(step.rewards, step.terminated, step.truncated, finished);
+      frames.set(this.#environments.observations, (start + count) * SIZE);
+      actions.set(acted.actions, start);
+      logProbs.set(acted.logProbs, start);
+      rewards.set(step.rewards.map((reward) => this.#clipAndScale(reward)), start);
+      const { bootstrap_terminations } = this.#settings;
+      terminated.set(bootstrap_terminations ? new Uint8Array(count) : step.terminated, start);
+      truncated.set(bootstrap_terminations ? this.#ended : step.truncated, start);
+      // A row that only resets precedes the first row of an episode, which must begin with a zero state.
       const size = this.#policy.stateSize;
-      this.#state = acted.state.map((number, i) => number * valid[at + Math.floor(i / size)]);
+      this.#state = acted.state.map((number, i) => number * valid[start + Math.floor(i / size)]);
     }
-    const cells = [rows, count];
+    const shape = [rows, count];
     return {
       kind: "Rollout",
       fields: { identity, policy_version: policyVersion },
       arrays: {
         frames: { dtype: "<f4", shape: [rows + 1, count, SIZE], data: frames },
         initial_state: { dtype: "<f4", shape: [count, this.#policy.stateSize], data: initialState },
-        actions: { dtype: "|u1", shape: cells, data: actions },
-        behaviour_log_probs: { dtype: "<f4", shape: cells, data: logProbs },
-        rewards: { dtype: "<f4", shape: cells, data: rewards },
-        terminated: { dtype: "|b1", shape: cells, data: terminated },
-        truncated: { dtype: "|b1", shape: cells, data: truncated },
-        valid: { dtype: "|b1", shape: cells, data: valid },
+        actions: { dtype: "|u1", shape, data: actions },
+        behaviour_log_probs: { dtype: "<f4", shape, data: logProbs },
+        rewards: { dtype: "<f4", shape, data: rewards },
+        terminated: { dtype: "|b1", shape, data: terminated },
+        truncated: { dtype: "|b1", shape, data: truncated },
+        valid: { dtype: "|b1", shape, data: valid },
         episode_returns: { dtype: "<f4", shape: [finished.returns.length], data: Float32Array.from(finished.returns) },
         episode_lengths: { dtype: "<i4", shape: [finished.lengths.length], data: Int32Array.from(finished.lengths) },
       },
     };
   }
 
-  /** Follows the running episodes; those that end in this row are appended to `finished`, with their true returns. */
-  #count(
+  /** Count one row of unscaled rewards in the running episodes. Append the episodes that end in it to `finished`. */
+  #countEpisodes(
     rewards: Float32Array,
     terminated: Uint8Array,
     truncated: Uint8Array,
-    finished: { returns: number[]; lengths: number[] },
+    finished: FinishedEpisodes,
   ): void {
     for (let e = 0; e < rewards.length; e++) {
       this.#returns[e] += rewards[e];
@@ -103,8 +116,8 @@ export class Collector {
     }
   }
 
-  #shape(reward: number): number {
-    const { clip, scale } = this.#shaping;
-    return scale * (clip === null ? reward : Math.max(-clip, Math.min(clip, reward)));
+  #clipAndScale(reward: number): number {
+    const { reward_clip, reward_scale } = this.#settings;
+    return reward_scale * (reward_clip === null ? reward : Math.max(-reward_clip, Math.min(reward_clip, reward)));
   }
 }

@@ -1,8 +1,9 @@
-/** What an actor asks of learners: to be found, to be let in, for programs and snapshots. No state. */
+/** The queries of an actor to learners: join and program. Functions without state. */
 
 import type { Bridge } from "./bridge.ts";
-import { decodeWhole, encode, type Message } from "./wire.ts";
+import { encode, type Message, tryDecode } from "./wire.ts";
 
+/** `environment` of the run's specification, except the settings that concern only the Python actor. */
 export interface EnvironmentSpec {
   id: string;
   kwargs: Record<string, unknown>;
@@ -19,7 +20,7 @@ export interface EnvironmentSpec {
   bootstrap_terminations: boolean;
 }
 
-/** What the answer to a Join holds, as far as this actor needs it. */
+/** The fields of a Welcome that this actor uses. */
 export interface Welcome {
   run: string;
   learner_epoch: number | bigint;
@@ -31,21 +32,24 @@ export interface Welcome {
   };
 }
 
-/** The actor cannot take part; the message says why. */
+/** The actor cannot take part; the message states the reason. */
 export class RefusedError extends Error {}
 
-/** Another actor of that name takes part, or did a moment ago. */
+/** Another actor of the same name takes part, or did a moment ago. */
 export class NameTakenError extends RefusedError {}
 
-/** The run is over, or the actor was told to stop; the message says which. */
+/** The run ended, or the actor was asked to stop; the message states which. */
 export class RunOverError extends Error {}
 
-/** The learner went away, or lives another life; join again. */
+/** The learner left, or another learner epoch began; join again. */
 export class LearnerLostError extends Error {}
 
-/** Asks to take part in a run, `*` for any. */
+/**
+ * Send one request to join `run` (`*`: any run) and return the answer. Throws LearnerLostError without an answer, and
+ * RefusedError or RunOverError if a learner refuses.
+ */
 export async function join(bridge: Bridge, run: string, fields: Message["fields"]): Promise<Welcome> {
-  const answers = await ask(bridge, `daedalus/${run}/join`, encode({ kind: "Join", fields, arrays: {} }));
+  const answers = await query(bridge, `daedalus/${run}/join`, encode({ kind: "Join", fields, arrays: {} }));
   const welcomes = answers.filter((answer) => answer.kind === "Welcome");
   if (welcomes.length > 1) throw new RefusedError("several learners answer here: choose one with --run");
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
@@ -53,17 +57,18 @@ export async function join(bridge: Bridge, run: string, fields: Message["fields"
   if (refusal?.code === "finished") throw new RunOverError("the run is over");
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);
-  throw new LearnerLostError("no learner answers");
+  throw new LearnerLostError("no learner answers: check that the learner runs and that the bridge connects to it");
 }
 
-/** The ONNX model with that hash. */
+/** Return the ONNX model with a hash. Throws LearnerLostError if no learner has it. */
 export async function program(bridge: Bridge, run: string, hash: string): Promise<Uint8Array> {
-  for (const answer of await ask(bridge, `daedalus/${run}/program/${hash}`)) {
+  for (const answer of await query(bridge, `daedalus/${run}/program/${hash}`)) {
     if (answer.kind === "Program") return answer.arrays.model.data as Uint8Array;
   }
-  throw new LearnerLostError("nobody has the program");
+  throw new LearnerLostError(`no learner has the program ${hash}`);
 }
 
-async function ask(bridge: Bridge, key: string, payload?: Uint8Array): Promise<Message[]> {
-  return (await bridge.ask(key, payload)).map(decodeWhole).filter((message) => message !== undefined);
+/** Send a query and return the decoded answers without the damaged ones. */
+async function query(bridge: Bridge, key: string, payload?: Uint8Array): Promise<Message[]> {
+  return (await bridge.query(key, payload)).map(tryDecode).filter((message) => message !== undefined);
 }

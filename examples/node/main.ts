@@ -1,4 +1,4 @@
-/** `node main.ts --help`. Exit status: 0 the run is over or told to stop, 1 failed, 2 bad usage. */
+/** The command line of the actor: see `node main.ts --help`. */
 
 import { randomBytes } from "node:crypto";
 import { parseArgs } from "node:util";
@@ -10,17 +10,20 @@ import { ProtocolError } from "./wire.ts";
 const USAGE = `\
 usage: node main.ts [--bridge HOST:PORT] [--run NAME] [--name NAME] [--envs E]
 
-Plays CartPole for a learner, by way of \`daedalus bridge\`.
+Collect rollouts of CartPole for a learner, through \`daedalus bridge\`.
 
-  --bridge HOST:PORT  where the bridge listens (default: 127.0.0.1:7448)
-  --run NAME          which run to join, where several share a network
-  --name NAME         this actor's name, the same after a restart (default: node-PID)
-  --envs E            environments to step together (default: what the learner asks for)`;
+  --bridge HOST:PORT  address of the bridge (default: 127.0.0.1:7448)
+  --run NAME          the run to join; required if several learners share a network
+  --name NAME         name of this actor, the same after a restart (default: node-PID)
+  --envs E            number of environments (default: the learner's envs_per_actor)
+
+exit status: 0 the run is over or a signal arrived, 1 failed, 2 bad usage`;
 
 const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$/;
+const NAME_RULE = "must have 1 to 64 letters, digits, '.', '_' or '-', and start with a letter or a digit";
 
-/** The checked configuration, or undefined if only help was asked for; throws with what is wrong. */
-function config(): ActorConfig | undefined {
+/** Return the checked configuration, or undefined after --help. Throws TypeError for an invalid option. */
+function parseOptions(): ActorConfig | undefined {
   const { values } = parseArgs({
     options: {
       bridge: { type: "string", default: "127.0.0.1:7448" },
@@ -33,8 +36,8 @@ function config(): ActorConfig | undefined {
   if (values.help) return undefined;
   const [, host, port] = values.bridge.match(/^(.+):(\d{1,5})$/) ?? [];
   if (!host || Number(port) > 65535) throw new TypeError(`--bridge must be HOST:PORT, not ${values.bridge}`);
-  if (!NAME.test(values.name)) throw new TypeError(`--name ${values.name} must be letters, digits, '.', '_' or '-'`);
-  if (values.run !== "*" && !NAME.test(values.run)) throw new TypeError(`--run ${values.run} is no name`);
+  if (!NAME.test(values.name)) throw new TypeError(`--name ${NAME_RULE}, not ${values.name}`);
+  if (values.run !== "*" && !NAME.test(values.run)) throw new TypeError(`--run ${NAME_RULE}, not ${values.run}`);
   const environments = values.envs === undefined ? undefined : Number(values.envs);
   if (environments !== undefined && !(Number.isInteger(environments) && environments >= 1 && environments <= 4096)) {
     throw new TypeError(`--envs must be from 1 to 4096, not ${values.envs}`);
@@ -44,19 +47,19 @@ function config(): ActorConfig | undefined {
 }
 
 async function main(): Promise<number> {
-  let chosen: ActorConfig | undefined;
+  let config: ActorConfig | undefined;
   try {
-    chosen = config();
+    config = parseOptions();
   } catch (error) {
     console.error(`node actor: ${(error as Error).message}`);
     return 2;
   }
-  if (!chosen) {
+  if (!config) {
     console.log(USAGE);
     return 0;
   }
-  const { name } = chosen;
-  const actor = new Actor(chosen, (text) => console.log(`actor ${name}: ${text}`));
+  const { name } = config;
+  const actor = new Actor(config, (text) => console.log(`actor ${name}: ${text}`));
   for (const signal of ["SIGTERM", "SIGINT"] as const) process.once(signal, () => actor.stop());
   try {
     await actor.run();

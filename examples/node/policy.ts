@@ -1,39 +1,42 @@
-/** Runs the learner's ONNX program with the weights of a snapshot. This file knows no connection and no environment. */
+/** The learner's ONNX program with the weights of a snapshot. No network, no environments. */
 
 import { createHash } from "node:crypto";
 import { InferenceSession, Tensor } from "onnxruntime-node";
 import type { WireArray } from "./wire.ts";
 
-/** A program or weights that do not fit together, or not the environment. */
+/** This actor cannot use the program or the weights. */
 export class PolicyError extends Error {}
 
-export interface Acted {
+/** Sampled actions of one row. */
+export interface SampledRow {
   actions: Uint8Array; // [E]
-  logProbs: Float32Array; // [E]
-  state: Float32Array; // [E, S] the policy's memory for the next row
+  logProbs: Float32Array; // [E] log-probabilities of the actions
+  state: Float32Array; // [E, S] input of the next row
 }
 
-/** What the collector needs of a policy. */
-export interface Acting {
-  readonly stateSize: number; // S, how many numbers it remembers from row to row; 0 for most
+/** Interface of a policy that a collector uses. */
+export interface BehaviourPolicy {
+  readonly stateSize: number; // S; 0 without a memory
 
-  /** One sampled action for each of the observations [E, ...shape] under the memory `state` [E, S]. */
-  act(observations: Float32Array, shape: number[], state: Float32Array, random: () => number): Promise<Acted>;
+  /** Sample an action for each observation [E, ...shape] with the memory's state [E, S]. */
+  act(observations: Float32Array, shape: number[], state: Float32Array, random: () => number): Promise<SampledRow>;
 }
 
-export class Policy implements Acting {
+/** A program in onnxruntime, and the weights that it was bound to last. */
+export class Policy implements BehaviourPolicy {
   readonly stateSize: number;
   readonly #session: InferenceSession;
-  readonly #wanted: Map<string, readonly (number | string)[]>; // the shapes of its weights, by name
+  readonly #weightShapes: Map<string, readonly (number | string)[]>; // by input name
   #weights: Record<string, Tensor> = {};
 
-  /** The policy of a program, `name` being the hash that it must have. */
-  static async load(model: Uint8Array, name: string): Promise<Policy> {
-    if (createHash("sha256").update(model).digest("hex") !== name) throw new PolicyError("not the program asked for");
+  /** Load an ONNX model. Throws PolicyError unless `hash` is its SHA-256 and this actor supports the program. */
+  static async load(model: Uint8Array, hash: string): Promise<Policy> {
+    const actual = createHash("sha256").update(model).digest("hex");
+    if (actual !== hash) throw new PolicyError(`the program has the hash ${actual}, but ${hash} was requested`);
     const session = await InferenceSession.create(model, {
       intraOpNumThreads: 1,
       interOpNumThreads: 1,
-      // A model may name files to take weights from. None lie here: whoever sends a program shall not read with it.
+      // A model may name external files for its tensors. The sender must not be able to read files: use no folder.
       extra: { session: { model_external_initializers_file_folder_path: "/dev/null" } },
     });
     return new Policy(session);
@@ -41,33 +44,40 @@ export class Policy implements Acting {
 
   private constructor(session: InferenceSession) {
     this.#session = session;
-    this.#wanted = new Map();
+    this.#weightShapes = new Map();
     let stateSize = 0;
     for (const input of session.inputMetadata) {
-      if (!input.isTensor || input.type !== "float32") throw new PolicyError(`input ${input.name} is no float tensor`);
+      if (!input.isTensor || input.type !== "float32") {
+        throw new PolicyError(`the program's input '${input.name}' must be a float32 tensor`);
+      }
       if (input.name === "state") stateSize = Number(input.shape[1]);
-      else if (input.name !== "observations") this.#wanted.set(input.name, input.shape);
+      else if (input.name !== "observations") this.#weightShapes.set(input.name, input.shape);
     }
     if (!session.inputNames.includes("observations") || session.outputNames[0] !== "logits") {
-      throw new PolicyError("the program does not turn observations into logits");
+      throw new PolicyError("the program must compute 'logits' from 'observations'");
     }
     this.stateSize = stateSize;
   }
 
-  /** Binds a snapshot's weights, by name, for all later calls. */
+  /** Use these weights from the next `act` on. Throws PolicyError if they do not match the program's inputs. */
   bind(weights: Record<string, WireArray>): void {
     const bound: Record<string, Tensor> = {};
-    for (const [name, shape] of this.#wanted) {
+    for (const [name, shape] of this.#weightShapes) {
       const given = weights[name];
       if (given?.dtype !== "<f4" || String(given.shape) !== String(shape)) {
-        throw new PolicyError(`the snapshot has no weights ${name} [${shape}]`);
+        throw new PolicyError(`the snapshot has no float32 weights '${name}' of shape [${shape}]`);
       }
       bound[name] = new Tensor("float32", given.data as Float32Array, given.shape);
     }
     this.#weights = bound;
   }
 
-  async act(observations: Float32Array, shape: number[], state: Float32Array, random: () => number): Promise<Acted> {
+  async act(
+    observations: Float32Array,
+    shape: number[],
+    state: Float32Array,
+    random: () => number,
+  ): Promise<SampledRow> {
     const rows = observations.length / shape.reduce((product, side) => product * side, 1);
     const feeds: Record<string, Tensor> = {
       ...this.#weights,
@@ -80,7 +90,11 @@ export class Policy implements Acting {
   }
 }
 
-/** An action from each softmax policy, logits [E, A], by inverting its cumulative distribution. */
+/**
+ * Sample an action from the softmax of each row of logits [E, A], by inverting the cumulative distribution.
+ *
+ * Returns the actions [E] and their log-probabilities [E].
+ */
 export function sample(logits: Float32Array, rows: number, random: () => number) {
   const choices = logits.length / rows;
   const actions = new Uint8Array(rows);
@@ -92,7 +106,7 @@ export function sample(logits: Float32Array, rows: number, random: () => number)
     const total = weights.reduce((sum, weight) => sum + weight, 0);
     let left = random() * total;
     let action = 0;
-    // The last choice takes what rounding leaves over.
+    // Stop at the last action: because of rounding, the weights may sum to less than `left`.
     while (action < choices - 1 && left >= weights[action]) left -= weights[action++];
     actions[row] = action;
     logProbs[row] = shifted[action] - largest - Math.log(total);

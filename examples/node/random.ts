@@ -1,4 +1,7 @@
-/** Numbers in [0, 1) from a seed: Marsaglia's xorshift over 32 bits, its state stirred once so that seeds differ. */
+/**
+ * Return a generator of uniform numbers in [0, 1): Marsaglia's 32-bit xorshift. The seed is mixed once, so that
+ * neighbouring seeds give different sequences.
+ */
 export function seeded(seed: number): () => number {
   let state = Math.imul((seed >>> 0) ^ 0x9e3779b9, 0x85ebca6b) >>> 0 || 1;
   return () => {

@@ -1,39 +1,40 @@
-/** Rollouts that were collected and not yet answered for good. Sending twice is safe: the learner takes each once. */
+/** Rollouts without a final acknowledgement. They may be sent twice: the learner applies each at most once. */
 
 import { setTimeout as sleep } from "node:timers/promises";
 
-const BUSY_MILLISECONDS = 5; // first wait after a busy answer; doubles
-const LOST_MILLISECONDS = 100; // first wait after no answer at all; doubles
-const MAX_WAIT_MILLISECONDS = 500;
+const BUSY_MILLISECONDS = 5; // delay after the first `busy` answer; doubles
+const NO_ANSWER_MILLISECONDS = 100; // delay after the first attempt without an answer; doubles
+const MAX_DELAY_MILLISECONDS = 500;
 
 export interface Acknowledgement {
   verdict: "accepted" | "busy" | "rejected" | "fenced" | "quarantined" | "finished";
   reason: string;
-  policy_version: number; // the newest
+  policy_version: number; // the newest published version
 }
 
+/** Rollouts in flight and the next sequence number, for one learner epoch. */
 export class Uploader {
   readonly learnerEpoch: number | bigint;
-  readonly pending = new Map<number, Uint8Array>(); // by sequence number
-  readonly #window: number;
-  #sequence = 0;
+  readonly pending = new Map<number, Uint8Array>(); // encoded rollouts by sequence number
+  readonly #window: number; // most rollouts in flight
+  #sequence = 0; // of the next rollout
 
   constructor(learnerEpoch: number | bigint, window: number) {
     this.learnerEpoch = learnerEpoch;
     this.#window = window;
   }
 
-  /** Whether one more may be played, and then sent. */
+  /** Whether one more rollout may be collected and sent. */
   get hasRoom(): boolean {
     return this.pending.size < this.#window;
   }
 
-  /** The sequence number of the next rollout. */
-  next(): number {
+  /** Return the sequence number of the next rollout, and advance it. */
+  nextSequence(): number {
     return this.#sequence++;
   }
 
-  /** Sends one until it is answered for good; `send` may come back without an answer. */
+  /** Send a pending rollout until its final acknowledgement, and return it. `send` returns undefined if none came. */
   async deliver(
     sequence: number,
     send: (rollout: Uint8Array) => Promise<Acknowledgement | undefined>,
@@ -44,8 +45,8 @@ export class Uploader {
         this.pending.delete(sequence);
         return answer;
       }
-      const first = answer ? BUSY_MILLISECONDS : LOST_MILLISECONDS;
-      await sleep(Math.min(first * 2 ** Math.min(attempt, 10), MAX_WAIT_MILLISECONDS));
+      const first = answer ? BUSY_MILLISECONDS : NO_ANSWER_MILLISECONDS;
+      await sleep(Math.min(first * 2 ** Math.min(attempt, 10), MAX_DELAY_MILLISECONDS));
     }
   }
 }

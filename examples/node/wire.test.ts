@@ -1,4 +1,4 @@
-/** The golden messages, shared with the Python suite: read, held against their values, and written again. */
+/** Tests of the encoding with the golden messages, which the Python tests use too. */
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -9,27 +9,27 @@ import { decode, encode, PROTOCOL_VERSION, ProtocolError, type WireArray } from 
 const FOLDER = new URL(`../../tests/protocol/golden/v${PROTOCOL_VERSION}/`, import.meta.url);
 const bytesOf = (name: string) => readFileSync(new URL(`${name}.bin`, FOLDER));
 
-/** Numbers that a double cannot hold become bigints, as in messages. */
-function exactly(_key: string, value: unknown, context?: { source?: string }): unknown {
+/** Reviver for JSON.parse: return integers from 2^32 as bigints, as `decode` does. */
+function reviveIntegers(_key: string, value: unknown, context?: { source?: string }): unknown {
   const whole = typeof value === "number" && /^\d+$/.test(context?.source ?? "");
   return whole && (value as number) >= 2 ** 32 ? BigInt(context!.source!) : value;
 }
 
-const VALUES: Record<string, any> = JSON.parse(readFileSync(new URL("values.json", FOLDER), "utf8"), exactly);
+const VALUES: Record<string, any> = JSON.parse(readFileSync(new URL("values.json", FOLDER), "utf8"), reviveIntegers);
 
-/** The values of an array in the order of its shape. */
+/** Return the values of an array in the order of its shape. */
 function inOrder({ shape, swapped, data }: WireArray): unknown[] {
   if (!swapped) return Array.from(data as ArrayLike<unknown>);
   const [first, second, ...rest] = shape;
   const size = rest.reduce((product, side) => product * side, 1);
   const rows = Array.from({ length: first * second }, (_, i) => {
-    const at = ((i % second) * first + Math.floor(i / second)) * size; // the second axis comes first
+    const at = ((i % second) * first + Math.floor(i / second)) * size; // the second axis is stored first
     return Array.from((data as Uint8Array).subarray(at, at + size));
   });
   return rows.flat();
 }
 
-/** A message with its body decompressed: zstd's own output may differ from release to release. */
+/** Return a message with its body decompressed: zstd's output may differ between releases. */
 function plain(bytes: Buffer): Buffer {
   const end = 12 + bytes.readUInt32LE(8);
   const start = end + (-end & 7);
@@ -37,12 +37,12 @@ function plain(bytes: Buffer): Buffer {
   return Buffer.concat([bytes.subarray(0, start), bytes.readUInt16LE(6) === 1 ? zstdDecompressSync(body) : body]);
 }
 
-test("there are golden messages of this version", () => {
+test("golden messages of this protocol version exist", () => {
   assert.ok(Object.keys(VALUES).length >= 10);
 });
 
 for (const [name, { kind, fields, arrays }] of Object.entries(VALUES)) {
-  test(`${name} holds what was written down`, () => {
+  test(`${name} decodes to its recorded values`, () => {
     const message = decode(bytesOf(name));
     assert.equal(message.kind, kind);
     assert.deepEqual(message.fields, fields);
@@ -54,15 +54,15 @@ for (const [name, { kind, fields, arrays }] of Object.entries(VALUES)) {
     }
   });
 
-  test(`${name} is written again as it was`, () => {
+  test(`${name} is encoded to the same bytes`, () => {
     const message = decode(bytesOf(name));
-    // JavaScript does not tell 50.0 from 50, so what bears such numbers comes back equal in value only.
+    // JavaScript does not distinguish 50.0 from 50: the bytes of messages with such numbers may differ.
     if (kind === "Welcome" || kind === "StatusReport") assert.deepEqual(decode(encode(message)), message);
     else assert.deepEqual(plain(encode(message)), plain(bytesOf(name)));
   });
 }
 
-test("differences of a compact snapshot are added as docs/wire.md says", () => {
+test("differences of a compact snapshot are added as docs/wire.md specifies", () => {
   const { arrays } = decode(bytesOf("compact_snapshot"));
   const added = (name: string, base: (i: number) => number) => {
     const planes = arrays[`weights/${name}`].data as Uint8Array;
@@ -73,13 +73,13 @@ test("differences of a compact snapshot are added as docs/wire.md says", () => {
       return new Float32Array(Uint32Array.of((bits & 0xffff) << 16).buffer)[0];
     });
   };
-  // They lead from the 3 x 3 identity to 1.01 times it, and from ones to zeros: in bfloat16 1.01 is 1.0078125.
+  // The weights change from the 3 x 3 identity to 1.01 times it (1.0078125 in bfloat16), the biases from 1 to 0.
   const diagonal = (i: number) => Number(i % 4 === 0);
   assert.deepEqual(added("body.weight", diagonal), Array.from({ length: 9 }, (_, i) => 1.0078125 * diagonal(i)));
   assert.deepEqual(added("body.bias", () => 1), [0, 0, 0]);
 });
 
-test("damaged bytes are refused as such", () => {
+test("damaged bytes raise ProtocolError and nothing else", () => {
   for (const name of Object.keys(VALUES)) {
     const whole = bytesOf(name);
     for (let length = 0; length < whole.length; length += 1 + (length >> 5)) {
@@ -97,12 +97,12 @@ test("damaged bytes are refused as such", () => {
   }
 });
 
-test("another version is named", () => {
+test("a message of another protocol version is reported with its version", () => {
   const other = bytesOf("join");
   other.writeUInt16LE(PROTOCOL_VERSION + 1, 4);
-  assert.throws(() => decode(other), /speaks protocol version/);
+  assert.throws(() => decode(other), /uses protocol version/);
 });
 
-test("no more is unpacked than a limit allows", () => {
+test("a body larger than the limit is refused", () => {
   assert.throws(() => decode(bytesOf("program"), 100), /the limit is 100/);
 });

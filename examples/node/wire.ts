@@ -1,23 +1,24 @@
 /**
- * Messages to bytes and back, as docs/wire.md has them. This file knows no key, no connection and no state.
+ * The encoding of messages as bytes, specified in docs/wire.md. Pure functions.
  *
- * Numbers above 2^32 are bigints on both ways, so that identities come back as they went.
+ * Integers from 2^32 are bigints, in decoded messages and in those to encode: a number of JavaScript, a double, cannot
+ * hold every learner epoch and incarnation.
  */
 
 import { decode as unpack, encode as pack } from "@msgpack/msgpack";
 import { constants, zstdCompressSync, zstdDecompressSync } from "node:zlib";
 
 export const PROTOCOL_VERSION = 5;
-export const MAX_BODY_BYTES = 2 ** 30; // of what the learner sends: weights may be large
+export const MAX_BODY_BYTES = 2 ** 30; // of messages from the learner: weights may be large
 
 const MAGIC = 0x44454144; // "DAED" as a little-endian number
 const PREFIX_BYTES = 12;
 const MAX_HEADER_BYTES = 256 * 1024;
 const MAX_ARRAYS = 4096;
 const MAX_DIMENSIONS = 8;
-const PLAIN = 0;
+const PLAIN = 0; // flags of a message
 const ZSTD = 1;
-const COMPRESSED = new Set(["Rollout", "Program", "CompactSnapshot"]);
+const COMPRESSED_KINDS = new Set(["Rollout", "Program", "CompactSnapshot"]);
 
 const TYPES = {
   "<f4": Float32Array,
@@ -30,7 +31,7 @@ const TYPES = {
 export type Dtype = keyof typeof TYPES;
 type Data = Float32Array | Uint8Array | Uint16Array | Int32Array | BigInt64Array;
 
-/** An array with its shape; of a swapped one, the second axis comes first in `data`. */
+/** An array of a message. If it is swapped, `data` has the second axis first. */
 export interface WireArray {
   dtype: Dtype;
   shape: number[];
@@ -38,19 +39,20 @@ export interface WireArray {
   data: Data;
 }
 
+/** A message: its kind, its fields that are not arrays, and its arrays, all by the names in docs/wire.md. */
 export interface Message {
   kind: string;
   fields: Record<string, unknown>;
   arrays: Record<string, WireArray>;
 }
 
-/** The bytes are no message that this end can accept. */
+/** The bytes are not an acceptable message: a fault of the sender. */
 export class ProtocolError extends Error {}
 
-/** The other end speaks another version of the protocol. */
+/** The other end uses another version of the protocol. */
 export class VersionMismatchError extends ProtocolError {}
 
-/** The bytes of a message. */
+/** Encode a message. */
 export function encode(message: Message): Buffer {
   const arrays = Object.entries(message.arrays);
   let body = Buffer.concat(
@@ -69,9 +71,9 @@ export function encode(message: Message): Buffer {
     { useBigInt64: true },
   );
   let flags = PLAIN;
-  if (COMPRESSED.has(message.kind) && body.length > 0) {
+  if (COMPRESSED_KINDS.has(message.kind) && body.length > 0) {
     const smaller = zstdCompressSync(body, {
-      pledgedSrcSize: body.length, // a frame has to declare its size
+      pledgedSrcSize: body.length, // the frame must declare its content size
       params: { [constants.ZSTD_c_compressionLevel]: 1 },
     });
     if (smaller.length < body.length) [flags, body] = [ZSTD, smaller];
@@ -84,21 +86,29 @@ export function encode(message: Message): Buffer {
   return Buffer.concat([prefix, header, Buffer.alloc(padding(PREFIX_BYTES + header.length)), body]);
 }
 
-/** The message in `bytes`; throws ProtocolError if it is anything but one whole message. */
+/** Decode a message. Throws ProtocolError unless `bytes` are exactly one complete message within the limits. */
 export function decode(bytes: Uint8Array, maxBodyBytes = MAX_BODY_BYTES): Message {
   const view = Buffer.from(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  if (view.length < PREFIX_BYTES || view.readUInt32LE(0) !== MAGIC) throw new ProtocolError("not a message");
+  if (view.length < PREFIX_BYTES || view.readUInt32LE(0) !== MAGIC) {
+    throw new ProtocolError("not a message of this protocol");
+  }
   const version = view.readUInt16LE(4);
   if (version !== PROTOCOL_VERSION) {
-    throw new VersionMismatchError(`the other end speaks protocol version ${version}, this one ${PROTOCOL_VERSION}`);
+    throw new VersionMismatchError(
+      `the other end uses protocol version ${version}, this one ${PROTOCOL_VERSION}: install the same release on both`,
+    );
   }
   const flags = view.readUInt16LE(6);
   const headerBytes = view.readUInt32LE(8);
   const end = PREFIX_BYTES + headerBytes;
   const bodyStart = end + padding(end);
-  if (headerBytes > MAX_HEADER_BYTES || bodyStart > view.length) throw new ProtocolError("its header is too long");
+  if (headerBytes > MAX_HEADER_BYTES || bodyStart > view.length) {
+    throw new ProtocolError(
+      `a header of ${headerBytes} bytes in a message of ${view.length}, the limit is ${MAX_HEADER_BYTES}`,
+    );
+  }
   const { kind, fields, arrays, size } = readHeader(view.subarray(PREFIX_BYTES, end));
-  if (size > maxBodyBytes) throw new ProtocolError(`a body of ${size} bytes, the limit is ${maxBodyBytes}`);
+  if (size > maxBodyBytes) throw new ProtocolError(`the body declares ${size} bytes, the limit is ${maxBodyBytes}`);
   const body = readBody(flags, kind, view.subarray(bodyStart), size);
   const message: Message = { kind, fields, arrays: {} };
   let offset = 0;
@@ -106,16 +116,18 @@ export function decode(bytes: Uint8Array, maxBodyBytes = MAX_BODY_BYTES): Messag
     const type = TYPES[dtype];
     const length = shape.reduce((product, side) => product * side, 1);
     const byteLength = length * type.BYTES_PER_ELEMENT;
-    if (offset + byteLength > size || Object.hasOwn(message.arrays, name)) throw new ProtocolError(`array ${name} does not fit`);
+    if (offset + byteLength > size || Object.hasOwn(message.arrays, name)) {
+      throw new ProtocolError(`array '${name}' is a duplicate, or exceeds the body of ${size} bytes`);
+    }
     message.arrays[name] = { dtype, shape, swapped, data: new type(body, offset, length) };
     offset += byteLength + padding(byteLength);
   }
-  if (offset !== size) throw new ProtocolError(`the arrays take ${offset} bytes, the body has ${size}`);
+  if (offset !== size) throw new ProtocolError(`the arrays take ${offset} bytes, the body declares ${size}`);
   return message;
 }
 
-/** The message in `bytes`; nothing if it is damaged. Throws VersionMismatchError if another version wrote it. */
-export function decodeWhole(bytes: Uint8Array): Message | undefined {
+/** Decode a message; return undefined if it is damaged. Throws VersionMismatchError if another version wrote it. */
+export function tryDecode(bytes: Uint8Array): Message | undefined {
   try {
     return decode(bytes);
   } catch (error) {
@@ -133,7 +145,7 @@ function readHeader(bytes: Uint8Array): { kind: string; fields: Message["fields"
     throw new ProtocolError(`unreadable header: ${error}`);
   }
   const { kind, fields, arrays, size } = content ?? {};
-  const whole = (value: unknown) => Number.isSafeInteger(value) && (value as number) >= 0;
+  const isLength = (value: unknown) => Number.isSafeInteger(value) && (value as number) >= 0;
   const isEntry = (entry: any) =>
     Array.isArray(entry) &&
     entry.length === 4 &&
@@ -141,33 +153,34 @@ function readHeader(bytes: Uint8Array): { kind: string; fields: Message["fields"
     Object.hasOwn(TYPES, entry[1]) &&
     Array.isArray(entry[2]) &&
     entry[2].length <= MAX_DIMENSIONS &&
-    entry[2].every(whole) &&
+    entry[2].every(isLength) &&
     typeof entry[3] === "boolean";
-  if (typeof kind !== "string" || typeof fields !== "object" || fields === null || !whole(size)) {
-    throw new ProtocolError("the header lacks kind, fields or size");
+  if (typeof kind !== "string" || typeof fields !== "object" || fields === null || !isLength(size)) {
+    throw new ProtocolError("the header's kind, fields or size are missing or have the wrong type");
   }
   if (!Array.isArray(arrays) || arrays.length > MAX_ARRAYS || !arrays.every(isEntry)) {
-    throw new ProtocolError("the header's arrays are not as they should be");
+    throw new ProtocolError(`the header must list up to ${MAX_ARRAYS} arrays by name, dtype, shape and swapped`);
   }
   return { kind, fields, arrays, size };
 }
 
-/** The plain body in memory of its own, at whose start every array's type may begin. */
+/** Return the plain body in a buffer of its own, so that its arrays are aligned. Throws ProtocolError. */
 function readBody(flags: number, kind: string, body: Buffer, size: number): ArrayBuffer {
   let plain: Uint8Array = body;
-  if (flags === ZSTD && COMPRESSED.has(kind)) {
+  if (flags === ZSTD && COMPRESSED_KINDS.has(kind)) {
     try {
       plain = zstdDecompressSync(body, { maxOutputLength: Math.max(size, 1) });
     } catch (error) {
       throw new ProtocolError(`unreadable body: ${error}`);
     }
   } else if (flags !== PLAIN) {
-    throw new ProtocolError(`a ${kind} with flags ${flags}`);
+    throw new ProtocolError(`a ${kind} must not have flags ${flags}`);
   }
-  if (plain.length !== size) throw new ProtocolError(`a body of ${plain.length} bytes that declares ${size}`);
+  if (plain.length !== size) throw new ProtocolError(`the body has ${plain.length} bytes, it declares ${size}`);
   return new Uint8Array(plain).buffer;
 }
 
+/** Return the number of zeros after `length` bytes, up to a multiple of 8. */
 function padding(length: number): number {
   return -length & 7;
 }
