@@ -106,7 +106,8 @@ class Client:
 
         Args:
           terminated: True if the environment ended the episode; False if a limit truncated it.
-          observation: the last one. Required after a truncation, for the bootstrap value.
+          observation: the last one. Required for the bootstrap value: after a truncation, and after a termination in
+            a run with environment.bootstrap_terminations.
 
         Raises ValueError if the episode has no action yet, or the observation is missing or does not fit the space.
         """

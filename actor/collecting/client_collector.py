@@ -16,7 +16,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 _MAX_FULL_ROLLOUTS = 8  # that the service has not taken yet; beyond that the oldest is dropped
 _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # `collect` replaces it
@@ -30,9 +30,10 @@ class ClientCollector:
         self._observation_space, self._action_space = observation_space, action_space
         self.policy_loaded = threading.Event()  # the caller may act
         self.on_rollout: Callable[[], None] = lambda: None  # called on the caller's thread when a rollout is full
-        self._lock = threading.Lock()  # guards the next five
+        self._lock = threading.Lock()  # guards the next six
         self.dropped = 0  # rollouts that were replaced by newer ones before the service took them
         self._transforms: Transforms | None = None
+        self._bootstrap_terminations = False
         self._next_policy: tuple[PolicyRuntime, RolloutWriter] | None = None  # begun, and not acting yet
         self._snapshot: Snapshot | None = None  # the newest
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
@@ -53,7 +54,9 @@ class ClientCollector:
                 f"a run with {spec.training.algorithm} makes its actors wait for each update, but a client cannot "
                 "wait: use another algorithm"
             )
+        _refuse_unapplied_settings(spec.environment)
         with self._lock:
+            self._bootstrap_terminations = spec.environment.bootstrap_terminations
             self._transforms = Transforms(spec.environment, self._observation_space, self._action_space)
             return self._transforms.spaces, 1
 
@@ -123,6 +126,11 @@ class ClientCollector:
             self._last_frame = self._to_frame(observation)
         elif not terminated:
             raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
+        elif self._bootstrap_terminations:
+            raise ValueError(
+                "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
+                "pass the last observation"
+            )
         self._terminated, self._truncated = terminated, not terminated
         assert self._last_frame is not None
         self._record(self._last_frame)
@@ -177,3 +185,18 @@ class ClientCollector:
                 self.dropped += len(self._full) == _MAX_FULL_ROLLOUTS
                 self._full.append(rollout)
         self.on_rollout()
+
+
+def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
+    """Raise ActorError for settings that decide when a loop steps or ends, which here belongs to the caller."""
+    defaults = {"action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
+    changed = [
+        f"environment.{name}={getattr(spec, name)}"
+        for name, default in defaults.items()
+        if getattr(spec, name) != default
+    ]
+    if changed:
+        raise ActorError(
+            f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop repeats actions and "
+            "ends episodes; start the run without these settings"
+        )

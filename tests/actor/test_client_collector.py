@@ -162,3 +162,24 @@ def test_synchronous_run_is_refused() -> None:
     environment = gymnasium.make(spec.environment.id)
     with pytest.raises(ActorError, match="a client cannot wait: use another algorithm"):
         ClientCollector(environment.observation_space, environment.action_space).prepare(spec)
+
+
+def test_terminated_episode_needs_its_last_observation_where_terminations_are_bootstrapped() -> None:
+    """Without that observation the value of the one before it would be learned from."""
+    client, robot = begun(Played(run_spec(bootstrap_terminations=True)))
+    client.act(robot.observation)
+    with pytest.raises(ValueError, match=r"bootstraps terminated episodes.*pass the last observation"):
+        client.end_episode(None, terminated=True)
+    client.end_episode(robot.observation, terminated=True)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("action_repeat", 4), ("no_reward_limit", 30), ("max_episode_steps", 200)]
+)
+def test_run_whose_settings_only_an_environment_of_ours_applies_is_refused(setting: str, value: int) -> None:
+    spec = run_spec()
+    environment = gymnasium.make(spec.environment.id)
+    changed = spec.model_copy(update={"environment": spec.environment.model_copy(update={setting: value})})
+    client = ClientCollector(environment.observation_space, environment.action_space)
+    with pytest.raises(ActorError, match=rf"environment\.{setting}={value}"):
+        client.prepare(changed)
