@@ -3,9 +3,11 @@
 import argparse
 import json
 import logging
+import re
 import time
 from collections.abc import Callable
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
 LEVELS = ("debug", "info", "warning", "error")
 
 
@@ -43,6 +45,11 @@ def _print(line: str) -> None:
     print(line, flush=True)
 
 
+def _printable(text: str) -> str:
+    """Return `text` with control characters escaped: it may come from a peer, and a terminal would obey them."""
+    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
 class _LineHandler(logging.Handler):
     """Handler that writes each record as one line. It ignores a closed terminal."""
 
@@ -53,7 +60,7 @@ class _LineHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """See logging.Handler."""
         try:
-            self._write(self.format(record))
+            self._write(_printable(self.format(record)))
         except (OSError, ValueError):  # closed
             return
         except Exception:

@@ -1,10 +1,13 @@
 """The spaces of observations and actions in messages."""
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
+
+_MAX_OBSERVATION_BYTES = 64 << 20  # a sender's word decides how much the learner allocates for a batch
 
 
 class ArraySpace(Specification):
@@ -18,6 +21,13 @@ class ArraySpace(Specification):
     shape: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=4)]  # of one frame
     dtype: Literal["float32", "uint8"]
     frames: Annotated[int, Field(ge=1, le=16)] = 1
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> "ArraySpace":
+        size = math.prod(self.stacked_shape) * (4 if self.dtype == "float32" else 1)
+        if size > _MAX_OBSERVATION_BYTES:
+            raise ValueError(f"an observation of {self} has {size:,} bytes: use at most {_MAX_OBSERVATION_BYTES:,}")
+        return self
 
     @property
     def stacked_shape(self) -> tuple[int, ...]:

@@ -130,7 +130,8 @@ def _issue(directory: Path, role: str, names: list[str], hosts: list[str]) -> li
     _write_names(directory, authorised)
     return [
         *(
-            f"{directory / f'{role}-{name}'}    copy this folder to the host of the {role} and use --tls {role}-{name}"
+            f"{directory / _folder(role, name)}    copy this folder to the host of the {role} and use "
+            f"--tls {_folder(role, name)}"
             for name in names
         ),
         _RESTART,

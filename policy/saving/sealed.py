@@ -12,6 +12,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
+
 _MANIFEST, _SEAL = "manifest.json", "seal"
 _MAX_MANIFEST_BYTES = 16 << 20
 
@@ -62,6 +64,18 @@ def _move_into_place(partial: Path, directory: Path) -> None:
     shutil.rmtree(replaced, ignore_errors=True)
 
 
+class _File(BaseModel):
+    bytes: int
+    sha256: str
+
+
+class _Manifest(BaseModel):
+    """Contents of `manifest.json`: anybody can write a manifest with a right seal."""
+
+    files: dict[str, _File]
+    content: dict[str, Any]
+
+
 class SealedDirectory:
     """A sealed directory with a verified manifest; each file is verified when it is read."""
 
@@ -77,9 +91,12 @@ class SealedDirectory:
             raise DamagedError(f"{directory}: {error.strerror}: {error.filename}") from None
         if hashlib.sha256(manifest).hexdigest().encode() != seal:
             raise DamagedError(f"{directory}: the manifest is damaged")
-        parsed = json.loads(manifest)
-        self._files: dict[str, dict[str, Any]] = parsed["files"]
-        self.content: dict[str, Any] = parsed["content"]
+        try:
+            parsed = _Manifest.model_validate_json(manifest)
+        except ValidationError:
+            raise DamagedError(f"{directory}: the manifest is not of this format") from None
+        self._files = parsed.files
+        self.content = parsed.content
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a file. Raises DamagedError if it is missing or damaged."""
@@ -88,12 +105,12 @@ class SealedDirectory:
             raise DamagedError(f"{self._directory}: no file {name}")
         try:
             size = (self._directory / name).stat().st_size
-            if size != entry["bytes"]:
-                raise DamagedError(f"{self._directory / name}: {size} bytes instead of {entry['bytes']}")
+            if size != entry.bytes:
+                raise DamagedError(f"{self._directory / name}: {size} bytes instead of {entry.bytes}")
             data = (self._directory / name).read_bytes()
         except OSError as error:
             raise DamagedError(f"{self._directory / name}: {error.strerror}") from None
-        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+        if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DamagedError(f"{self._directory / name}: damaged: the checksum differs")
         return data
 

@@ -9,6 +9,7 @@ from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Message, Program, Refusal, RunEnded, Welcome
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
@@ -74,3 +75,14 @@ def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     late = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"
+
+
+def test_join_with_observations_too_large_for_memory_is_refused_and_fixes_no_spaces() -> None:
+    """Such a Join once ended the learner: it allocated the batch."""
+    responses, fleet = make_responses()
+    huge = ArraySpace.model_construct(kind="array", shape=(2**40,), dtype="float32", frames=1)
+    spaces = Spaces.model_construct(observation=huge, action=DiscreteSpace(count=2))
+    answer = read(responses.join(encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
+    assert isinstance(answer, Refusal)
+    assert "use at most" in answer.reason
+    assert fleet.spaces is None

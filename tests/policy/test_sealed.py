@@ -248,3 +248,28 @@ def test_checkpoints_are_listed_newest_first(tmp_path: Path) -> None:
     for name in ("0000000009", "0000000010", ".0000000011.77.partial", "notes"):
         (tmp_path / "checkpoints" / name).mkdir(parents=True)
     assert [entry.name for entry in checkpoints(tmp_path)] == ["0000000010", "0000000009"]
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        b"",
+        b"not json",
+        b"[]",
+        b"null",
+        b"{}",
+        b'{"files": {}}',
+        b'{"files": [], "content": {}}',
+        b'{"files": {"a": 1}, "content": {}}',
+        b'{"files": {"a": {"bytes": "many", "sha256": "x"}}, "content": {}}',
+        b'{"files": {"a": {}}, "content": {}}',
+        b'{"files": {}, "content": []}',
+        b"[" * 100_000,
+        b"\xff\xfe",
+    ],
+)
+def test_manifest_of_another_form_under_a_right_seal_is_reported_as_damaged(tmp_path: Path, manifest: bytes) -> None:
+    (tmp_path / "manifest.json").write_bytes(manifest)
+    (tmp_path / "seal").write_text(hashlib.sha256(manifest).hexdigest())
+    with pytest.raises(DamagedError, match=str(tmp_path)):
+        SealedDirectory(tmp_path)

@@ -220,3 +220,11 @@ def test_every_algorithm_has_its_mathematics() -> None:
     from daedalus.algorithms.registry import BUILDERS
 
     assert BUILDERS.keys() == ALGORITHMS.keys()
+
+
+@pytest.mark.parametrize(("shape", "frames"), [((2**40,), 1), ((4096, 4096), 2), ((2**13, 2**13, 2**13, 2**13), 16)])
+def test_observations_too_large_for_memory_are_refused(shape: tuple[int, ...], frames: int) -> None:
+    """The first actor to join decides the spaces, and the learner allocates batches of them."""
+    with pytest.raises(ValidationError, match="use at most 67,108,864"):
+        ArraySpace(shape=shape, dtype="float32", frames=frames)
+    ArraySpace(shape=(2048, 2048, 3), dtype="uint8", frames=4)
