@@ -57,6 +57,7 @@ def make_rollout(
         terminated[row] = valid[row] & (random.random(environments) < 0.15)
         truncated[row] = valid[row] & (random.random(environments) < 0.15)
     cells = (rows, environments)
+    ends = int(np.count_nonzero(terminated | truncated))
     content: dict[str, Any] = {
         "frames": random.standard_normal((stack + rows, environments, *shape), np.float32),
         "initial_state": random.standard_normal((environments, state_size), np.float32),
@@ -66,8 +67,8 @@ def make_rollout(
         "terminated": terminated,
         "truncated": truncated,
         "valid": valid,
-        "episode_returns": np.array([-1.5], np.float32),
-        "episode_lengths": np.array([4], np.int32),
+        "episode_returns": np.full(ends, -1.5, np.float32),
+        "episode_lengths": np.full(ends, 4, np.int32),
     }
     return Rollout(identity=rollout_identity or identity(), policy_version=version, **{**content, **replaced})
 

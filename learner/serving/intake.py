@@ -19,6 +19,7 @@ from daedalus.protocol.spec import RunSpec
 
 _ROW_BYTES = 1 + 2 + 4 * 4 + 8  # per environment and row, without the observation, rounded up
 _SLACK_BYTES = 64 << 10
+_MAX_REWARD = 1e9  # beyond it squares of returns overflow float32, and no update has a finite gradient
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,9 +158,23 @@ class Intake:
             largest = environment.reward_clip * environment.reward_scale
             if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
                 return f"rewards has a value outside the clip range of +-{largest:g}"
+        if np.abs(rollout.rewards).max() > _MAX_REWARD:
+            return f"rewards has a value beyond +-{_MAX_REWARD:g}: set environment.reward_scale"
         if (rollout.episode_lengths < 1).any():
             return "episode_lengths has a value below 1"
-        return ""
+        return _first_episode_violation(rollout)
+
+
+def _first_episode_violation(rollout: Rollout) -> str:
+    """Return where the rollout breaks gymnasium's NEXT_STEP rule, or reports other episodes than ended in it."""
+    ends = rollout.terminated | rollout.truncated  # [T, E]
+    if (ends & ~rollout.valid).any():
+        return "an episode ends in a row that only resets"
+    if (rollout.valid[1:] == ends[:-1]).any():
+        return "valid breaks the reset rule: a row must be invalid if, and only if, an episode ended in the row before"
+    if len(rollout.episode_returns) != np.count_nonzero(ends):
+        return f"episode_returns has {len(rollout.episode_returns)} values, but {np.count_nonzero(ends)} episodes ended"
+    return ""
 
 
 def acknowledgement(verdict: Rollout | Rejected, policy_version: int) -> Acknowledgement:

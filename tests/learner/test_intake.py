@@ -262,11 +262,16 @@ def test_frames_with_wrong_stack_or_size_are_rejected(frames: np.ndarray) -> Non
 
 def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_frames() -> None:
     largest = good(frames=pixels(), initial_state=np.zeros((ENVIRONMENTS, 40_000), np.float32))
+    every_second = np.broadcast_to((np.arange(ROWS) % 2 == 0)[:, None], (ROWS, ENVIRONMENTS)).copy()
+    most = int(every_second.sum())  # episodes of one row, each followed by a reset row
     largest = dataclasses.replace(
         largest,
         actions=largest.actions.astype(np.int64),
-        episode_returns=np.zeros(ROWS * ENVIRONMENTS, np.float32),
-        episode_lengths=np.ones(ROWS * ENVIRONMENTS, np.int64),
+        terminated=every_second,
+        truncated=np.zeros_like(every_second),
+        valid=every_second,
+        episode_returns=np.zeros(most, np.float32),
+        episode_lengths=np.ones(most, np.int64),
     )
     assert isinstance(stacked_harness(40_000).receive(encode(largest)), Rollout)
     too_many = good(frames=pixels(2 * (ROWS + 4)))
@@ -416,7 +421,44 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
 
 
 def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
-    assert_rejected(harness, encode(good(episode_lengths=np.array([0], np.int32))), "unfit", "episode_lengths")
+    lengths = np.zeros_like(good().episode_lengths)
+    assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit", "episode_lengths")
+
+
+def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Harness) -> None:
+    """100 invented returns once ended a run as solved."""
+    none = np.zeros((ROWS, ENVIRONMENTS), np.bool_)
+    invented = {"episode_returns": np.full(7, 500, np.float32), "episode_lengths": np.full(7, 500, np.int32)}
+    rollout = good(terminated=none, truncated=none, valid=~none, **invented)
+    assert_rejected(harness, encode(rollout), "unfit", "7 values, but 0 episodes ended")
+
+
+@pytest.mark.parametrize(
+    ("ends", "valid", "reason"),
+    [
+        (False, False, "reset rule"),  # nothing was played
+        (True, True, "reset rule"),  # an episode ends in every row
+        (True, False, "a row that only resets"),
+    ],
+)
+def test_rows_that_break_the_reset_rule_are_rejected_as_unfit(
+    harness: Harness, ends: bool, valid: bool, reason: str
+) -> None:
+    rows = (ROWS, ENVIRONMENTS)
+    count = ROWS * ENVIRONMENTS if ends else 0
+    rollout = good(
+        terminated=np.full(rows, ends),
+        truncated=np.full(rows, ends),
+        valid=np.full(rows, valid),
+        episode_returns=np.zeros(count, np.float32),
+        episode_lengths=np.ones(count, np.int32),
+    )
+    assert_rejected(harness, encode(rollout), "unfit", reason)
+
+
+@pytest.mark.parametrize("value", [3e38, -2e9])
+def test_rewards_that_no_gradient_survives_are_rejected_as_unfit(harness: Harness, value: float) -> None:
+    assert_rejected(harness, encode(with_value("rewards", value)), "unfit", "environment.reward_scale")
 
 
 # ---------------------------------------------------------------------------------------- at most once
