@@ -3,11 +3,10 @@
 from collections.abc import Iterator
 
 import torch
-from torch import Tensor
 
 from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, normalized
+from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, policy_weights
 from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.targets import vtrace_corrected_targets
 from daedalus.policy.network.distributions import ActionDistribution
@@ -38,8 +37,9 @@ class Appo:
         log_probs, entropies = self._distribution.log_prob_and_entropy(parameters, minibatch.actions)
         log_ratios = log_probs - minibatch.log_probs
         clip_range, valid = self._spec.clip_range, minibatch.valid
+        factors = policy_weights(minibatch.advantages, minibatch.weights, valid, self._spec.normalize_advantages)
         return Losses(
-            policy_loss=clipped_policy_loss(log_ratios, self._weighted_advantages(minibatch), valid, clip_range),
+            policy_loss=clipped_policy_loss(log_ratios, factors, valid, clip_range),
             entropies=entropies,
             values=values,
             targets=minibatch.targets,
@@ -47,8 +47,3 @@ class Appo:
             valid=valid,
             clipped_fraction=clipped_fraction(log_ratios.detach(), valid, clip_range),
         )
-
-    def _weighted_advantages(self, minibatch: Minibatch) -> Tensor:
-        advantages = minibatch.advantages
-        scaled = normalized(advantages, minibatch.valid) if self._spec.normalize_advantages else advantages
-        return minibatch.weights * scaled

@@ -17,6 +17,14 @@ def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
     return centred / (masked_mean(centred.square(), valid).sqrt() + 1e-8)
 
 
+def policy_weights(advantages: Tensor, weights: Tensor, valid: Tensor, normalize: bool) -> Tensor:
+    """Return w_t A_t [T, B], the factor of row t in the policy loss, with A_t normalised over the valid rows if asked.
+
+    A_t is normalised before it is weighted: normalised after, a row with weight 0 would get -mean / std.
+    """
+    return weights * (normalized(advantages, valid) if normalize else advantages)
+
+
 def policy_gradient_loss(log_probs: Tensor, advantages: Tensor, valid: Tensor) -> Tensor:
     """Return - mean log pi(a_t|s_t) A_t, with A_t a constant. Its gradient is minus the policy gradient.
 

@@ -6,7 +6,7 @@ import torch
 
 from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.losses import normalized, policy_gradient_loss
+from daedalus.algorithms.losses import policy_gradient_loss, policy_weights
 from daedalus.algorithms.targets import TargetsFunction
 from daedalus.policy.network.distributions import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
@@ -24,14 +24,14 @@ class PolicyGradient:
         log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
         with torch.no_grad():
             targets = self._targets(self._spec, batch, log_probs, values)
-        advantages = targets.advantages
-        scaled = normalized(advantages, batch.valid) if self._spec.normalize_advantages else advantages
+        normalize = self._spec.normalize_advantages
+        factors = policy_weights(targets.advantages, targets.weights, batch.valid, normalize)
         yield Losses(
-            policy_loss=policy_gradient_loss(log_probs, targets.weights * scaled, batch.valid),
+            policy_loss=policy_gradient_loss(log_probs, factors, batch.valid),
             entropies=entropies,
             values=values[:-1],
             targets=targets.values,
-            advantages=advantages,
+            advantages=targets.advantages,
             valid=batch.valid,
             clipped_fraction=torch.zeros((), device=values.device),
         )

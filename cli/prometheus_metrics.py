@@ -53,11 +53,16 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
     (
         GaugeMetricFamily,
         "actor_silence_seconds",
-        "Time since the last sign of it.",
+        "Time since the learner last heard from the actor.",
         lambda actor: actor.seconds_since_seen,
     ),
     (GaugeMetricFamily, "actor_environments", "Environments of the actor.", lambda actor: actor.environments),
-    (CounterMetricFamily, "actor_env_steps", "Its env_steps that were trained on.", lambda actor: actor.env_steps),
+    (
+        CounterMetricFamily,
+        "actor_env_steps",
+        "Environment steps of the actor that were trained on.",
+        lambda actor: actor.env_steps,
+    ),
     (
         GaugeMetricFamily,
         "actor_env_steps_per_second",

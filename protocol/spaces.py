@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
-_MAX_OBSERVATION_BYTES = 64 << 20  # a sender's word decides how much the learner allocates for a batch
+_MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 
 
 class ArraySpace(Specification):
@@ -40,7 +40,7 @@ class ArraySpace(Specification):
 
 
 class DiscreteSpace(Specification):
-    """One of `count` choices, numbered from 0 (gymnasium's Discrete with `start` subtracted)."""
+    """Space of `count` choices, numbered from 0: gymnasium's Discrete with `start` subtracted."""
 
     kind: Literal["discrete"] = "discrete"
     count: Annotated[int, Field(ge=1, le=65_536)]

@@ -123,7 +123,8 @@ class TrainingSpec(Specification):
     passes: Annotated[int, Field(ge=1, le=64)] = 3
     """Passes over each batch; `appo` only."""
     minibatches: Annotated[int, Field(ge=1, le=4096)] = 4
-    """Minibatches that each pass shuffles the batch into, one update for each; `appo` only."""
+    """Minibatches that each pass shuffles the batch into, one update for each; `appo` only. A batch with fewer parts
+    (environments with memory, else valid rows) makes as many minibatches as it has parts."""
     clip_range: Annotated[float, Field(gt=0.0)] = 0.2
     """Clip range of the probability ratio; `appo` only."""
 

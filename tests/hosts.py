@@ -1,6 +1,6 @@
-"""Several hosts on this machine: network namespaces with addresses of their own, connected to one switch.
+"""Network namespaces of this machine that act as hosts with their own addresses, connected by one switch.
 
-The switch has a namespace too, so the network of the machine does not change. Needs Linux, root and iproute2.
+The switch is in a namespace too, so that the network of the machine does not change. Needs Linux, root and iproute2.
 """
 
 import secrets

@@ -19,7 +19,7 @@ class TransportError(Exception):
 
 
 class AddressInUseError(TransportError):
-    """Another process already listens on the address."""
+    """The address is in use by another process."""
 
 
 class RefusedError(TransportError):

@@ -43,7 +43,7 @@ class LearnerLostError(Exception):
 
 
 class NameInUseError(ActorError):
-    """Another actor of the same name takes part, or did a moment ago."""
+    """The actor name is in use by another actor, or was in use a moment ago."""
 
 
 class RunOverError(Exception):

@@ -55,6 +55,16 @@ def test_an_actor_may_have_the_name_of_a_role(tmp_path: Path) -> None:
     assert load(made / "learner", "learner").role == "learner"
 
 
+def test_issue_prints_the_folders_that_it_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An actor named `actor` has the folder `actor`, without its name twice."""
+    made = make(tmp_path / "certs")
+    capsys.readouterr()
+    assert certs(["issue", "actor", "actor", "arm", "--directory", str(made)]) == 0
+    printed = [Path(line.split()[0]) for line in capsys.readouterr().out.splitlines() if line.startswith(str(made))]
+    assert printed == [made / "actor", made / "actor-arm"]
+    assert all((folder / "key.pem").is_file() for folder in printed)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
