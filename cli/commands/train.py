@@ -1,6 +1,7 @@
 """`daedalus train` and `daedalus resume`: train with a learner and actors on this machine, and evaluate the policy."""
 
 import argparse
+import importlib.util
 import sys
 from pathlib import Path
 from typing import Any
@@ -158,5 +159,7 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['backend']}'s {evaluation['environment']}"
     )
-    folder = f"run directory: {run.directory}; draw the curves with: daedalus plot {run.directory} --output curve.png"
+    folder = f"run directory: {run.directory}"
+    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
+        folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
     return f"{trained}\n{evaluated}\n{folder}"

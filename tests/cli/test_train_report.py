@@ -1,0 +1,37 @@
+"""The last lines of `daedalus train`."""
+
+import importlib.util
+import time
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli.commands.train import _report
+from daedalus.cli.local_run import LocalRun
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+SUMMARY = {
+    "solved": False,
+    "env_steps": 1234,
+    "updates": 5,
+    "evaluation": {
+        "return_mean": 1.0,
+        "return_std": 0.0,
+        "episodes": 3,
+        "actions": "greedy",
+        "best_checkpoint": False,
+        "backend": "gymnasium",
+        "environment": "CartPole-v1",
+    },
+}
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
+    installed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
+    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
+    text = _report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
+    assert "run directory: runs/one" in text
+    assert ("daedalus plot runs/one" in text) == installed
