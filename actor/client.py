@@ -46,18 +46,21 @@ class Client:
         tls: Path | None = None,
         link: LinkChoice = "auto",
         timeout: float = 60.0,
+        action_mask: Any = None,
     ) -> None:
         """Join a run, and wait for the first policy.
 
         Args:
           connect: address of the learner or of a router, such as `tcp/gpu-box:7447`.
-          observation_space: a gymnasium Box.
-          action_space: a gymnasium Discrete, or the Box that the run's action table is over.
+          observation_space: a gymnasium Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of these.
+          action_space: of the same kinds.
           name: keep it after a restart; default: made of the host name and the process id.
           run: the run to join, if several share a network.
           tls: folder of this actor's certificate (`daedalus certs`), for addresses that begin with tls/.
           link: see `daedalus actor --help`.
           timeout: seconds to wait for a learner and its first policy.
+          action_mask: an example of the masks that `act` gets, if some discrete actions are not always legal: an array
+            over all choices, or a map of arrays by action component.
 
         Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
@@ -71,7 +74,7 @@ class Client:
             authorization_hint=authorization_hint(credentials),
         )
         self._stop = threading.Event()
-        self._collector = ClientCollector(observation_space, action_space)
+        self._collector = ClientCollector(observation_space, action_space, action_mask)
         self._error: Exception | None = None
         transport = connect_with_retry([connect], self._stop, timeout, credentials)
         assert transport is not None  # only a stop makes it None
@@ -84,15 +87,19 @@ class Client:
             self.close()
             raise self._error or ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Any, action_mask: Any = None) -> Any:
         """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
+
+        Args:
+          observation: of the observation space.
+          action_mask: the legal choices, if the client was constructed with a mask: of the same form.
 
         Raises ValueError if the observation does not fit the space, ActorError if the learner quarantined this actor,
         and whatever else ended the client's thread.
         """
         if self._error is not None:
             raise self._error
-        return self._collector.act(observation)
+        return self._collector.act(observation, action_mask)
 
     def reward(self, value: float) -> None:
         """Add `value` to the reward of the last action; may be called any number of times.

@@ -5,11 +5,11 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Components
 
-# The network on R rows of B environments: observations [R, B, ...], state [B, S], starts [R, B] -> parameters of
-# the action distributions [R, B, P], values [R, B].
-Forward = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+# The network on R rows of B environments: observations {name: [R, B, ...]}, state [B, S], starts [R, B] -> parameters
+# of the action distributions [R, B, P], values [R, B].
+Forward = Callable[[Components, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Losses(NamedTuple):

@@ -9,7 +9,7 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, policy_weights
 from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.targets import vtrace_corrected_targets
-from daedalus.policy.network.distributions import ActionDistribution
+from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -26,7 +26,7 @@ class Appo:
         """Yield the losses of each minibatch of each pass. See Algorithm."""
         with torch.no_grad():
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
-            log_probs, _ = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
+            log_probs = self._distribution.log_prob(parameters[:-1], batch.actions, batch.masks)
             targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
         for _ in range(self._spec.passes):
             for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
@@ -34,7 +34,7 @@ class Appo:
 
     def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
         parameters, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)
-        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters, minibatch.actions)
+        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters, minibatch.actions, minibatch.masks)
         log_ratios = log_probs - minibatch.log_probs
         clip_range, valid = self._spec.clip_range, minibatch.valid
         factors = policy_weights(minibatch.advantages, minibatch.weights, valid, self._spec.normalize_advantages)

@@ -1,6 +1,6 @@
 """Rollouts joined on the environment axis, as tensors in reused memory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -10,17 +10,25 @@ from torch import Tensor
 
 from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
+
+Components = dict[str, Tensor]
+
+
+def each(components: Components, function: Callable[[Tensor], Tensor]) -> Components:
+    """Return the map with `function` applied to each component."""
+    return {name: function(values) for name, values in components.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Batch:
-    """Rollouts joined on the environment axis: T rows of B environments."""
+    """Rollouts joined on the environment axis: T rows of B environments. Maps are by component."""
 
-    observations: Tensor  # [T+1, B, *stacked_shape]
+    observations: Components  # each [T+1, B, *stacked_shape]; discrete ones int64
     initial_state: Tensor  # [B, S], the recurrent state of the policy at row 0
     starts: Tensor  # [T+1, B] bool, an episode starts here and the recurrent state is 0; never at row 0
-    actions: Tensor  # [T, B] int64
+    actions: Components  # each [T, B, D], int64 or float32
+    masks: Components  # of the masked actions [T, B, choices] bool
     behaviour_log_probs: Tensor  # [T, B]
     rewards: Tensor  # [T, B]
     terminated: Tensor  # [T, B] bool
@@ -31,7 +39,15 @@ class Batch:
         """Return the batch on a device. Copies from pinned memory are asynchronous."""
         if device.type == "cpu":
             return self
-        return Batch(**{part.name: getattr(self, part.name).to(device, non_blocking=True) for part in fields(self)})
+
+        def moved(values: Tensor) -> Tensor:
+            return values.to(device, non_blocking=True)
+
+        moved_parts: dict[str, Any] = {}
+        for part in fields(self):
+            values = getattr(self, part.name)
+            moved_parts[part.name] = each(values, moved) if isinstance(values, dict) else moved(values)
+        return Batch(**moved_parts)
 
 
 class BatchAssembler:
@@ -40,8 +56,8 @@ class BatchAssembler:
     A batch is valid until the next `join` with the same sizes, which overwrites its memory.
     """
 
-    def __init__(self, observation: ArraySpace, device: torch.device) -> None:
-        self._space = observation
+    def __init__(self, spaces: Spaces, device: torch.device) -> None:
+        self._spaces = spaces
         self._pinned = device.type == "cuda"
         self._memory: dict[str, Tensor] = {}
 
@@ -49,24 +65,35 @@ class BatchAssembler:
         """Return one batch of all rollouts, in the given order."""
         rows = rollouts[0].rows
         width = sum(rollout.environments for rollout in rollouts)
-        space = self._space
-        batch = Batch(
-            observations=self._array("observations", (rows + 1, width, *space.stacked_shape), space.dtype),
-            initial_state=self._array("initial_state", (width, rollouts[0].initial_state.shape[1]), "float32"),
-            starts=self._array("starts", (rows + 1, width), "bool"),
-            actions=self._array("actions", (rows, width), "int64"),
-            behaviour_log_probs=self._array("behaviour_log_probs", (rows, width), "float32"),
-            rewards=self._array("rewards", (rows, width), "float32"),
-            terminated=self._array("terminated", (rows, width), "bool"),
-            truncated=self._array("truncated", (rows, width), "bool"),
-            valid=self._array("valid", (rows, width), "float32"),
-        )
-        into: dict[str, np.ndarray] = {part.name: getattr(batch, part.name).numpy() for part in fields(batch)}
+        batch = self._allocate(rows, width, rollouts[0].initial_state.shape[1])
         first = 0
         for rollout in rollouts:
-            self._copy(rollout, {name: _columns(name, array, first, rollout) for name, array in into.items()})
+            self._copy(rollout, batch, slice(first, first + rollout.environments))
             first += rollout.environments
         return batch
+
+    def _allocate(self, rows: int, width: int, state_size: int) -> Batch:
+        def rows_of(name: str, dtype: str, *shape: int, extra: int = 0) -> Tensor:
+            return self._array(name, (rows + extra, width, *shape), dtype)
+
+        spaces = self._spaces
+        return Batch(
+            observations={
+                name: rows_of(f"observations/{name}", _dtype(space), *space.stacked_shape, extra=1)
+                for name, space in spaces.observations.items()
+            },
+            initial_state=self._array("initial_state", (width, state_size), "float32"),
+            starts=rows_of("starts", "bool", extra=1),
+            actions={
+                name: rows_of(f"actions/{name}", _dtype(space), space.size) for name, space in spaces.actions.items()
+            },
+            masks={name: rows_of(f"masks/{name}", "bool", size) for name, size in spaces.masks.items()},
+            behaviour_log_probs=rows_of("behaviour_log_probs", "float32"),
+            rewards=rows_of("rewards", "float32"),
+            terminated=rows_of("terminated", "bool"),
+            truncated=rows_of("truncated", "bool"),
+            valid=rows_of("valid", "float32"),
+        )
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: str) -> Tensor:
         array = self._memory.get(name)
@@ -75,17 +102,28 @@ class BatchAssembler:
             self._memory[name] = array
         return array
 
-    def _copy(self, rollout: Rollout, into: dict[str, np.ndarray]) -> None:
-        if self._space.frames == 1:
-            into["observations"][:] = rollout.frames
-        else:
-            stack_rows(rollout.frames, rollout.valid, into["observations"])
-        np.logical_not(rollout.valid, out=into["starts"][1:])
-        for name in ("initial_state", "actions", "behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
-            into[name][:] = getattr(rollout, name)
+    def _copy(self, rollout: Rollout, batch: Batch, columns: slice) -> None:
+        for name, space in self._spaces.observations.items():
+            into = batch.observations[name].numpy()[:, columns]
+            if space.frames == 1:
+                into[:] = rollout.frames[name]
+            else:
+                stack_rows(rollout.frames[name], rollout.valid, into)
+        batch.initial_state.numpy()[columns] = rollout.initial_state
+        np.logical_not(rollout.valid, out=batch.starts.numpy()[1:, columns])
+        for kind in ("actions", "masks"):
+            for name, values in getattr(rollout, kind).items():
+                getattr(batch, kind)[name].numpy()[:, columns] = values
+        for name in ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
+            getattr(batch, name).numpy()[:, columns] = getattr(rollout, name)
 
 
-def _columns(name: str, array: Any, first: int, rollout: Rollout) -> np.ndarray:
-    """Return a view of the columns of a batch's array that hold a rollout."""
-    part = slice(first, first + rollout.environments)
-    return array[part] if name == "initial_state" else array[:, part]
+def _dtype(space: Any) -> str:
+    """Return the data type of a component in a batch."""
+    match space:
+        case DiscreteSpace():
+            return "int64"
+        case ContinuousSpace():
+            return "float32"
+        case _:
+            return space.dtype

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.algorithm import Losses
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Components
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.algorithms.losses import explained_variance, masked_mean, value_loss
 from daedalus.algorithms.precision import autocast
@@ -34,7 +34,7 @@ class GradientComputer:
     def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
         self._spec, self._network = spec, network
         self._algorithm = build_algorithm(spec, network.distribution)
-        self.parameters = FlatParameters(network.parameters())
+        self.parameters = FlatParameters(network.learned_parameters())
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
@@ -49,8 +49,8 @@ class GradientComputer:
             loss.backward()
             yield _terms(losses, value_term, entropy)
 
-    def _forward(self, observations: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
-        with autocast(self._spec.precision, observations.device, self._network.convolutional):
+    def _forward(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        with autocast(self._spec.precision, starts.device, self._network.convolutional):
             return self._network(observations, state, starts)
 
 

@@ -2,7 +2,7 @@
 
 from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.targets import vtrace_corrected_targets
-from daedalus.policy.network.distributions import ActionDistribution
+from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.batch import Batch, Components, each
 from daedalus.algorithms.returns import Targets
 
 
@@ -17,10 +18,11 @@ class Minibatch:
     R is T for a policy with memory. Without memory R is 1, and B counts single rows.
     """
 
-    observations: Tensor  # [R, B, *stacked_shape]
+    observations: Components  # each [R, B, *stacked_shape]
     initial_state: Tensor  # [B, S]
     starts: Tensor  # [R, B] bool
-    actions: Tensor  # [R, B] int64
+    actions: Components  # each [R, B, D]
+    masks: Components  # of the masked actions [R, B, choices] bool
     log_probs: Tensor  # [R, B], log pi(a_t | s_t) before the first update of the batch
     targets: Tensor  # [R, B], value targets
     advantages: Tensor  # [R, B]
@@ -40,13 +42,14 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
       targets: value targets and advantages, [T, B].
     """
     if batch.initial_state.shape[1]:
-        order = torch.randperm(batch.actions.shape[1]).to(batch.actions.device)
+        order = torch.randperm(batch.rewards.shape[1]).to(batch.rewards.device)
         for part in order.tensor_split(min(count, len(order))):
             yield Minibatch(
-                observations=batch.observations[:-1, part],
+                observations=each(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
                 initial_state=batch.initial_state[part],
                 starts=batch.starts[:-1, part],
-                actions=batch.actions[:, part],
+                actions=each(batch.actions, partial(_columns, part=part)),
+                masks=each(batch.masks, partial(_columns, part=part)),
                 log_probs=log_probs[:, part],
                 targets=targets.values[:, part],
                 advantages=targets.advantages[:, part],
@@ -56,20 +59,24 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
         return
     rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
     order = rows[torch.randperm(len(rows)).to(rows.device)]
-    observations = batch.observations[:-1].flatten(0, 1)
 
     def select(values: Tensor, part: Tensor) -> Tensor:
-        return values.flatten(0, 1)[part].unsqueeze(0)
+        return values[: len(batch.rewards)].flatten(0, 1)[part].unsqueeze(0)
 
     for part in order.tensor_split(min(count, len(order))) if len(order) else ():
         yield Minibatch(
-            observations=observations[part].unsqueeze(0),
+            observations=each(batch.observations, partial(select, part=part)),
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
-            starts=select(batch.starts[:-1], part),
-            actions=select(batch.actions, part),
+            starts=select(batch.starts, part),
+            actions=each(batch.actions, partial(select, part=part)),
+            masks=each(batch.masks, partial(select, part=part)),
             log_probs=select(log_probs, part),
             targets=select(targets.values, part),
             advantages=select(targets.advantages, part),
             weights=select(targets.weights, part),
             valid=select(batch.valid, part),
         )
+
+
+def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:
+    return values[:rows, part]

@@ -8,7 +8,7 @@ from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import policy_gradient_loss, policy_weights
 from daedalus.algorithms.targets import TargetsFunction
-from daedalus.policy.network.distributions import ActionDistribution
+from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -21,7 +21,7 @@ class PolicyGradient:
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of the only update. See Algorithm."""
         parameters, values = forward(batch.observations, batch.initial_state, batch.starts)  # [T+1, B, ...]
-        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
+        log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions, batch.masks)
         with torch.no_grad():
             targets = self._targets(self._spec, batch, log_probs, values)
         normalize = self._spec.normalize_advantages

@@ -7,7 +7,7 @@ from daedalus.algorithms.a3c import A3c
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.impala import Impala
-from daedalus.policy.network.distributions import ActionDistribution
+from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
 
 Builder = Callable[[TrainingSpec, ActionDistribution], Algorithm]

@@ -7,13 +7,13 @@ of a rollout from the received frames. Pure numpy; codec.py encodes frames as by
 
 import numpy as np
 
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 
 class FrameStack:
     """Running stacks of E environments. With k = 1 a stack is the frame itself, without a stack axis."""
 
-    def __init__(self, space: ArraySpace, environments: int) -> None:
+    def __init__(self, space: ArraySpace | DiscreteSpace, environments: int) -> None:
         self._depth = space.frames
         self._frames = np.zeros((environments, space.frames, *space.shape), space.dtype)
 
@@ -41,6 +41,28 @@ class FrameStack:
         self._frames[:, -1] = frames
         for environment in np.flatnonzero(starts):
             self._frames[environment] = frames[environment]
+
+
+class ObservationStacks:
+    """Running stacks of every component of the observations of E environments."""
+
+    def __init__(self, spaces: Spaces, environments: int) -> None:
+        self._stacks = {name: FrameStack(space, environments) for name, space in spaces.observations.items()}
+
+    @property
+    def frames(self) -> dict[str, np.ndarray]:
+        """Frames of the stacks of each component [E, k, *frame_shape]; views."""
+        return {name: stack.frames for name, stack in self._stacks.items()}
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:
+        """Observations of the policy, each [E, *stacked_shape]; views, valid until the next `push`."""
+        return {name: stack.observations for name, stack in self._stacks.items()}
+
+    def push(self, frames: dict[str, np.ndarray], starts: np.ndarray) -> None:
+        """Add the next frame of each component and environment; arguments as for FrameStack."""
+        for name, stack in self._stacks.items():
+            stack.push(frames[name], starts)
 
 
 def stack_rows(frames: np.ndarray, valid: np.ndarray, out: np.ndarray) -> None:

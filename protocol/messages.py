@@ -74,14 +74,17 @@ class Rollout:
     the first frame of an episode replaces the frames before it (protocol/frames.py); without a frame stack k is 1.
     Environments reset by gymnasium's NEXT_STEP rule: the row after the end of an episode only resets the environment.
     Its action was ignored and it is not `valid`; its observation is the final observation of the episode.
+
+    Observations, actions and masks are maps of components, as in Spaces (protocol/spaces.py).
     """
 
     identity: RolloutIdentity
     policy_version: int  # of the behaviour policy
-    frames: np.ndarray  # [k-1 + T+1, E, *frame_shape]; the last row bootstraps
+    frames: dict[str, np.ndarray]  # each [k-1 + T+1, E, *frame_shape], discrete ones [T+1, E, D]; the last bootstraps
     initial_state: np.ndarray  # [E, S] float32, the policy's memory at row 0; S is 0 without a memory
-    actions: np.ndarray  # [T, E] integers
-    behaviour_log_probs: np.ndarray  # [T, E] float32, log mu(a_t | s_t)
+    actions: dict[str, np.ndarray]  # each [T, E, D]: integers, or float32 as ContinuousSpace describes
+    masks: dict[str, np.ndarray]  # of the masked actions [T, E, choices] bool, True for a legal choice
+    behaviour_log_probs: np.ndarray  # [T, E] float32, log mu(a_t | s_t), summed over the components of the action
     rewards: np.ndarray  # [T, E] float32, scaled and clipped for learning
     terminated: np.ndarray  # [T, E] bool, the environment ended the episode
     truncated: np.ndarray  # [T, E] bool, a limit ended the episode
@@ -90,41 +93,56 @@ class Rollout:
     episode_lengths: np.ndarray  # [K] int32, their env_steps
 
     def __post_init__(self) -> None:
-        if self.actions.ndim != 2:
-            raise ValueError(f"actions must be [T, E], not {self.actions.shape}")
-        rows, environments = self.actions.shape
+        if self.rewards.ndim != 2:
+            raise ValueError(f"rewards must be [T, E], not {self.rewards.shape}")
+        rows, environments = self.rewards.shape
         if rows == 0 or environments == 0:
             raise ValueError("a rollout must have at least one row and one environment")
-        if self.frames.ndim < 3 or len(self.frames) <= rows or self.frames.shape[1] != environments:
-            raise ValueError(f"frames must be [{rows + 1} or more, {environments}, ...], not {self.frames.shape}")
+        if not self.frames or not self.actions:
+            raise ValueError("a rollout must have observations and actions")
+        for name, frames in self.frames.items():
+            if frames.ndim < 3 or len(frames) <= rows or frames.shape[1] != environments:
+                raise ValueError(f"frames/{name} must be [{rows + 1} or more, {environments}, ...], not {frames.shape}")
         if self.initial_state.ndim != 2 or len(self.initial_state) != environments:
             raise ValueError(f"initial_state must be [{environments}, S], not {self.initial_state.shape}")
-        for name in ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
+        for kind, components in (("actions", self.actions), ("masks", self.masks)):
+            for name, values in components.items():
+                if values.ndim != 3 or values.shape[:2] != (rows, environments):
+                    raise ValueError(f"{kind}/{name} must be [{rows}, {environments}, D], not {values.shape}")
+        for name in ("behaviour_log_probs", "terminated", "truncated", "valid"):
             shape = getattr(self, name).shape
             if shape != (rows, environments):
-                raise ValueError(f"{name} must be [{rows}, {environments}] like actions, not {shape}")
-        for name in ("terminated", "truncated", "valid"):
-            if getattr(self, name).dtype != np.bool_:
-                raise ValueError(f"{name} must be bool, not {getattr(self, name).dtype}")
-        for name in ("initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
-            if getattr(self, name).dtype != np.float32:
-                raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
-        if self.actions.dtype.kind not in "iu" or self.episode_lengths.dtype.kind not in "iu":
-            raise ValueError("actions and episode_lengths must be integers")
+                raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {shape}")
+        self._check_dtypes()
         if self.episode_returns.ndim != 1 or self.episode_returns.shape != self.episode_lengths.shape:
             raise ValueError("episode_returns and episode_lengths must both be [K]")
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
 
+    def _check_dtypes(self) -> None:
+        masks = {f"masks/{name}": mask for name, mask in self.masks.items()}
+        flags = {name: getattr(self, name) for name in ("terminated", "truncated", "valid")}
+        for name, array in (flags | masks).items():
+            if array.dtype != np.bool_:
+                raise ValueError(f"{name} must be bool, not {array.dtype}")
+        for name in ("initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
+            if getattr(self, name).dtype != np.float32:
+                raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
+        for name, actions in self.actions.items():
+            if actions.dtype != np.float32 and actions.dtype.kind not in "iu":
+                raise ValueError(f"actions/{name} must be float32 or integers, not {actions.dtype}")
+        if self.episode_lengths.dtype.kind not in "iu":
+            raise ValueError("episode_lengths must be integers")
+
     @property
     def rows(self) -> int:
         """T, the number of rows."""
-        return self.actions.shape[0]
+        return self.rewards.shape[0]
 
     @property
     def environments(self) -> int:
         """E, the number of environments."""
-        return self.actions.shape[1]
+        return self.rewards.shape[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +166,7 @@ class Acknowledgement:
 class Snapshot:
     """Immutable weights of one policy version. Learner -> actors, on `snapshots`.
 
-    `program` is the hash of the program; `weights` has all of its inputs except the observations and the state.
+    `program` is the hash of the program; `weights` has all of its inputs that are weights.
     """
 
     learner_epoch: int

@@ -1,13 +1,20 @@
-"""The spaces of observations and actions in messages."""
+"""The spaces of observations and actions in messages: flat maps of named components.
+
+The environment's nested spaces are flattened to components, and actions back (actor/environments/components.py).
+"""
 
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
+_MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
+_MAX_COMPONENTS = 64
+
+ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]
 
 
 class ArraySpace(Specification):
@@ -24,9 +31,10 @@ class ArraySpace(Specification):
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> "ArraySpace":
-        size = math.prod(self.stacked_shape) * (4 if self.dtype == "float32" else 1)
-        if size > _MAX_OBSERVATION_BYTES:
-            raise ValueError(f"an observation of {self} has {size:,} bytes: use at most {_MAX_OBSERVATION_BYTES:,}")
+        if self.observation_bytes > _MAX_OBSERVATION_BYTES:
+            raise ValueError(
+                f"an observation of {self} has {self.observation_bytes:,} bytes: use at most {_MAX_OBSERVATION_BYTES:,}"
+            )
         return self
 
     @property
@@ -34,26 +42,160 @@ class ArraySpace(Specification):
         """Shape of the policy's observations."""
         return self.shape if self.frames == 1 else (self.frames, *self.shape)
 
+    @property
+    def observation_bytes(self) -> int:
+        """Size of one stacked observation."""
+        return math.prod(self.stacked_shape) * (4 if self.dtype == "float32" else 1)
+
+    @property
+    def is_image(self) -> bool:
+        """Whether a frame is an image: bytes in two or three dimensions, at least 16 pixels high and wide."""
+        if self.dtype != "uint8" or len(self.shape) not in (2, 3):
+            return False
+        sides = sorted(self.shape)[-2:]  # colours first or last: the two longest sides are those of the image
+        return min(sides) >= 16
+
     def __str__(self) -> str:
         stacked = f", {self.frames} stacked" if self.frames > 1 else ""
         return f"{self.dtype} array of shape {self.shape}{stacked}"
 
 
 class DiscreteSpace(Specification):
-    """Space of `count` choices, numbered from 0: gymnasium's Discrete with `start` subtracted."""
+    """D variables, each with a number of choices counted from 0: gymnasium's Discrete, MultiDiscrete and MultiBinary.
+
+    Values are integers [D].
+    """
 
     kind: Literal["discrete"] = "discrete"
-    count: Annotated[int, Field(ge=1, le=65_536)]
+    counts: Annotated[tuple[Annotated[int, Field(ge=1, le=_MAX_CHOICES)], ...], Field(min_length=1, max_length=4096)]
+    masked: bool = False  # an action space whose legal choices come with each observation
+
+    @model_validator(mode="after")
+    def _has_few_choices(self) -> "DiscreteSpace":
+        if self.choices > _MAX_CHOICES:
+            raise ValueError(f"{self} are {self.choices:,} choices together: use at most {_MAX_CHOICES:,}")
+        return self
+
+    @property
+    def choices(self) -> int:
+        """Number of choices of all variables together: the size of a mask, and of a one-hot encoding."""
+        return sum(self.counts)
+
+    @property
+    def size(self) -> int:
+        """D, the number of variables."""
+        return len(self.counts)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of a value, [D]. As an observation it has no frame stack."""
+        return (len(self.counts),)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that the policy observes: the newest."""
+        return 1
+
+    @property
+    def stacked_shape(self) -> tuple[int, ...]:
+        """Shape of the policy's observations."""
+        return self.shape
+
+    @property
+    def dtype(self) -> Literal["uint8", "uint16"]:
+        """Data type of values in messages."""
+        return "uint8" if max(self.counts) <= 256 else "uint16"
 
     def __str__(self) -> str:
-        return f"{self.count} choices"
+        masked = ", masked" if self.masked else ""
+        if self.size == 1:
+            return f"{self.counts[0]} choices{masked}"
+        listed = " x ".join(map(str, self.counts)) if self.size <= 8 else f"{self.size} variables"
+        return f"choices of {listed}{masked}"
+
+
+class ContinuousSpace(Specification):
+    """D continuous actions with optional bounds: gymnasium's Box, flattened.
+
+    In messages, an action with both bounds is scaled to [-1, 1]; any other is as the environment has it. Values are
+    float32 [D], and may lie outside the bounds: an actor clips them before the environment receives them.
+    """
+
+    kind: Literal["continuous"] = "continuous"
+    low: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096)]
+    high: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096)]
+
+    @model_validator(mode="after")
+    def _bounds_agree(self) -> "ContinuousSpace":
+        if len(self.low) != len(self.high):
+            raise ValueError(f"{len(self.low)} lower bounds, but {len(self.high)} upper bounds")
+        for low, high in zip(self.low, self.high, strict=True):
+            if not all(bound is None or math.isfinite(bound) for bound in (low, high)):
+                raise ValueError("a bound is not finite: leave it out")
+            if low is not None and high is not None and not low < high:
+                raise ValueError(f"the lower bound {low:g} is not below the upper bound {high:g}")
+        return self
+
+    @property
+    def size(self) -> int:
+        """D, the number of actions."""
+        return len(self.low)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether every action has both bounds."""
+        return None not in self.low and None not in self.high
+
+    @property
+    def dtype(self) -> Literal["float32"]:
+        """Data type of values in messages."""
+        return "float32"
+
+    def __str__(self) -> str:
+        bounds = sorted({(low, high) for low, high in zip(self.low, self.high, strict=True)}, key=str)
+        if len(bounds) > 1:
+            return f"{self.size} continuous"
+        low, high = bounds[0]
+        return f"{self.size} continuous from {'-inf' if low is None else f'{low:g}'} to " + (
+            "inf" if high is None else f"{high:g}"
+        )
+
+
+ObservationSpace = Annotated[ArraySpace | DiscreteSpace, Field(discriminator="kind")]
+ActionSpace = Annotated[DiscreteSpace | ContinuousSpace, Field(discriminator="kind")]
 
 
 class Spaces(Specification):
-    """Observation and action space of an environment; actors report them, and the learner checks that all agree."""
+    """Observation and action space of an environment; actors report them, and the learner checks that all agree.
 
-    observation: ArraySpace
-    action: DiscreteSpace
+    A space that is not composite has one component, `observation` or `action`.
+    """
+
+    observations: Annotated[dict[ComponentName, ObservationSpace], Field(min_length=1, max_length=_MAX_COMPONENTS)]
+    actions: Annotated[dict[ComponentName, ActionSpace], Field(min_length=1, max_length=_MAX_COMPONENTS)]
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> "Spaces":
+        arrays = [space for space in self.observations.values() if isinstance(space, ArraySpace)]
+        size = sum(space.observation_bytes for space in arrays)
+        if size > _MAX_OBSERVATION_BYTES:
+            raise ValueError(f"an observation has {size:,} bytes: use at most {_MAX_OBSERVATION_BYTES:,}")
+        return self
+
+    @property
+    def masks(self) -> dict[str, int]:
+        """Number of choices in the mask of each masked action component."""
+        return {
+            name: space.choices
+            for name, space in self.actions.items()
+            if isinstance(space, DiscreteSpace) and space.masked
+        }
 
     def __str__(self) -> str:
-        return f"observation: {self.observation}; action: {self.action}"
+        return f"observation: {_listed(self.observations)}; action: {_listed(self.actions)}"
+
+
+def _listed(components: dict[str, ArraySpace | DiscreteSpace] | dict[str, DiscreteSpace | ContinuousSpace]) -> str:
+    if len(components) == 1 and next(iter(components)) in ("observation", "action"):
+        return str(next(iter(components.values())))
+    return ", ".join(f"{name}: {space}" for name, space in components.items())

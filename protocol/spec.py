@@ -11,9 +11,11 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm
+from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
+FrameStackSize = Annotated[int, Field(ge=1, le=16)]
 
 
 class EnvironmentSpec(Specification):
@@ -47,8 +49,9 @@ class EnvironmentSpec(Specification):
     """Convert RGB frames to greyscale; the colour axis is removed."""
     resize: tuple[PositiveInt, PositiveInt] | None = None
     """Resize frames to (height, width); each pixel is the mean of the area that it covers."""
-    frame_stack: Annotated[int, Field(ge=1, le=16)] = 1
-    """Number of newest frames that the policy sees, stacked on a new first axis if more than one."""
+    frame_stack: FrameStackSize | dict[ComponentName, FrameStackSize] = 1
+    """Number of newest frames that the policy sees, stacked on a new first axis if more than one. For observations of
+    several components, a table by name; one number stands for all images, or for all arrays if there are no images."""
 
     # Learning uses these rewards and terminations; logs and evaluations show the true ones.
     reward_clip: Annotated[float, Field(gt=0.0)] | None = None
@@ -72,10 +75,31 @@ class PolicySpec(Specification):
     """Units of each hidden layer; the `mlp` encoder only."""
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation function; the `mlp` encoder only."""
+    normalize_observations: bool = False
+    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Images are left out."""
+    distribution: Annotated[
+        str, Field(pattern=r"^(gaussian|squashed_gaussian|gaussian_mixture|kumaraswamy|[\w.]+:\w+)$", max_length=200)
+    ] = "gaussian"
+    """Distribution of continuous actions: `gaussian`, `squashed_gaussian`, `gaussian_mixture`, `kumaraswamy`, or
+    `module:Class` for your own. Discrete actions are categorical."""
+    initial_std: Annotated[float, Field(gt=0.0, le=7.0)] = 0.6
+    """Standard deviation of the Gaussian distributions at the start; 1 is half the range of a bounded action."""
+    state_dependent_std: bool = False
+    """Let the network compute standard deviations from the observation. `gaussian` and `squashed_gaussian` only."""
+    mixture_components: Annotated[int, Field(ge=1, le=16)] = 3
+    """Gaussians in each mixture; `gaussian_mixture` only."""
+    separate_value_encoder: bool = False
+    """Give the value head an encoder of its own: the losses of policy and value then share no layer. Without memory."""
     memory: Literal["none", "gru"] = "none"
     """Recurrent layer between the encoder and the heads."""
     memory_units: Annotated[int, Field(ge=1, le=4096)] = 256
     """Size of the recurrent state."""
+
+    @model_validator(mode="after")
+    def _memory_is_shared(self) -> "PolicySpec":
+        if self.separate_value_encoder and self.memory != "none":
+            raise ValueError("policy.separate_value_encoder needs policy.memory=none: the memory is shared")
+        return self
 
 
 class CollectionSpec(Specification):
@@ -136,6 +160,8 @@ class TrainingSpec(Specification):
     """Weight of the policy's entropy."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus to this value over the budget. Unset: constant."""
+    normalize_rewards: bool = False
+    """Divide rewards by the running standard deviation of the discounted return, so that values are near one."""
     normalize_advantages: bool = False
     """Scale the advantages of each update to mean 0 and standard deviation 1."""
 
@@ -237,7 +263,8 @@ class RunSpec(Specification):
 
     @model_validator(mode="after")
     def _stack_fits_the_rollout(self) -> "RunSpec":
-        stack, rows = self.environment.frame_stack, self.collection.rollout_length
+        sizes, rows = self.environment.frame_stack, self.collection.rollout_length
+        stack = sizes if isinstance(sizes, int) else max(sizes.values(), default=1)
         if stack > rows:
             raise ValueError(
                 f"environment.frame_stack is {stack}, longer than a rollout: "

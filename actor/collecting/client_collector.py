@@ -11,6 +11,8 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.interface import Observed
+from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.acting.runtime import PolicyRuntime
@@ -25,9 +27,15 @@ _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoc
 class ClientCollector:
     """A Collector between two threads: the caller's, which acts, and the service's, which sends the rollouts."""
 
-    def __init__(self, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> None:
-        """`observation_space` and `action_space` are those of the caller's loop."""
+    def __init__(self, observation_space: gymnasium.Space, action_space: gymnasium.Space, example_mask: Any) -> None:
+        """Construct the collector.
+
+        Args:
+          observation_space, action_space: those of the caller's loop.
+          example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
+        """
         self._observation_space, self._action_space = observation_space, action_space
+        self._example_mask = example_mask
         self.policy_loaded = threading.Event()  # the caller may act
         self.on_rollout: Callable[[], None] = lambda: None  # called on the caller's thread when a rollout is full
         self._lock = threading.Lock()  # guards the next six
@@ -40,7 +48,7 @@ class ClientCollector:
         # For the caller's thread only:
         self._policy: tuple[PolicyRuntime, RolloutWriter] | None = None
         self._loaded: Snapshot | None = None  # in the runtime
-        self._last_frame: np.ndarray | None = None  # [1, *frame_shape]
+        self._last: Observed | None = None  # the newest observation
         self._acted = False  # the current row has an action and no outcome yet
         self._episode_ended = False  # the next row is a reset row
         self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
@@ -57,7 +65,8 @@ class ClientCollector:
         _refuse_unapplied_settings(spec.environment)
         with self._lock:
             self._bootstrap_terminations = spec.environment.bootstrap_terminations
-            self._transforms = Transforms(spec.environment, self._observation_space, self._action_space)
+            example = None if self._example_mask is None else mask_of_one(self._example_mask)
+            self._transforms = Transforms(spec.environment, self._observation_space, self._action_space, example)
             return self._transforms.spaces, 1
 
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
@@ -95,20 +104,20 @@ class ClientCollector:
 
     # --------------------------------------------------------------------------------- on the caller's thread
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Any, action_mask: Any = None) -> Any:
         """Return the action for an observation, which the last action, or the last episode's end, led to."""
-        frame = self._to_frame(observation)
-        self._switch_policy(frame)
+        observed = self._observe(observation, action_mask, needed=True)
+        self._switch_policy(observed)
         assert self._policy is not None
         if self._acted:
-            self._record(frame)
+            self._record(observed)
         if self._episode_ended:  # write the reset row, whose action has no effect
             self._choose()
             self._episode_ended = False
-            self._record(frame)
+            self._record(observed)
         self._acted = True
         assert self._transforms is not None
-        return self._transforms.env_actions(self._choose())[0]
+        return self._transforms.env_action(self._choose())
 
     def reward(self, value: float) -> None:
         """Add to the reward of the last action."""
@@ -123,7 +132,7 @@ class ClientCollector:
         if not self._acted:
             raise ValueError("the episode ended without any action: call act() first")
         if observation is not None:
-            self._last_frame = self._to_frame(observation)
+            self._last = self._observe(observation, self._example_mask, needed=False)
         elif not terminated:
             raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
         elif self._bootstrap_terminations:
@@ -132,34 +141,28 @@ class ClientCollector:
                 "pass the last observation"
             )
         self._terminated, self._truncated = terminated, not terminated
-        assert self._last_frame is not None
-        self._record(self._last_frame)
+        assert self._last is not None
+        self._record(self._last)
         self._episode_ended = True
 
-    def _to_frame(self, observation: Any) -> np.ndarray:
-        """Return a checked observation as the run has it, [1, *frame_shape]."""
-        space = self._observation_space
-        frame = np.asarray(observation, space.dtype)
-        if frame.shape != space.shape:
-            raise ValueError(f"the observation has shape {frame.shape}, but its space has shape {space.shape}")
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise ValueError("the observation has a value that is not finite")
+    def _observe(self, observation: Any, action_mask: Any, *, needed: bool) -> Observed:
+        """Return a checked observation as the run has it."""
         assert self._transforms is not None
-        return self._transforms.frames(frame[None])
+        return self._transforms.observe_one(observation, action_mask, needed)
 
-    def _switch_policy(self, frame: np.ndarray) -> None:
+    def _switch_policy(self, observed: Observed) -> None:
         """Continue with a policy that has begun meanwhile; discard the unfinished rollout of the previous one."""
-        self._last_frame = frame
+        self._last = observed
         with self._lock:
             if self._next_policy is None or self._snapshot is None:
                 return
             self._policy, self._next_policy = self._next_policy, None
         self._acted = self._episode_ended = False
         self._reward, self._terminated, self._truncated, self._loaded = 0.0, False, False, None
-        self._policy[1].start(frame)
+        self._policy[1].start(observed)
 
-    def _choose(self) -> np.ndarray:
-        """Return the actions [1] of the next row; load the newest weights first if the row begins a rollout."""
+    def _choose(self) -> dict[str, np.ndarray]:
+        """Return the actions {name: [1, D]} of the next row; load the newest weights first if it begins a rollout."""
         assert self._policy is not None
         runtime, writer = self._policy
         if writer.is_between_rollouts:
@@ -170,12 +173,14 @@ class ClientCollector:
                 self._loaded = snapshot
         return writer.act()
 
-    def _record(self, frame: np.ndarray) -> None:
+    def _record(self, observed: Observed) -> None:
         """Complete the row of the last action."""
         assert self._policy is not None
         assert self._loaded is not None
         writer = self._policy[1]
-        full = writer.record(frame, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated]))
+        full = writer.record(
+            observed, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated])
+        )
         self._acted, self._reward, self._terminated, self._truncated = False, 0.0, False, False
         if not full:
             return

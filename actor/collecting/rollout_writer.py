@@ -3,10 +3,12 @@
 import numpy as np
 
 from daedalus.actor.collecting.episode_counter import EpisodeCounter
+from daedalus.actor.environments.interface import Observed
+from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.frames import FrameStack
+from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -38,20 +40,24 @@ class RolloutWriter:
           random: source of the sampled actions.
         """
         rows = rollout_length
-        observation, action = spaces.observation, spaces.action
         self._runtime = runtime
         self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
         self._bootstrap_terminations = spec.bootstrap_terminations
-        self._random = random
+        self._random, self._count = random, count
         self._episodes = EpisodeCounter(count)
-        self._stack = FrameStack(observation, count)
+        self._stacks = ObservationStacks(spaces, count)
+        self._current_masks: dict[str, np.ndarray] = {}  # of the newest observations
         self._state = np.zeros((count, runtime.state_size), np.float32)
         self._next_state = self._state
         self._row = 0
 
-        self._frames = _frames(observation, rows, count)
+        self._frames = {name: _frames(space, rows, count) for name, space in spaces.observations.items()}
+        self._depths = {name: space.frames for name, space in spaces.observations.items()}
         self._initial_state = np.zeros_like(self._state)
-        self._actions = np.zeros((rows, count), np.uint8 if action.count <= 256 else np.uint16)
+        self._actions = {
+            name: np.zeros((rows, count, space.size), space.dtype) for name, space in spaces.actions.items()
+        }
+        self._masks = {name: np.ones((rows, count, size), np.bool_) for name, size in spaces.masks.items()}
         self._log_probs = np.zeros((rows, count), np.float32)
         self._rewards = np.zeros((rows, count), np.float32)
         self._terminated = np.zeros((rows, count), np.bool_)
@@ -63,37 +69,43 @@ class RolloutWriter:
         """Whether the next row is the first of a rollout: only then may the runtime load other weights."""
         return self._row == 0
 
-    def start(self, frames: np.ndarray) -> None:
-        """Begin with the first frames [E, *frame_shape] of all environments."""
-        self._stack.push(frames, np.ones(len(frames), np.bool_))
+    def start(self, observed: Observed) -> None:
+        """Begin with the first observations of all environments."""
+        self._stacks.push(observed.frames, np.ones(self._count, np.bool_))
+        self._current_masks = observed.masks
 
-    def act(self) -> np.ndarray:
-        """Return the actions [E] that the policy chooses for the next row."""
-        if self._row == 0:
-            depth = self._stack.frames.shape[1]
-            self._frames[:depth] = self._stack.frames.swapaxes(0, 1)
+    def act(self) -> dict[str, np.ndarray]:
+        """Return the actions {name: [E, D]} that the policy chooses for the next row."""
+        row = self._row
+        if row == 0:
+            for name, frames in self._stacks.frames.items():
+                self._frames[name][: self._depths[name]] = frames.swapaxes(0, 1)
             self._initial_state[:] = self._state
-        actions, self._log_probs[self._row], self._next_state = self._runtime.act(
-            self._stack.observations, self._state, self._random
-        )
-        self._actions[self._row] = actions
-        return actions
+        noise = draw_noise(self._runtime.noise_size, self._count, self._random)
+        choice = self._runtime.act(self._stacks.observations, self._state, noise, self._current_masks)
+        self._log_probs[row], self._next_state = choice.log_probs, choice.state
+        for name, actions in self._actions.items():
+            actions[row] = choice.actions[name]
+        for name, masks in self._masks.items():
+            masks[row] = self._current_masks[name]
+        return choice.actions
 
-    def record(self, frames: np.ndarray, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
+    def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
-        row, depth = self._row, self._stack.frames.shape[1]
-        valid = self._episodes.valid
-        self._frames[depth + row] = frames
+        row, valid = self._row, self._episodes.valid
+        for name, frames in self._frames.items():
+            frames[self._depths[name] + row] = observed.frames[name]
         self._rewards[row] = rewards
         self._terminated[row] = terminated
         self._truncated[row] = truncated
         self._valid[row] = valid
         # The row after a reset row is the first of its episode: its frame stack and memory begin anew.
-        self._stack.push(frames, ~valid)
+        self._stacks.push(observed.frames, ~valid)
+        self._current_masks = observed.masks
         self._state = self._next_state * valid[:, None]
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
         self._row += 1
-        return self._row == len(self._actions)
+        return self._row == len(self._rewards)
 
     def finish(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
         """Return the full rollout. Its arrays are views: encode or copy it before the next `act`."""
@@ -111,6 +123,7 @@ class RolloutWriter:
             frames=self._frames,
             initial_state=self._initial_state,
             actions=self._actions,
+            masks=self._masks,
             behaviour_log_probs=self._log_probs,
             rewards=self._rewards,
             terminated=self._terminated,
@@ -121,7 +134,7 @@ class RolloutWriter:
         )
 
 
-def _frames(space: ArraySpace, rows: int, environments: int) -> np.ndarray:
+def _frames(space: ArraySpace | DiscreteSpace, rows: int, environments: int) -> np.ndarray:
     """Return an array for a rollout's frames [k-1 + T+1, E, *frame_shape].
 
     Images are stored environment by environment, as they are sent: consecutive images are alike and compress well.

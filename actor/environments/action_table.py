@@ -1,4 +1,4 @@
-"""Action indices, counted from 0, mapped to the environment's own actions."""
+"""Action tables: discrete choices over a continuous action space."""
 
 import gymnasium
 import numpy as np
@@ -6,29 +6,14 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 
 
-def env_actions(table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> np.ndarray:
-    """Return the environment's own action for each action index, [count, *action_shape].
-
-    Args:
-      table: over a Box, a row of numbers for each action; None for a Discrete space.
-      space: the action space of one environment.
+def table_actions(table: tuple[tuple[float, ...], ...], space: gymnasium.Space) -> np.ndarray:
+    """Return the environment's action for each row of the table, [count, *action_shape].
 
     Raises EnvironmentSetupError if the table does not fit the space.
     """
-    if isinstance(space, gymnasium.spaces.Discrete):
-        if table is not None:
-            raise EnvironmentSetupError(
-                f"environment.action_table has {len(table)} rows, but action space {space} needs no table: leave it out"
-            )
-        return np.arange(space.start, space.start + space.n)
     if not isinstance(space, gymnasium.spaces.Box):
         raise EnvironmentSetupError(
-            f"action space {space} is not supported: it must be Discrete, or a Box with an environment.action_table"
-        )
-    if table is None:
-        raise EnvironmentSetupError(
-            f"action space {space} is not supported without a table: it must be Discrete; "
-            f"list the actions to choose from in environment.action_table, {_size(space)} numbers each"
+            f"environment.action_table has {len(table)} rows, but action space {space} needs no table: leave it out"
         )
     return _checked(table, space)
 

@@ -21,6 +21,8 @@ _PURPOSE = "environment.backend=ale"
 class AleEnvironments:
     """A BackendEnvironments over an AtariVectorEnv with stacks of one frame."""
 
+    action_mask = None
+
     def __init__(self, environment: Any) -> None:
         self._environment = environment
         self.count: int = environment.num_envs

@@ -31,6 +31,8 @@ class EnvpoolEnvironments:
     Ended episodes are reset by index, as the pool's own autoreset does.
     """
 
+    action_mask = None
+
     def __init__(
         self,
         envpool: Any,

@@ -19,6 +19,8 @@ from daedalus.actor.environments.environment_errors import (
     unknown_environment,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.interface import BackendStep
+from daedalus.actor.environments.masks import MASK_KEY
 from daedalus.protocol.spec import EnvironmentSpec
 
 Camera = Callable[[np.ndarray], None]
@@ -30,22 +32,47 @@ class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
     def __init__(self, environment: Any) -> None:
+        """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them."""
         self._environment = environment
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
+        self.action_mask: Any = None
+        if not isinstance(self.action_space, gymnasium.spaces.Box):
+            self.reset(0)
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
-        return self._environment.reset(seed=seed)[0]
+        observations, info = self._environment.reset(seed=seed)
+        self.action_mask = info.get(MASK_KEY)
+        return observations
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments."""
-        return self._environment.step(actions)[:4]
+        observations, rewards, terminated, truncated, info = self._environment.step(actions)
+        self.action_mask = info.get(MASK_KEY)
+        return observations, rewards, terminated, truncated
 
     def close(self) -> None:
         """See BackendEnvironments."""
         self._environment.close()
+
+
+class MaskInInfo(gymnasium.Wrapper):
+    """A wrapper that puts the result of the environment's `action_masks()` into `info`."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {**info, MASK_KEY: self._mask()}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, MASK_KEY: self._mask()}
+
+    def _mask(self) -> np.ndarray:
+        return np.asarray(self.env.get_wrapper_attr("action_masks")(), np.bool_)
 
 
 class RepeatedSteps(gymnasium.Wrapper):
@@ -119,6 +146,8 @@ class EnvironmentFactory:
         )
         if self.wrap is not None:
             environment = _wrapped(environment, self.wrap)
+        if environment.has_wrapper_attr("action_masks"):
+            environment = MaskInInfo(environment)
         if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
             environment = RepeatedSteps(
                 environment, repeat=spec.action_repeat, no_reward_limit=spec.no_reward_limit, camera=self.camera

@@ -4,14 +4,23 @@ The step after an episode's end ignores its action and resets. Observations are 
 stacks them. Rewards are the environment's own.
 """
 
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 
 from daedalus.protocol.spaces import Spaces
 
-Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+class Observed(NamedTuple):
+    """What E environments show: one frame of each component, and which actions are legal."""
+
+    frames: dict[str, np.ndarray]  # of each component [E, *frame_shape]
+    masks: dict[str, np.ndarray]  # of the masked actions [E, choices] bool
+
+
+Step = tuple[Observed, np.ndarray, np.ndarray, np.ndarray]
+BackendStep = tuple[Any, np.ndarray, np.ndarray, np.ndarray]
 
 
 class VectorEnvironment(Protocol):
@@ -27,15 +36,19 @@ class VectorEnvironment(Protocol):
         """The observation and action space of one environment, as the run has them."""
         ...
 
-    def reset(self, seed: int) -> np.ndarray:
-        """Start an episode in each environment; return frames [E, *frame_shape]."""
+    def reset(self, seed: int) -> Observed:
+        """Start an episode in each environment."""
         ...
 
-    def step(self, actions: np.ndarray) -> Step:
-        """Take one action [E] in each environment, repeated as the specification says.
+    def step(self, actions: dict[str, np.ndarray]) -> Step:
+        """Take one action in each environment, repeated as the specification says.
 
-        Returns: frames [E, *frame_shape], true rewards [E] (summed over the repeats), terminated [E], truncated [E].
+        Args:
+          actions: of each component [E, D].
+
+        Returns: the next observations, true rewards [E] (summed over the repeats), terminated [E], truncated [E].
         In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame.
+        Raises EnvironmentSetupError for a mask that forbids every action.
         """
         ...
 
@@ -62,12 +75,20 @@ class BackendEnvironments(Protocol):
         """The action space of one environment."""
         ...
 
-    def reset(self, seed: int) -> np.ndarray:
-        """See VectorEnvironment."""
+    @property
+    def action_mask(self) -> Any:
+        """The legal actions of the newest observations, batched as gymnasium's `info` is; None without masks.
+
+        Known from construction on: an environment either has masks or has none.
+        """
         ...
 
-    def step(self, actions: np.ndarray) -> Step:
-        """See VectorEnvironment; actions [E, *action_shape] are the environment's own."""
+    def reset(self, seed: int) -> Any:
+        """Start an episode in each environment, and return batched observations of the environment's own space."""
+        ...
+
+    def step(self, actions: Any) -> BackendStep:
+        """See VectorEnvironment; observations and actions are the environment's own, batched by component."""
         ...
 
     def close(self) -> None:

@@ -1,58 +1,112 @@
-"""The action table and pixel transforms of a specification, applied to a backend's environments."""
+"""The transforms of a specification, applied to a backend's environments: components, action table, pixels, masks."""
 
 from typing import Any
 
 import gymnasium
 import numpy as np
+from pydantic import ValidationError
 
-from daedalus.actor.environments.action_table import env_actions
+from daedalus.actor.environments.components import (
+    ActionComponents,
+    ObservationComponent,
+    batch_of_one,
+    observation_components,
+    only_of_batch,
+)
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.interface import BackendEnvironments, Step
+from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
+from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
+ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
+
 
 class Transforms:
-    """The mapping between an environment's spaces and the run's: action table and pixel transforms."""
+    """The mapping between an environment's spaces and the run's.
+
+    `spaces` are the run's: flat maps of components, after the action table and the pixel transforms.
+    """
 
     def __init__(
-        self, spec: EnvironmentSpec, observation_space: gymnasium.Space, action_space: gymnasium.Space
+        self,
+        spec: EnvironmentSpec,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+        action_mask: Any = None,
     ) -> None:
-        """Raises EnvironmentSetupError if the specification does not fit the spaces."""
-        if not isinstance(observation_space, gymnasium.spaces.Box) or not 1 <= len(observation_space.shape) <= 4:
-            raise EnvironmentSetupError(
-                f"observation space {observation_space} is not supported: it must be a Box with one to four dimensions"
-            )
-        self._observation_space = observation_space
-        self._actions = env_actions(spec.action_table, action_space)
-        self._pixels = Pixels(spec, observation_space)
-        dtype = "uint8" if observation_space.dtype == np.uint8 else "float32"
-        self.spaces = Spaces(
-            observation=ArraySpace(shape=self._pixels.shape, dtype=dtype, frames=spec.frame_stack),
-            action=DiscreteSpace(count=len(self._actions)),
-        )
+        """Construct the mapping.
 
-    def frame(self, observation: Any) -> np.ndarray:
-        """Return one observation of the environment as the run has it: [1, *frame_shape].
+        Args:
+          spec: the transforms.
+          observation_space, action_space: of one environment.
+          action_mask: the mask that accompanied a batch of observations; None if the environment has no masks.
 
-        Raises ValueError if the observation is not of the environment's space.
+        Raises EnvironmentSetupError if the specification does not fit the spaces.
         """
-        space = self._observation_space
-        frame = np.asarray(observation, space.dtype)
-        if frame.shape != space.shape:
-            raise ValueError(f"the observation has shape {frame.shape}, its space {space.shape}")
-        if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-            raise ValueError("the observation has a value that is not finite")
-        return self.frames(frame[None])
+        self._observation_space, self._action_space = observation_space, action_space
+        self._actions = ActionComponents(spec.action_table, action_space)
+        components = observation_components(observation_space)
+        self._mask_source = mask_component(components, self._actions.spaces)
+        self._observations = [component for component in components if component is not self._mask_source]
+        if not self._observations:
+            raise EnvironmentSetupError(f"observation space {observation_space} has nothing but the {MASK_KEY}")
+        example = action_mask if self._mask_source is None else np.ones((1, *self._mask_source.shape), np.bool_)
+        self._masks = Masks(self._actions.spaces, example)
+        self._pixels = _pixels(spec, self._observations)
+        try:
+            self.spaces = Spaces(
+                observations=_observation_spaces(spec, self._observations, self._pixels),
+                actions=self._masks.spaces,
+            )
+        except ValidationError as error:
+            raise EnvironmentSetupError(
+                f"observation space {observation_space} is not supported: {error.errors()[0]['msg']}"
+            ) from None
 
-    def frames(self, frames: np.ndarray) -> np.ndarray:
-        """Return the environment's frames [E, ...] as the run has them: [E, *frame_shape]."""
-        return self._pixels(frames)
+    def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
+        """Return batched observations of the environment as the run has them.
 
-    def env_actions(self, indices: np.ndarray) -> np.ndarray:
-        """Return the environment's actions [E, *action_shape] for action indices [E]."""
-        return self._actions[indices]
+        Args:
+          observations: of the environment's own space, each component with a first axis E.
+          action_mask: as BackendEnvironments has it.
+          needed: [E] bool, whether an action will be taken from the observation: then a choice must be legal.
+
+        Raises EnvironmentSetupError for a mask that forbids every choice where one is needed, or of a wrong size.
+        """
+        frames = {}
+        for component in self._observations:
+            values, pixels = component.values(observations), self._pixels.get(component.leaf.name)
+            frames[component.leaf.name] = values if pixels is None else pixels(values)
+        if self._mask_source is not None:
+            action_mask = self._mask_source.values(observations)
+        return Observed(frames, self._masks(action_mask, needed))
+
+    def observe_one(self, observation: Any, action_mask: Any, needed: bool = True) -> Observed:
+        """Return one observation of the environment's own space as the run has it, with E = 1.
+
+        Args:
+          observation: one observation; it is checked.
+          action_mask: the legal choices, one array or a map of them by action component; None without masks.
+          needed: whether an action will be taken from it.
+
+        Raises ValueError if the observation or the mask does not fit the spaces.
+        """
+        batch = batch_of_one(self._observation_space, observation)
+        mask = None if action_mask is None else mask_of_one(action_mask)
+        try:
+            return self.observe(batch, mask, np.array([needed]))
+        except EnvironmentSetupError as error:
+            raise ValueError(str(error)) from None
+
+    def env_actions(self, actions: dict[str, np.ndarray]) -> Any:
+        """Return the environment's batched actions for the run's {name: [E, D]}."""
+        return self._actions.env_actions(actions)
+
+    def env_action(self, actions: dict[str, np.ndarray]) -> Any:
+        """Return the environment's action for the run's {name: [1, D]}."""
+        return only_of_batch(self._action_space, self._actions.env_actions(actions))
 
 
 class TransformedEnvironment:
@@ -61,7 +115,9 @@ class TransformedEnvironment:
     def __init__(self, environments: BackendEnvironments, spec: EnvironmentSpec) -> None:
         """Raises EnvironmentSetupError if the specification does not fit the environments."""
         self._environments = environments
-        self._transforms = Transforms(spec, environments.observation_space, environments.action_space)
+        self._transforms = Transforms(
+            spec, environments.observation_space, environments.action_space, environments.action_mask
+        )
 
     @property
     def count(self) -> int:
@@ -73,15 +129,83 @@ class TransformedEnvironment:
         """See VectorEnvironment."""
         return self._transforms.spaces
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, seed: int) -> Observed:
         """See VectorEnvironment."""
-        return self._transforms.frames(self._environments.reset(seed))
+        observations = self._environments.reset(seed)
+        return self._transforms.observe(observations, self._environments.action_mask, np.ones(self.count, np.bool_))
 
-    def step(self, actions: np.ndarray) -> Step:
+    def step(self, actions: dict[str, np.ndarray]) -> Step:
         """See VectorEnvironment."""
-        frames, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
-        return self._transforms.frames(frames), rewards, terminated, truncated
+        observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
+        needed = ~(terminated | truncated)  # after an episode's end the next step only resets
+        observed = self._transforms.observe(observations, self._environments.action_mask, needed)
+        return observed, rewards, terminated, truncated
 
     def close(self) -> None:
         """See VectorEnvironment."""
         self._environments.close()
+
+
+def _pixels(spec: EnvironmentSpec, components: list[ObservationComponent]) -> dict[str, Pixels]:
+    """Return the pixel transforms of each image; of the only component whatever it is, so that a misfit is reported."""
+    if spec.crop is None and not spec.grey and spec.resize is None:
+        return {}
+    images = [component for component in components if _is_image(component)] if len(components) > 1 else components
+    if not images:
+        raise EnvironmentSetupError(
+            "environment.crop, grey and resize need an image, but the observation has none: leave them out"
+        )
+    return {component.leaf.name: Pixels(spec, _box(component)) for component in images}
+
+
+def _is_image(component: ObservationComponent) -> bool:
+    space = component.leaf.space
+    if not isinstance(space, gymnasium.spaces.Box) or space.dtype != np.uint8:
+        return False
+    return ArraySpace(shape=component.shape, dtype="uint8").is_image
+
+
+def _box(component: ObservationComponent) -> gymnasium.spaces.Box:
+    space = component.leaf.space
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise EnvironmentSetupError(f"environment.crop, grey and resize do not fit observation space {space}")
+    return space
+
+
+def _observation_spaces(
+    spec: EnvironmentSpec, components: list[ObservationComponent], pixels: dict[str, Pixels]
+) -> ObservationSpaces:
+    spaces: ObservationSpaces = {}
+    for component in components:
+        name = component.leaf.name
+        if component.first is not None:
+            spaces[name] = DiscreteSpace(counts=component.counts)
+        else:
+            shape = pixels[name].shape if name in pixels else component.shape
+            dtype = "uint8" if component.leaf.space.dtype == np.uint8 else "float32"
+            spaces[name] = ArraySpace(shape=shape, dtype=dtype)
+    depths = _stack_depths(spec, spaces)
+    return {
+        name: space.model_copy(update={"frames": depths[name]}) if isinstance(space, ArraySpace) else space
+        for name, space in spaces.items()
+    }
+
+
+def _stack_depths(spec: EnvironmentSpec, spaces: ObservationSpaces) -> dict[str, int]:
+    """Return the depth of the frame stack of each component."""
+    arrays = {name: space for name, space in spaces.items() if isinstance(space, ArraySpace)}
+    depth = spec.frame_stack
+    if isinstance(depth, dict):
+        unknown = [name for name in depth if name not in arrays]
+        if unknown:
+            raise EnvironmentSetupError(
+                f"environment.frame_stack names {unknown[0]!r}, but the arrays of the observation are "
+                f"{', '.join(arrays) or 'none'}"
+            )
+        return {name: depth.get(name, 1) for name in arrays}
+    if depth > 1 and not arrays:
+        raise EnvironmentSetupError(
+            f"environment.frame_stack is {depth}, but the observation has no array to stack: leave it out"
+        )
+    images = {name for name, space in arrays.items() if space.is_image}
+    return {name: depth if name in (images or arrays) else 1 for name in arrays}

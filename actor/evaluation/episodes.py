@@ -8,8 +8,9 @@ import numpy as np
 
 from daedalus.actor.collecting.episode_counter import EpisodeCounter, FinishedEpisodes
 from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.frames import FrameStack
+from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import EnvironmentSpec
 
 _MAX_ENVIRONMENTS = 100
@@ -60,18 +61,21 @@ def play_episodes(
     """
     count = environments.count
     environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
-    random = np.random.default_rng(action_seed) if sampled else None
+    random = np.random.default_rng(action_seed)
     counter, counted = EpisodeCounter(count), _CountedEpisodes(episodes, count)
-    stack = FrameStack(environments.spaces.observation, count)
+    stacks = ObservationStacks(environments.spaces, count)
     state = np.zeros((count, runtime.state_size), np.float32)
-    stack.push(environments.reset(int(environment_seed)), np.ones(count, np.bool_))
+    observed = environments.reset(int(environment_seed))
+    stacks.push(observed.frames, np.ones(count, np.bool_))
+    neutral = neutral_noise(runtime.noise_size, count)
     while not counted.complete:
         valid = counter.valid
-        actions, _, next_state = runtime.act(stack.observations, state, random)
-        frames, rewards, terminated, truncated = environments.step(actions)
+        noise = draw_noise(runtime.noise_size, count, random) if sampled else neutral
+        choice = runtime.act(stacks.observations, state, noise, observed.masks)
+        observed, rewards, terminated, truncated = environments.step(choice.actions)
         # As in RolloutWriter: the frame stack and the memory begin anew with each episode.
-        stack.push(frames, ~valid)
-        state = next_state * valid[:, None]
+        stacks.push(observed.frames, ~valid)
+        state = choice.state * valid[:, None]
         counter.step(rewards, terminated, truncated)
         ended = terminated | truncated
         if ended.any():

@@ -1,5 +1,6 @@
 """A trained policy for a loop of the caller's own: load it from a run, give it observations, take its actions."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,13 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
+from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
-from daedalus.protocol.frames import FrameStack
+from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import RunSpec
 
 
@@ -28,7 +31,8 @@ class Policy:
         self.spec: RunSpec = saved.spec
         self.policy_version: int = saved.policy_version
         self.observation_space, self.action_space = observation_space, action_space
-        self._transforms = Transforms(saved.spec.environment, observation_space, action_space)
+        masks = {name: np.ones((1, size), np.bool_) for name, size in saved.spaces.masks.items()}
+        self._transforms = Transforms(saved.spec.environment, observation_space, action_space, masks or None)
         if self._transforms.spaces != saved.spaces:
             raise EnvironmentSetupError(
                 f"the environment has {self._transforms.spaces} after the run's transforms; the policy was trained on "
@@ -44,12 +48,12 @@ class Policy:
         """Start an episode: forget what was seen. `seed` is for the actions of `act(sampled=True)`."""
         if seed is not None:
             self._random = np.random.default_rng(seed)
-        self._stack = FrameStack(self._transforms.spaces.observation, 1)
+        self._stacks = ObservationStacks(self._transforms.spaces, 1)
         self._state = np.zeros((1, self._runtime.state_size), np.float32)
         self._action: Any = None
         self._repeats_left = 0
 
-    def act(self, observation: Any, *, sampled: bool = False) -> Any:
+    def act(self, observation: Any, *, sampled: bool = False, action_mask: Any = None) -> Any:
         """Return the action for the next step of the environment: the most probable one, or a sampled one.
 
         Call it once for every step, with the newest observation, and call `reset` at the start of each episode. If the
@@ -58,20 +62,23 @@ class Policy:
         Args:
           observation: one observation, of the environment's own shape and dtype.
           sampled: sample from the policy's distribution, as training does.
+          action_mask: the legal choices, if the environment has masks: an array, or a map of arrays by component.
 
         Raises ValueError for an observation that is not of the space.
         """
         if self._repeats_left == 0:
-            self._action = self._choose(self._transforms.frame(observation), sampled)
+            self._action = self._choose(self._transforms.observe_one(observation, action_mask), sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
-        return self._action.copy()
+        return copy.deepcopy(self._action)
 
-    def _choose(self, frame: np.ndarray, sampled: bool) -> Any:
-        self._stack.push(frame, np.array([self._action is None]))
-        random = self._random if sampled else None
-        actions, _, self._state = self._runtime.act(self._stack.observations, self._state, random)
-        return self._transforms.env_actions(actions)[0]
+    def _choose(self, observed: Observed, sampled: bool) -> Any:
+        self._stacks.push(observed.frames, np.array([self._action is None]))
+        size = self._runtime.noise_size
+        noise = draw_noise(size, 1, self._random) if sampled else neutral_noise(size, 1)
+        choice = self._runtime.act(self._stacks.observations, self._state, noise, observed.masks)
+        self._state = choice.state
+        return self._transforms.env_action(choice.actions)
 
 
 def load_policy(

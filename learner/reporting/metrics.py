@@ -1,7 +1,7 @@
 """Columns of the metrics, and the interface of a metrics writer."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -47,7 +47,7 @@ class Details:
 
     returns: Sequence[float] = ()  # of the newest episodes
     lengths: Sequence[int] = ()
-    action_counts: Sequence[int] = ()  # by action, since the previous details
+    action_counts: Mapping[str, Sequence[int]] = field(default_factory=dict)  # by component, since the last
     picture: np.ndarray | None = None  # one observation as the network receives it: uint8 [H, W] or [H, W, 3]
 
 

@@ -49,10 +49,11 @@ class TensorBoardWriter:
             for tag, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
             if len(numbers)
         ]
-        if sum(details.action_counts):
-            chosen = np.array(details.action_counts)
-            edges = np.arange(len(chosen) + 1) - 0.5
-            values.append(self._summary.Value(tag="action", histo=self._histogram(chosen, edges, ())))
+        for name, counts in details.action_counts.items():
+            if sum(counts):
+                tag = "action" if name == "action" else f"action/{name}"
+                histogram = self._histogram(np.array(counts), np.arange(len(counts) + 1) - 0.5, ())
+                values.append(self._summary.Value(tag=tag, histo=histogram))
         if details.picture is not None:
             values.append(self._summary.Value(tag="what_the_network_sees", image=self._image(details.picture)))
         self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
@@ -19,6 +20,7 @@ from daedalus.protocol.spec import RunSpec
 
 _ROW_BYTES = 1 + 2 + 4 * 4 + 8  # per environment and row, without the observation, rounded up
 _SLACK_BYTES = 64 << 10
+_OTHER_ARRAYS = 16  # besides observations, actions and masks
 _MAX_REWARD = 1e9  # beyond it squares of returns overflow float32, and no update has a finite gradient
 
 
@@ -125,34 +127,32 @@ class Intake:
 
     def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
         """Return the size limits of a rollout, from the specification and the number of environments of the actor."""
-        frame = math.prod(spaces.observation.shape) * np.dtype(spaces.observation.dtype).itemsize
-        rows = self._spec.collection.rollout_length + spaces.observation.frames
-        row_bytes = actor.environments * (frame + _ROW_BYTES)
-        state_bytes = 4 * actor.environments * self.state_size
-        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16)
+        row = _ROW_BYTES + sum(spaces.masks.values())
+        row += sum(space.size * np.dtype(space.dtype).itemsize for space in spaces.actions.values())
+        size = self._spec.collection.rollout_length * row + 4 * self.state_size
+        for space in spaces.observations.values():
+            frame = math.prod(space.shape) * np.dtype(space.dtype).itemsize
+            size += (self._spec.collection.rollout_length + space.frames) * frame
+        arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions)
+        padding = _SLACK_BYTES + arrays * 8
+        return Limits(max_bytes=actor.environments * size + padding, max_arrays=arrays)
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
-        space, rows = spaces.observation, self._spec.collection.rollout_length
+        rows = self._spec.collection.rollout_length
         if (rollout.rows, rollout.environments) != (rows, actor.environments):
             return (
                 f"the rollout has {rollout.rows} rows of {rollout.environments} environments, "
                 f"expected {rows} rows of {actor.environments} environments"
             )
-        expected = (rows + space.frames, actor.environments, *space.shape)
-        if rollout.frames.shape != expected or rollout.frames.dtype != space.dtype:
-            return (
-                f"frames are {rollout.frames.dtype} {rollout.frames.shape}, expected {space.dtype} {expected} ({space})"
-            )
         if rollout.initial_state.shape[1] != self.state_size:
             return f"initial_state has size {rollout.initial_state.shape[1]}, expected {self.state_size}"
-        if rollout.actions.min() < 0 or rollout.actions.max() >= spaces.action.count:
-            return f"actions has a value outside {spaces.action}"
-        for name in ("frames", "initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
+        violation = first_component_violation(rollout, spaces)
+        if violation:
+            return violation
+        for name in ("initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
             if not np.isfinite(getattr(rollout, name)).all():
                 return f"{name} has a value that is not finite"
-        if (rollout.behaviour_log_probs > 1e-4).any():
-            return "behaviour_log_probs has a value above 0"
         environment = self._spec.environment
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale

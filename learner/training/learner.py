@@ -11,6 +11,7 @@ from daedalus.algorithms.batch import BatchAssembler
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.learner.training.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
@@ -42,7 +43,9 @@ class Learner:
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
         self._optimizer = build_optimizer(spec, self._flat.values)
-        self._assembler = BatchAssembler(spaces.observation, self._device)
+        self._assembler = BatchAssembler(spaces, self._device)
+        self._observations = ObservationStatistics(self._network.normalizer)
+        self._rewards = RewardNormalizer(spec.discount_factor) if spec.normalize_rewards else None
         self.metrics = UpdateMetrics(spaces, self._device)
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
@@ -59,10 +62,14 @@ class Learner:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
-        batch = self._assembler.join(rollouts).to(self._device)
+        batch = self._assembler.join(rollouts)
+        if self._rewards is not None:
+            self._rewards.normalize(batch, rollouts)
+        batch = batch.to(self._device)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             self.policy_version += 1
             self._apply_gradients(terms, self.learning_rate(progress))
+        self._observations.add(batch)
         self.metrics.add_batch(batch)
 
     def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:
@@ -86,7 +93,7 @@ class Learner:
 
     def program(self) -> bytes:
         """Return the policy program (daedalus/policy/acting/program.py)."""
-        return export_program(self._network, self._spaces.observation)
+        return export_program(self._network, self._spaces)
 
     def weights(self) -> dict[str, np.ndarray]:
         """Return all parameters as numpy arrays.
@@ -96,10 +103,16 @@ class Learner:
         return {name: parameter.detach().cpu().numpy() for name, parameter in self._parameters.items()}
 
     def state(self) -> dict[str, Tensor]:
-        """Return the training state besides the parameters: optimiser statistics and random state."""
-        kind = self._spec.optimizer
-        statistics = {f"{kind}/{name}": value for name, value in self._optimizer.statistics.items()}
-        return {"torch_random_state": torch.get_rng_state(), **statistics}
+        """Return the training state besides the parameters: optimiser and running statistics, random state."""
+        return {"torch_random_state": torch.get_rng_state(), **self._statistics()}
+
+    def _statistics(self) -> dict[str, Tensor]:
+        statistics = {f"{self._spec.optimizer}/{name}": value for name, value in self._optimizer.statistics.items()}
+        for component, moments in self._observations.moments.items():
+            statistics |= {f"observations/{component}/{name}": value for name, value in moments.state().items()}
+        if self._rewards is not None:
+            statistics |= {f"returns/{name}": value for name, value in self._rewards.moments.state().items()}
+        return statistics
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
         """Restore a version from the results of `weights` and `state`; training then continues exactly as before.
@@ -115,11 +128,12 @@ class Learner:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(parameters[name].copy()))
-        for name, statistic in self._optimizer.statistics.items():
-            saved = state.get(f"{self._spec.optimizer}/{name}")
+        for name, statistic in self._statistics().items():
+            saved = state.get(name)
             if saved is None or saved.shape != statistic.shape:
                 raise CheckpointMismatchError(
-                    "the statistics of the checkpoint are of another optimiser: restore training.optimizer of the run"
+                    f"the checkpoint lacks the statistics {name!r}: restore training.optimizer, "
+                    "training.normalize_rewards and policy.normalize_observations of the run"
                 )
             statistic.copy_(saved)
         torch.set_rng_state(state["torch_random_state"])

@@ -1,12 +1,14 @@
 """Metrics of updates and batches since the last metrics row. State; no I/O."""
 
+import itertools
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import Terms
-from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
 METRICS = (*Terms._fields, GRADIENT_NORM)
@@ -19,11 +21,22 @@ class UpdateMetrics:
     """
 
     def __init__(self, spaces: Spaces, device: torch.device) -> None:
-        self._observation = spaces.observation
+        arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
+        self._image = next((name for name, space in arrays.items() if _shows_image(space)), None)
+        self._image_space = arrays.get(self._image or "")
         self._sums = torch.zeros(len(METRICS), device=device)
         self._updates = 0
-        self._action_counts = torch.zeros(spaces.action.count, dtype=torch.int64, device=device)
-        self._newest: Tensor | None = None  # the first observation of the newest batch
+        self._action_counts = {
+            name: torch.zeros(space.choices, dtype=torch.int64, device=device)
+            for name, space in spaces.actions.items()
+            if isinstance(space, DiscreteSpace)
+        }
+        self._first_choices = {  # of each variable among all choices of its component
+            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device)
+            for name, space in spaces.actions.items()
+            if isinstance(space, DiscreteSpace)
+        }
+        self._newest: Tensor | None = None  # the first image of the newest batch
 
     def add_update(self, terms: Terms, gradient_norm: Tensor) -> None:
         """Add the metrics of an update that changed the parameters."""
@@ -32,9 +45,12 @@ class UpdateMetrics:
 
     def add_batch(self, batch: Batch) -> None:
         """Count the actions of a batch, and keep one of its observations."""
-        self._newest = batch.observations[0, 0]
-        chosen = torch.bincount(batch.actions.flatten(), batch.valid.flatten(), len(self._action_counts))
-        self._action_counts += chosen.to(torch.int64)
+        if self._image is not None:
+            self._newest = batch.observations[self._image][0, 0]
+        for name, counts in self._action_counts.items():
+            choices = batch.actions[name] + self._first_choices[name]  # [T, B, D]
+            weights = batch.valid.unsqueeze(-1).expand(choices.shape)
+            counts += torch.bincount(choices.flatten(), weights.flatten(), len(counts)).to(torch.int64)
 
     def take_means(self) -> dict[str, float]:
         """Return means over the updates since the last call, by name; empty if there were no updates."""
@@ -45,11 +61,12 @@ class UpdateMetrics:
         self._updates = 0
         return dict(zip(METRICS, means, strict=True))
 
-    def take_action_counts(self) -> list[int]:
-        """Return the number of times each action was chosen in the batches since the last call."""
-        counts = self._action_counts.tolist()
-        self._action_counts.zero_()
-        return counts
+    def take_action_counts(self) -> dict[str, list[int]]:
+        """Return how often each choice of each discrete component was chosen in the batches since the last call."""
+        taken = {name: counts.tolist() for name, counts in self._action_counts.items()}
+        for counts in self._action_counts.values():
+            counts.zero_()
+        return taken
 
     def take_observation_image(self) -> np.ndarray | None:
         """Return an observation of the newest batch, with its frames side by side: uint8 [H, W] or [H, W, 3].
@@ -57,13 +74,14 @@ class UpdateMetrics:
         Returns None if observations are not images, or without a batch since the last call.
         """
         newest, self._newest = self._newest, None
-        return None if newest is None else _image(newest, self._observation)
+        if newest is None or self._image_space is None:
+            return None
+        space = self._image_space
+        frames = newest.cpu().numpy().reshape(space.frames, *space.shape)
+        side_by_side = np.concatenate(list(frames), axis=1)  # [H, k * W, ...]
+        return side_by_side[..., 0] if space.shape[2:] == (1,) else side_by_side
 
 
-def _image(observation: Tensor, space: ArraySpace) -> np.ndarray | None:
+def _shows_image(space: ArraySpace) -> bool:
     colours = space.shape[2:] in ((1,), (3,))
-    if space.dtype != "uint8" or not (len(space.shape) == 2 or colours):
-        return None
-    frames = observation.cpu().numpy().reshape(space.frames, *space.shape)
-    side_by_side = np.concatenate(list(frames), axis=1)  # [H, k * W, ...]
-    return side_by_side[..., 0] if space.shape[2:] == (1,) else side_by_side
+    return space.dtype == "uint8" and (len(space.shape) == 2 or colours)

@@ -1,7 +1,8 @@
 """Exporting a torch network as an ONNX program: the part of the forward pass that acting needs, without weights.
 
 The weights are inputs of the program, named like the parameters; a runtime binds the weights of a snapshot. So the
-program travels once, and every torch module that can be exported runs where torch is not installed.
+program travels once, and every torch module that can be exported runs where torch is not installed. Sampling is part
+of the program: the caller only draws random numbers.
 """
 
 import io
@@ -11,65 +12,90 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.acting.runtime import NEXT_STATE, OBSERVATIONS, STATE, OnnxRuntime, PolicyError
+from daedalus.policy.acting.runtime import (
+    LOG_PROB,
+    NEXT_STATE,
+    NORMAL,
+    STATE,
+    UNIFORM,
+    OnnxRuntime,
+    PolicyError,
+    action_name,
+    mask_name,
+    observation_name,
+)
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 _OPSET = 17
+_ROWS = 2  # of the example that is traced
 
 
 class _Acting(nn.Module):
     """A module whose `forward` is the network's `act`; shares the parameters and their names."""
 
-    def __init__(self, network: ActorCritic) -> None:
+    def __init__(self, network: ActorCritic, spaces: Spaces) -> None:
         super().__init__()
         self._network = [network]  # in a list, so that it is not registered and parameters keep their names
+        self._actions = tuple(spaces.actions)
         for name, child in network.named_children():
             self.add_module(name, child)
 
-    def forward(self, observations: Tensor, state: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        parameters, next_state = self._network[0].act(observations, state)
-        return (parameters, next_state) if self._network[0].state_size else parameters
+    def forward(
+        self,
+        observations: dict[str, Tensor],
+        state: Tensor,
+        uniform: Tensor,
+        normal: Tensor,
+        masks: dict[str, Tensor],
+    ) -> tuple[Tensor, ...]:
+        actions, log_prob, next_state = self._network[0].act(observations, state, uniform, normal, masks)
+        outputs = (*(actions[name] for name in self._actions), log_prob)
+        return (*outputs, next_state) if self._network[0].state_size else outputs
 
 
-def export_program(network: ActorCritic, observation: ArraySpace) -> bytes:
+def export_program(network: ActorCritic, spaces: Spaces) -> bytes:
     """Return the ONNX program of a network.
 
-    Its inputs are `observations` [N, *stacked_shape] and the weights; its output holds the parameters of the action
-    distributions [N, P] (`logits` [N, A] for a discrete space). A network with a memory adds the input `state` [N, S]
-    and the output `next_state` [N, S]. Raises NetworkError if a user's encoder cannot be exported.
+    Inputs, each with N rows: `observations/NAME` [N, *stacked_shape]; `masks/NAME` [N, choices] bool of masked
+    actions; `uniform` [N, U] and `normal` [N, G] float32 noise, where U or G is not 0; `state` [N, S] with a memory;
+    and the weights. Outputs: `actions/NAME` [N, D], int64 or float32; `log_prob` [N]; `next_state` [N, S] with a
+    memory. Raises NetworkError if code of the user cannot be exported.
     """
-    if not isinstance(network.encoder, CustomEncoder):
-        return _export(network, observation)
     try:
-        program = _export(network, observation)
+        program = _export(network, spaces)
         weights = {name: parameter.detach().cpu().numpy() for name, parameter in network.named_parameters()}
         OnnxRuntime(program).load(weights)
     except PolicyError as error:
-        raise NetworkError(f"actors cannot run the program of the encoder: {error}") from None
-    except Exception as error:  # the exporter calls the user's code, which may raise anything
+        raise NetworkError(f"actors cannot run the program of the policy: {error}") from None
+    except Exception as error:  # the exporter calls code of the user, which may raise anything
         first_line = next(iter(str(error).strip().splitlines()), "")
-        raise NetworkError(f"the encoder cannot be exported to ONNX: {type(error).__name__}: {first_line}") from error
+        raise NetworkError(f"the policy cannot be exported to ONNX: {type(error).__name__}: {first_line}") from error
     return program
 
 
-def _export(network: ActorCritic, observation: ArraySpace) -> bytes:
+def _export(network: ActorCritic, spaces: Spaces) -> bytes:
     device = next(network.parameters()).device
-    observations = torch.zeros((2, *observation.stacked_shape), dtype=getattr(torch, observation.dtype), device=device)
-    state = torch.zeros((2, network.state_size), device=device)
-    parameters = network.distribution.program_output
-    inputs, outputs = [OBSERVATIONS], [parameters]
-    if network.state_size:
-        inputs, outputs = [OBSERVATIONS, STATE], [parameters, NEXT_STATE]
+    distribution = network.distribution
+    observations = {
+        name: torch.zeros((_ROWS, *space.stacked_shape), dtype=_dtype(space), device=device)
+        for name, space in spaces.observations.items()
+    }
+    state = torch.zeros((_ROWS, network.state_size), device=device)
+    uniform = torch.full((_ROWS, distribution.uniform_count), 0.5, device=device)
+    normal = torch.zeros((_ROWS, distribution.normal_count), device=device)
+    masks = {name: torch.ones((_ROWS, size), dtype=torch.bool, device=device) for name, size in spaces.masks.items()}
+    inputs = [observation_name(name) for name in observations]
+    inputs += [STATE, UNIFORM, NORMAL, *map(mask_name, masks)]
+    outputs = [*map(action_name, spaces.actions), LOG_PROB, *([NEXT_STATE] if network.state_size else [])]
     program: Any = io.BytesIO()  # torch accepts a file, although its annotation does not
     with warnings.catch_warnings(), torch.no_grad():
         # The TorchScript exporter is deprecated, but takes 0.2 s; its successor takes several times as long.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            _Acting(network),
-            (observations, state),
+            _Acting(network, spaces),
+            (observations, state, uniform, normal, masks, {}),
             program,
             dynamo=False,
             export_params=False,
@@ -83,3 +109,7 @@ def _export(network: ActorCritic, observation: ArraySpace) -> bytes:
             dynamic_axes={name: {0: "rows"} for name in inputs + outputs},
         )
     return program.getvalue()
+
+
+def _dtype(space: ArraySpace | DiscreteSpace) -> torch.dtype:
+    return torch.int64 if isinstance(space, DiscreteSpace) else getattr(torch, space.dtype)

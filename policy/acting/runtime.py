@@ -5,21 +5,30 @@ TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actor
 
 import hashlib
 import os
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import onnxruntime
 
+from daedalus.policy.acting.noise import Noise, NoiseSize
 from daedalus.policy.acting.onnx_initializers import with_initializers
-from daedalus.policy.acting.sampling import SAMPLERS
 
-OBSERVATIONS, STATE = "observations", "state"
-NEXT_STATE = "next_state"
-_MAX_STATE_SIZE = 1 << 16
+STATE, UNIFORM, NORMAL = "state", "uniform", "normal"
+LOG_PROB, NEXT_STATE = "log_prob", "next_state"
+_OBSERVATIONS, _MASKS, _ACTIONS = "observations/", "masks/", "actions/"
+_MAX_STATE_SIZE = _MAX_NOISE_SIZE = 1 << 16
 
 
 class PolicyError(Exception):
     """A program or weights that do not fit together or do not fit the spaces: a fault of the sender."""
+
+
+class Choice(NamedTuple):
+    """What a policy chose for one row of E environments."""
+
+    actions: dict[str, np.ndarray]  # of each component [E, D], int64 or float32, as in a rollout
+    log_probs: np.ndarray  # [E] float32, of the whole actions
+    state: np.ndarray  # [E, S] float32, the policy's memory for the next row
 
 
 class PolicyRuntime(Protocol):
@@ -30,6 +39,11 @@ class PolicyRuntime(Protocol):
         """S, the size of the policy's memory; 0 for a policy without one."""
         ...
 
+    @property
+    def noise_size(self) -> NoiseSize:
+        """How many random numbers the choice of one action takes."""
+        ...
+
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Use these weights in all later calls. Raises PolicyError if names, shapes or dtypes do not fit.
 
@@ -38,17 +52,15 @@ class PolicyRuntime(Protocol):
         ...
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Choose one action for each observation: a sample if `random` is given, otherwise the most probable.
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
+        """Choose one action for each environment: a sample, or the greedy one if the noise is neutral.
 
         Args:
-          observations: [E, *stacked_shape].
+          observations: of each component [E, *stacked_shape].
           state: [E, S] float32, the policy's memory before this row; zeros where an episode starts.
-          random: source of random numbers, or None for greedy actions.
-
-        Returns: actions [E] int64, their log-probabilities [E] float32, and the state [E, S] float32 for the
-        next row.
+          noise: for E rows.
+          masks: of the masked actions [E, choices] bool, True for a legal choice.
         """
         ...
 
@@ -56,6 +68,21 @@ class PolicyRuntime(Protocol):
 def program_hash(model: bytes) -> str:
     """Return the name of a program: the SHA-256 of its bytes, in hexadecimal."""
     return hashlib.sha256(model).hexdigest()
+
+
+def observation_name(component: str) -> str:
+    """Return the name of a program's input for one component of the observation."""
+    return _OBSERVATIONS + component
+
+
+def mask_name(component: str) -> str:
+    """Return the name of a program's input for the mask of one component of the action."""
+    return _MASKS + component
+
+
+def action_name(component: str) -> str:
+    """Return the name of a program's output for one component of the action."""
+    return _ACTIONS + component
 
 
 class OnnxRuntime:
@@ -70,26 +97,27 @@ class OnnxRuntime:
         self._model = model
         self._session = _session(model)
         inputs = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
-        outputs = {entry.name: entry.type for entry in self._session.get_outputs()}
-        self._parameters = next(iter(outputs), "")  # name of the first output
-        expected = [self._parameters, NEXT_STATE] if STATE in inputs else [self._parameters]
-        known = OBSERVATIONS in inputs and self._parameters in SAMPLERS
-        if not known or list(outputs) != expected or set(outputs.values()) != {"tensor(float)"}:
-            raise PolicyError(
-                f"the program must compute {' or '.join(map(repr, SAMPLERS))} from {OBSERVATIONS!r}, "
-                f"and {NEXT_STATE!r} from {STATE!r} if it has a memory"
-            )
-        self._sampler = SAMPLERS[self._parameters]
-        del inputs[OBSERVATIONS]
-        self._state_size = _state_size(inputs.pop(STATE)) if STATE in inputs else 0
-        self._shapes = inputs
-        self._convolutional = any(len(shape) > 2 for shape in inputs.values())
+        self._actions = _action_components([entry.name for entry in self._session.get_outputs()], STATE in inputs)
+        self._integers = {
+            entry.name for entry in self._session.get_inputs() if entry.type == "tensor(int64)"
+        }  # discrete observations, which messages hold in fewer bits
+        self._components = {name for name in inputs if name.startswith((_OBSERVATIONS, _MASKS))}
+        self._state_size = _size(inputs, STATE, _MAX_STATE_SIZE)
+        self._noise_size = NoiseSize(_size(inputs, UNIFORM, _MAX_NOISE_SIZE), _size(inputs, NORMAL, _MAX_NOISE_SIZE))
+        others = self._components | {STATE, UNIFORM, NORMAL}
+        self._shapes = {name: shape for name, shape in inputs.items() if name not in others}
+        self._convolutional = any(len(shape) > 2 for shape in self._shapes.values())
         self._feed: dict[str, np.ndarray] = {}
 
     @property
     def state_size(self) -> int:
         """See PolicyRuntime."""
         return self._state_size
+
+    @property
+    def noise_size(self) -> NoiseSize:
+        """See PolicyRuntime."""
+        return self._noise_size
 
     @property
     def weight_names(self) -> tuple[str, ...]:
@@ -113,28 +141,61 @@ class OnnxRuntime:
             self._feed = bound
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
-        self._feed[OBSERVATIONS] = observations
+        feed = self._feed
+        for name, values in observations.items():
+            self._set(_OBSERVATIONS + name, values)
+        for name, mask in masks.items():
+            self._set(_MASKS + name, mask)
         if self._state_size:
-            self._feed[STATE] = state
+            feed[STATE] = state
+        if self._noise_size.uniform:
+            feed[UNIFORM] = noise.uniform
+        if self._noise_size.normal:
+            feed[NORMAL] = noise.normal
         try:
-            outputs: Any = self._session.run(None, self._feed)
+            outputs: Any = self._session.run(None, feed)
         except Exception as error:  # onnxruntime's exceptions share no base of their own
             raise PolicyError(f"the program failed: {_first_line(error)}") from None
-        parameters = outputs[0]  # [E, P]
-        if parameters.ndim != 2 or parameters.shape[0] != len(observations) or not parameters.shape[1]:
+        return self._checked(outputs, state)
+
+    def _set(self, name: str, values: np.ndarray) -> None:
+        """Set an input. One that the network does not use, such as by an encoder of the user, is not in the program."""
+        if name in self._integers:
+            self._feed[name] = values.astype(np.int64)
+        elif name in self._components:
+            self._feed[name] = values
+
+    def _checked(self, outputs: list[np.ndarray], state: np.ndarray) -> Choice:
+        rows = len(state)
+        actions = dict(zip(self._actions, outputs, strict=False))
+        for name, values in actions.items():
+            if values.ndim != 2 or len(values) != rows or values.dtype not in (np.int64, np.float32):
+                raise PolicyError(f"the program returns {name!r} {values.dtype} {values.shape} for {rows} observations")
+        log_probs = outputs[len(actions)]
+        if log_probs.shape != (rows,) or log_probs.dtype != np.float32:
             raise PolicyError(
-                f"the program returns {self._parameters!r} {parameters.shape} for {len(observations)} observations"
+                f"the program returns {LOG_PROB!r} {log_probs.dtype} {log_probs.shape} for {rows} observations"
             )
-        if self._state_size:
-            if outputs[1].shape != state.shape:
-                raise PolicyError(f"the program returns {NEXT_STATE!r} {outputs[1].shape} for {STATE!r} {state.shape}")
-            state = outputs[1]
-        sampler = self._sampler
-        actions, log_probs = sampler.mode(parameters) if random is None else sampler.sample(parameters, random)
-        return actions, log_probs, state
+        if not self._state_size:
+            return Choice(actions, log_probs, state)
+        next_state = outputs[-1]
+        if next_state.shape != state.shape or next_state.dtype != np.float32:
+            raise PolicyError(f"the program returns {NEXT_STATE!r} {next_state.shape} for {STATE!r} {state.shape}")
+        return Choice(actions, log_probs, next_state)
+
+
+def _action_components(outputs: list[str], remembers: bool) -> tuple[str, ...]:
+    """Return the components of the actions that a program computes. Raises PolicyError for unknown outputs."""
+    names = tuple(name.removeprefix(_ACTIONS) for name in outputs if name.startswith(_ACTIONS))
+    if not names or outputs != [*map(action_name, names), LOG_PROB, *([NEXT_STATE] if remembers else [])]:
+        raise PolicyError(
+            f"the program must compute {action_name('NAME')!r} and {LOG_PROB!r}, and {NEXT_STATE!r} from {STATE!r} if "
+            f"it has a memory, but it computes {', '.join(outputs)[:200]}"
+        )
+    return names
 
 
 def _session(model: bytes) -> onnxruntime.InferenceSession:
@@ -151,13 +212,15 @@ def _session(model: bytes) -> onnxruntime.InferenceSession:
         raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
 
 
-def _state_size(shape: tuple[Any, ...]) -> int:
-    match shape:
-        case (_, int(size)) if 0 < size <= _MAX_STATE_SIZE:
+def _size(inputs: dict[str, tuple[Any, ...]], name: str, largest: int) -> int:
+    """Return the second dimension of an input, or 0 if the program does not have it."""
+    match inputs.get(name, (None, 0)):
+        case (_, int(size)) if 0 <= size <= largest:
             return size
-    raise PolicyError(
-        f"the program's {STATE!r} has shape {shape}, it must be [rows, S] with S from 1 to {_MAX_STATE_SIZE}"
-    )
+        case shape:
+            raise PolicyError(
+                f"the program's {name!r} has shape {shape}, it must be [rows, size] with size up to {largest}"
+            )
 
 
 def _first_line(error: Exception) -> str:

@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from daedalus.policy.acting.runtime import PolicyError
-from daedalus.policy.acting.sampling import SAMPLERS
+from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.runtime import Choice, PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
 
@@ -15,26 +15,34 @@ class TorchRuntime:
     """Runs the network with torch on one thread."""
 
     def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise PolicyError if the network cannot be built, or has an encoder that the user supplies."""
-        if ":" in spec.encoder:
-            # The name came over the wire; importing it would execute code that another process chose.
-            raise PolicyError(f"the encoder {spec.encoder!r} is custom code, not imported here: use --runtime onnx")
+        """Raise PolicyError if the network cannot be built, or has code that the user supplies."""
+        for name in (spec.encoder, spec.distribution):
+            if ":" in name:
+                # The name came over the wire; importing it would execute code that another process chose.
+                raise PolicyError(f"{name!r} is custom code, not imported here: use --runtime onnx")
         torch.set_num_threads(1)
         try:
             self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
         except NetworkError as error:
             raise PolicyError(str(error)) from None
-        self._sampler = SAMPLERS[self._network.distribution.program_output]
+        distribution = self._network.distribution
+        self._noise_size = NoiseSize(distribution.uniform_count, distribution.normal_count)
+        self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
         self._parameters = dict(self._network.named_parameters())
-        self._acting = [name for name in self._parameters if not name.startswith("value_head")]
+        self._acting = [name for name in self._parameters if not name.startswith("value_")]
 
     @property
     def state_size(self) -> int:
         """See PolicyRuntime."""
         return self._network.state_size
 
+    @property
+    def noise_size(self) -> NoiseSize:
+        """See PolicyRuntime."""
+        return self._noise_size
+
     def load(self, weights: dict[str, np.ndarray]) -> None:
-        """See PolicyRuntime. The value head may be absent: acting does not use it."""
+        """See PolicyRuntime. The value head and its encoder may be absent: acting does not use them."""
         missing = [name for name in self._acting if name not in weights]
         if missing:
             raise PolicyError(f"the snapshot lacks the weights {missing[0]!r} of the network")
@@ -49,10 +57,19 @@ class TorchRuntime:
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
         """See PolicyRuntime."""
-        output, next_state = self._network.act(torch.from_numpy(observations), torch.from_numpy(state))
-        parameters, sampler = output.numpy(), self._sampler
-        actions, log_probs = sampler.mode(parameters) if random is None else sampler.sample(parameters, random)
-        return actions, log_probs, next_state.numpy() if self.state_size else state
+        tensors = {
+            name: torch.from_numpy(values.astype(np.int64) if name in self._discrete else values)
+            for name, values in observations.items()
+        }
+        actions, log_probs, next_state = self._network.act(
+            tensors,
+            torch.from_numpy(state),
+            torch.from_numpy(noise.uniform),
+            torch.from_numpy(noise.normal),
+            {name: torch.from_numpy(mask) for name, mask in masks.items()},
+        )
+        chosen = {name: values.numpy() for name, values in actions.items()}
+        return Choice(chosen, log_probs.numpy(), next_state.numpy() if self.state_size else state)

@@ -3,31 +3,36 @@
 import torch
 from torch import Tensor, nn
 
-from daedalus.policy.network.distributions import distribution_for
+from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
+from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
 _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observation
 
+Components = dict[str, Tensor]
+
 
 class ActorCritic(nn.Module):
-    """Encoder, memory, policy head, value head.
+    """Normaliser, encoder, memory, policy head with the distribution of actions, value head.
 
     Learning calls `forward`; acting needs only `act`, which is what the exported program computes.
     """
 
     def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise NetworkError if the encoder does not accept observations of this space."""
+        """Raise NetworkError if the encoder or the distribution does not support the spaces."""
         super().__init__()
-        self.distribution = distribution_for(spaces.action)
-        self.encoder = build_encoder(spec, spaces.observation)
+        self.distribution = ActionDistribution(spec, spaces)
+        self.normalizer = ObservationNormalizer(spaces.observations if spec.normalize_observations else {})
+        self.encoder = build_encoder(spec, spaces.observations)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1))
+        self.value_encoder = build_encoder(spec, spaces.observations) if spec.separate_value_encoder else None
 
     @property
     def state_size(self) -> int:
@@ -39,25 +44,45 @@ class ActorCritic(nn.Module):
         """Whether the network has convolutions, which then take most of its time."""
         return any(isinstance(module, nn.Conv2d) for module in self.modules())
 
-    def forward(self, observations: Tensor, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+    def learned_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that have gradients: all but the statistics of the normaliser."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def forward(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         """Compute policies and values for R consecutive rows of B environments.
 
         Args:
-          observations: [R, B, *stacked_shape].
+          observations: of each component [R, B, *stacked_shape].
           state: [B, S] float32, the memory before row 0.
           starts: [R, B] bool, whether an episode starts with the row, which clears the memory.
 
-        Returns: parameters of the action distributions [R, B, P] (for a discrete space logits, P = A) and values
-        [R, B], float32 also under autocast.
+        Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast.
         """
-        features = self.encoder(observations.flatten(0, 1)).unflatten(0, starts.shape)  # [R, B, F]
-        remembered = self.memory.unroll(features, state, starts)
+        flat = {name: values.flatten(0, 1) for name, values in observations.items()}
+        normalized = self.normalizer(flat)
+        features = self.encoder(normalized).unflatten(0, starts.shape)  # [R, B, F]
+        remembered = critic = self.memory.unroll(features, state, starts)
+        if self.value_encoder is not None:
+            critic = self.value_encoder(normalized).unflatten(0, starts.shape)
         # Both heads in full precision: bfloat16 would round values and logits to 8 bits, which is much of a TD error.
         with torch.autocast(remembered.device.type, enabled=False):
-            remembered = remembered.float()
-            return self.policy_head(remembered), self.value_head(remembered).squeeze(-1)
+            return self.policy_head(remembered.float()), self.value_head(critic.float()).squeeze(-1)
 
-    def act(self, observations: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute one row: observations [N, *stacked_shape], state [N, S] -> parameters [N, P], next state [N, S]."""
-        remembered, state = self.memory.step(self.encoder(observations), state)
-        return self.policy_head(remembered), state
+    def act(
+        self, observations: Components, state: Tensor, uniform: Tensor, normal: Tensor, masks: Components
+    ) -> tuple[Components, Tensor, Tensor]:
+        """Choose the actions of one row of N environments.
+
+        Args:
+          observations: of each component [N, *stacked_shape].
+          state: [N, S].
+          uniform: [N, U] noise from 0 to 1, 1 excluded.
+          normal: [N, G] standard normal noise.
+          masks: of the masked actions [N, choices] bool.
+
+        Returns: actions of each component [N, D], their log-probability [N], next state [N, S].
+        """
+        remembered, state = self.memory.step(self.encoder(self.normalizer(observations)), state)
+        parameters = self.policy_head(remembered)
+        actions = self.distribution.sample(parameters, uniform, normal, masks)
+        return actions, self.distribution.log_prob(parameters, actions, masks), state

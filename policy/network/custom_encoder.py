@@ -1,55 +1,53 @@
 """An encoder supplied by the user as `module:Class`: any torch.nn.Module that can be exported to ONNX.
 
 The class is constructed with one argument, the shape of an observation, frame stack included. It is called with
-observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32.
+observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32. If the
+observation has several components, it is constructed with a map of shapes, and called with a map of tensors.
 """
-
-import importlib
-import os
-import sys
 
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+
+ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 
 
 class CustomEncoder(nn.Module):
     """The user's module, imported, constructed and checked."""
 
-    def __init__(self, name: str, space: ArraySpace) -> None:
+    def __init__(self, name: str, spaces: ObservationSpaces) -> None:
         """Raise NetworkError, naming the encoder, if it cannot be imported, constructed or called."""
         super().__init__()
+        self._only = next(iter(spaces)) if len(spaces) == 1 else None
+        shapes = {component: space.stacked_shape for component, space in spaces.items()}
         try:
-            self.module = _find(name)(space.stacked_shape)
-            self.features = _checked_features(self.module, space)
+            self.module = find_class(name, nn.Module)(shapes if self._only is None else shapes[self._only])
+            self.features = _checked_features(self.module, self._inputs(_zeros(spaces)))
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
             first_line = next(iter(str(error).strip().splitlines()), "")
             raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}") from error
 
-    def forward(self, observations: Tensor) -> Tensor:
-        """Encode observations: [N, *stacked_shape] -> [N, features]."""
-        return self.module(observations)
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
+        return self.module(self._inputs(observations))
+
+    def _inputs(self, observations: dict[str, Tensor]) -> Tensor | dict[str, Tensor]:
+        return observations if self._only is None else observations[self._only]
 
 
-def _find(name: str) -> type[nn.Module]:
-    module_name, class_name = name.split(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise NetworkError(f"{error}; install it, or run in the folder of {module_name}.py") from error
-    found = getattr(module, class_name, None)
-    if not (isinstance(found, type) and issubclass(found, nn.Module)):
-        raise NetworkError(f"{module.__file__} has no torch.nn.Module {class_name!r}; name one of its classes")
-    return found
+def _zeros(spaces: ObservationSpaces) -> dict[str, Tensor]:
+    return {
+        name: torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype))
+        for name, space in spaces.items()
+    }
 
 
-def _checked_features(module: nn.Module, space: ArraySpace) -> int:
+def _checked_features(module: nn.Module, zeros: Tensor | dict[str, Tensor]) -> int:
     """Return the number of features, from a call with zeros. Raises NetworkError if the module is not an encoder."""
     buffers = [name for name, _ in module.named_buffers()]
     if buffers:
@@ -57,13 +55,13 @@ def _checked_features(module: nn.Module, space: ArraySpace) -> int:
             f"its buffer {buffers[0]!r} would not reach the actors, which receive only parameters: avoid buffers "
             "(use LayerNorm instead of BatchNorm)"
         )
-    zeros = torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype))
     with torch.no_grad():
         features = module(zeros)
     declared = getattr(module, "features", None)
     if not isinstance(features, Tensor) or features.ndim != 2 or len(features) != 2:
         shape = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
-        raise NetworkError(f"returns {shape} for 2 observations {tuple(zeros.shape)}; it must return [2, features]")
+        given = tuple(zeros.shape) if isinstance(zeros, Tensor) else {k: tuple(v.shape) for k, v in zeros.items()}
+        raise NetworkError(f"returns {shape} for 2 observations {given}; it must return [2, features]")
     if features.dtype != torch.float32:
         raise NetworkError(f"returns {features.dtype}; it must return torch.float32")
     if isinstance(declared, int) and declared != features.shape[1]:

@@ -1,66 +1,136 @@
 """The encoders by name. Needs torch: actors do not import this file.
 
-Each is an nn.Module [N, *stacked_shape] -> [N, features] with the attribute `features`.
+Each is an nn.Module with the attribute `features`: that of one array maps [N, *stacked_shape] to [N, features], that of
+several components takes a map of them.
 """
 
 import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
-from daedalus.policy.network.custom_encoder import CustomEncoder
+from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
+from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.layers import orthogonal
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _GAIN = math.sqrt(2.0)
 
+Observations = dict[str, Tensor]
 
-class MultilayerPerceptron(nn.Module):
-    """Fully connected layers (possibly none) on the flattened observation: [N, *stacked_shape] -> [N, features].
 
-    `uint8` observations are scaled to [0, 1].
+class FlatEncoder(nn.Module):
+    """Fully connected layers (possibly none) on all components side by side: {name: [N, ...]} -> [N, features].
+
+    Arrays are flattened, `uint8` ones that are not normalised scaled to [0, 1]; discrete components are one-hot.
     """
 
-    def __init__(self, space: ArraySpace, hidden: tuple[int, ...], activation: str) -> None:
+    def __init__(self, spaces: ObservationSpaces, spec: PolicySpec) -> None:
         super().__init__()
-        self._scale = 1.0 / 255.0 if space.dtype == "uint8" else None
+        self._spaces = spaces
         layers: list[nn.Module] = []
-        width = math.prod(space.stacked_shape)
-        for units in hidden:
-            layers += [orthogonal(nn.Linear(width, units), _GAIN), _ACTIVATIONS[activation]()]
+        width = sum(_width(space) for space in spaces.values())
+        for units in spec.hidden:
+            layers += [orthogonal(nn.Linear(width, units), _GAIN), _ACTIVATIONS[spec.activation]()]
             width = units
         self.layers = nn.Sequential(*layers)
         self.features = width
 
-    def forward(self, observations: Tensor) -> Tensor:
-        """Encode observations: [N, *stacked_shape] -> [N, features]."""
-        flat = observations.flatten(1)  # [N, prod(stacked_shape)]
-        if self._scale is not None:
-            flat = flat.to(torch.float32) * self._scale
-        return self.layers(flat)
+    def forward(self, observations: Observations) -> Tensor:
+        """Encode observations."""
+        parts = [_flat(observations[name], space) for name, space in self._spaces.items()]
+        return self.layers(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
 
 
-Encoder = MultilayerPerceptron | ImageEncoder | CustomEncoder
+class ArrayEncoder(nn.Module):
+    """An encoder of one array, as the encoder of a map with this component. The parameters keep their names."""
+
+    def __init__(self, name: str, encoder: ImageEncoder) -> None:
+        super().__init__()
+        self._name, self.features = name, encoder.features
+        self._encoder = [encoder]  # in a list, so that it is not registered and its parameters keep their names
+        for child_name, child in encoder.named_children():
+            self.add_module(child_name, child)
+
+    def forward(self, observations: Observations) -> Tensor:
+        """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
+        return self._encoder[0](observations[self._name])
 
 
-def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
-    """Return the encoder that the specification names, for observations of the space.
+class CompositeEncoder(nn.Module):
+    """An encoder for each image, and a multilayer perceptron for everything else; their features side by side."""
+
+    def __init__(self, images: ObservationSpaces, others: ObservationSpaces, spec: PolicySpec) -> None:
+        super().__init__()
+        self._names = tuple(images)
+        encoders = [_array_encoder(spec, space) for space in images.values()]
+        self.images = nn.ModuleList(encoders)
+        self.others = FlatEncoder(others, spec) if others else None
+        self.features = sum(encoder.features for encoder in encoders)
+        self.features += self.others.features if self.others is not None else 0
+
+    def forward(self, observations: Observations) -> Tensor:
+        """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
+        parts = [encoder(observations[name]) for name, encoder in zip(self._names, self.images, strict=True)]
+        if self.others is not None:
+            parts.append(self.others(observations))
+        return torch.cat(parts, -1)
+
+
+Encoder = FlatEncoder | ArrayEncoder | CompositeEncoder | CustomEncoder
+
+
+def build_encoder(spec: PolicySpec, spaces: ObservationSpaces) -> Encoder:
+    """Return the encoder that the specification names, for observations of the spaces.
+
+    Of several components, images go through the named encoder, everything else through the multilayer perceptron.
 
     Raises NetworkError if a custom encoder cannot be imported, or the encoder does not accept such observations.
     """
+    if spec.encoder == "mlp":
+        return FlatEncoder(spaces, spec)
+    if ":" in spec.encoder:
+        return CustomEncoder(spec.encoder, spaces)
+    if len(spaces) == 1:
+        name, space = next(iter(spaces.items()))
+        return ArrayEncoder(name, _array_encoder(spec, space))
+    images: ObservationSpaces = {
+        name: space for name, space in spaces.items() if isinstance(space, ArraySpace) and space.is_image
+    }
+    if not images:
+        raise NetworkError(
+            f"the encoder {spec.encoder!r} takes images, but the observations have none: set policy.encoder to mlp"
+        )
+    return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec)
+
+
+def _array_encoder(spec: PolicySpec, space: ArraySpace | DiscreteSpace) -> ImageEncoder:
+    if isinstance(space, DiscreteSpace):
+        raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")
     match spec.encoder:
-        case "mlp":
-            return MultilayerPerceptron(space, spec.hidden, spec.activation)
         case "nature":
             return nature(space)
         case "small":
             return small(space)
         case "impala":
             return impala(space)
-        case "article":
+        case _:
             return ArticleEncoder(space)
-        case name:
-            return CustomEncoder(name, space)
+
+
+def _width(space: ArraySpace | DiscreteSpace) -> int:
+    return space.choices if isinstance(space, DiscreteSpace) else math.prod(space.stacked_shape)
+
+
+def _flat(observations: Tensor, space: ArraySpace | DiscreteSpace) -> Tensor:
+    """Return the inputs of a perceptron [N, width] float32."""
+    if isinstance(space, ArraySpace):
+        flat = observations.flatten(1)
+        return flat if flat.dtype == torch.float32 else flat.to(torch.float32) * (1.0 / 255.0)
+    values = observations.to(torch.int64)  # [N, D]
+    hot = [functional.one_hot(values[:, index], count) for index, count in enumerate(space.counts)]
+    return torch.cat(hot, -1).to(torch.float32)

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from daedalus.policy.acting.sampling import LOGITS
 from onnx import TensorProto, helper
 from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
@@ -24,7 +25,6 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     program_hash,
 )
-from daedalus.policy.acting.sampling import LOGITS
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 

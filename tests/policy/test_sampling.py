@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from daedalus.policy.acting.sampling import CategoricalSampler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from daedalus.policy.acting.sampling import CategoricalSampler
 from daedalus.policy.network.distributions import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
 

@@ -1,0 +1,231 @@
+"""The environment's nested spaces as flat maps of named components, and values of one in the other. Pure functions.
+
+A component is named by the keys and indices that lead to it, joined by dots; a space that is not composite has the
+name `observation` or `action`.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces as gym
+from pydantic import ValidationError
+
+from daedalus.actor.environments.action_table import table_actions
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
+
+_UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
+_MAX_DIMENSIONS = 4
+
+
+class Leaf(NamedTuple):
+    """A space that is not composite, and where it is in the nested space."""
+
+    name: str
+    path: tuple[str | int, ...]
+    space: gymnasium.Space
+
+    def of(self, value: Any) -> np.ndarray:
+        """Return this component of a nested value; in a batch each component has the first axis E."""
+        for key in self.path:
+            value = value[key]
+        return np.asarray(value)
+
+
+def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
+    """Return all leaves of a nested space, in gymnasium's order. `whole` is the name of a space that is not composite.
+
+    Raises EnvironmentSetupError if there are none, or two get the same name.
+    """
+    found = tuple(Leaf(".".join(map(_cleaned, path)) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
+    names = [leaf.name for leaf in found]
+    if not found:
+        raise EnvironmentSetupError(f"{whole} space {space} is empty: it must have at least one component")
+    if len(set(names)) < len(names):
+        raise EnvironmentSetupError(f"{whole} space {space} has components with like names: {', '.join(names)}")
+    return found
+
+
+def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    if isinstance(space, gym.Dict):
+        for key, part in space.spaces.items():
+            yield from _walk(part, (*path, key))
+    elif isinstance(space, gym.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from _walk(part, (*path, index))
+    else:
+        yield path, space
+
+
+def _cleaned(key: str | int) -> str:
+    return re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII)[:48]
+
+
+def unsupported(kind: str, leaf: Leaf) -> EnvironmentSetupError:
+    """Return the error for a leaf of a kind that has no component."""
+    where = f" (component {leaf.name!r})" if leaf.path else ""
+    return EnvironmentSetupError(
+        f"{kind} space {leaf.space}{where} is not supported: use Box, Discrete, MultiDiscrete or MultiBinary, "
+        "or a Dict or Tuple of these"
+    )
+
+
+# ------------------------------------------------------------------------------------------------ observations
+
+
+class ObservationComponent(NamedTuple):
+    """One component of the environment's observations, before the transforms of the run."""
+
+    leaf: Leaf
+    shape: tuple[int, ...]  # of one frame
+    first: np.ndarray | None  # of a discrete component: the number of the first choice of each variable [D]
+    counts: tuple[int, ...] = ()  # of a discrete component: the number of choices of each variable
+
+    def values(self, observations: Any) -> np.ndarray:
+        """Return this component of batched observations: [E, *shape], uint8 or float32, discrete ones counted from 0.
+
+        Raises EnvironmentSetupError for a discrete value outside the space: it could not be encoded.
+        """
+        values = self.leaf.of(observations)
+        values = values.reshape(len(values), *self.shape)
+        if self.first is not None:
+            values = values - self.first
+            if ((values < 0) | (values >= self.counts)).any():
+                raise EnvironmentSetupError(
+                    f"the environment returned an observation outside its space {self.leaf.space}"
+                )
+            return values
+        return values if values.dtype in (np.uint8, np.float32) else values.astype(np.float32)
+
+
+def observation_components(space: gymnasium.Space) -> tuple[ObservationComponent, ...]:
+    """Return the components of an observation space. Raises EnvironmentSetupError for a space without any."""
+    return tuple(_observation(leaf) for leaf in leaves(space, "observation"))
+
+
+def _observation(leaf: Leaf) -> ObservationComponent:
+    match leaf.space:
+        case gym.Box() | gym.MultiBinary():
+            shape = tuple(leaf.space.shape or ()) or (1,)
+            if len(shape) > _MAX_DIMENSIONS or 0 in shape:
+                raise unsupported("observation", leaf)
+            return ObservationComponent(leaf, shape, None)
+        case gym.Discrete() as space:
+            return ObservationComponent(leaf, (1,), np.array([space.start]), (int(space.n),))
+        case gym.MultiDiscrete() as space:
+            counts = tuple(int(count) for count in space.nvec.ravel())
+            return ObservationComponent(leaf, (len(counts),), space.start.ravel(), counts)
+        case _:
+            raise unsupported("observation", leaf)
+
+
+# ----------------------------------------------------------------------------------------------------- actions
+
+
+class ActionComponents:
+    """The components of an action space, and the environment's actions for their values."""
+
+    def __init__(self, table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> None:
+        """Raises EnvironmentSetupError if the space is not supported, or the table does not fit it."""
+        self._space, self._leaves = space, leaves(space, "action")
+        self._table = None if table is None else table_actions(table, space)
+        try:
+            self.spaces: dict[str, ActionSpace] = {leaf.name: self._component(leaf) for leaf in self._leaves}
+        except ValidationError as error:
+            raise EnvironmentSetupError(f"action space {space} is not supported: {error.errors()[0]['msg']}") from None
+
+    def env_actions(self, values: dict[str, np.ndarray]) -> Any:
+        """Return the environment's batched actions for values {name: [E, D]} of all components."""
+        parts = {leaf.path: self._env_action(leaf, values[leaf.name]) for leaf in self._leaves}
+        return _nested(self._space, (), parts)
+
+    def _component(self, leaf: Leaf) -> ActionSpace:
+        if self._table is not None:
+            return DiscreteSpace(counts=(len(self._table),))
+        match leaf.space:
+            case gym.Discrete() as space:
+                return DiscreteSpace(counts=(int(space.n),))
+            case gym.MultiDiscrete() as space:
+                return DiscreteSpace(counts=tuple(int(count) for count in space.nvec.ravel()))
+            case gym.MultiBinary() as space:
+                return DiscreteSpace(counts=(2,) * int(np.prod(space.shape)))
+            case gym.Box() as space if space.dtype is not None and space.dtype.kind in "fiu" and 0 not in space.shape:
+                return ContinuousSpace(low=_bounds(space.low), high=_bounds(space.high))
+            case _:
+                raise unsupported("action", leaf)
+
+    def _env_action(self, leaf: Leaf, values: np.ndarray) -> np.ndarray:
+        if self._table is not None:
+            return self._table[values[:, 0]]
+        match leaf.space:
+            case gym.Discrete() as space:
+                return values[:, 0] + space.start
+            case gym.MultiDiscrete() as space:
+                return (values + space.start.ravel()).reshape(len(values), *space.shape).astype(space.dtype)
+            case gym.Box() as space:
+                return _unscaled(values, space)
+            case space:
+                return values.reshape(len(values), *(space.shape or ())).astype(space.dtype)
+
+
+def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
+    return tuple(float(value) if abs(value) < _UNBOUNDED else None for value in values.ravel())
+
+
+def _unscaled(values: np.ndarray, space: gym.Box) -> np.ndarray:
+    """Return actions of the environment [E, *shape]: within its bounds, [-1, 1] scaled to them where there are two."""
+    low, high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
+    bounded = (np.abs(low) < _UNBOUNDED) & (np.abs(high) < _UNBOUNDED)
+    with np.errstate(invalid="ignore", over="ignore"):
+        scaled = low + (values.astype(np.float64) + 1.0) * 0.5 * (high - low)
+    actions = np.clip(np.where(bounded, scaled, values), low, high)
+    if space.dtype is not None and space.dtype.kind != "f":
+        actions = np.rint(actions)
+    return actions.reshape(len(values), *space.shape).astype(space.dtype)
+
+
+def _nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tuple[str | int, ...], Any]) -> Any:
+    if isinstance(space, gym.Dict):
+        return {key: _nested(part, (*path, key), parts) for key, part in space.spaces.items()}
+    if isinstance(space, gym.Tuple):
+        return tuple(_nested(part, (*path, index), parts) for index, part in enumerate(space.spaces))
+    return parts[path]
+
+
+# ------------------------------------------------------------------------------------------- batches of one
+
+
+def batch_of_one(space: gymnasium.Space, value: Any, where: str = "the observation") -> Any:
+    """Return a value of a nested space with a first axis of 1 in each component.
+
+    Raises ValueError, naming the component, if it is not a finite value of the space.
+    """
+    if isinstance(space, gym.Dict):
+        missing = [key for key in space.spaces if not isinstance(value, Mapping) or key not in value]
+        if missing:
+            raise ValueError(f"{where} lacks {missing[0]!r}: its space has {', '.join(map(str, space.spaces))}")
+        return {key: batch_of_one(part, value[key], f"{where}[{key!r}]") for key, part in space.spaces.items()}
+    if isinstance(space, gym.Tuple):
+        if not isinstance(value, Sequence) or len(value) != len(space.spaces):
+            raise ValueError(f"{where} must be a tuple of {len(space.spaces)} components")
+        return tuple(batch_of_one(part, value[i], f"{where}[{i}]") for i, part in enumerate(space.spaces))
+    array = np.asarray(value)
+    if array.shape != space.shape:
+        raise ValueError(f"{where} has shape {array.shape}, but its space has shape {space.shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{where} has a value that is not finite")
+    if not isinstance(space, gym.Box) and not space.contains(array.astype(space.dtype)):
+        raise ValueError(f"{where} is {value}, which is outside {space}")
+    return array.astype(space.dtype)[None]
+
+
+def only_of_batch(space: gymnasium.Space, batch: Any) -> Any:
+    """Return the only value of a batch of one, as the nested space has it."""
+    if isinstance(space, gym.Dict):
+        return {key: only_of_batch(part, batch[key]) for key, part in space.spaces.items()}
+    if isinstance(space, gym.Tuple):
+        return tuple(only_of_batch(part, batch[index]) for index, part in enumerate(space.spaces))
+    return batch[0]

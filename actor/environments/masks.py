@@ -1,0 +1,103 @@
+"""Which discrete actions are legal, as environments say it by the conventions that exist.
+
+- `info["action_mask"]` (gymnasium): an array over all choices, or a map of them by action component;
+- `action_masks()` of the environment (stable-baselines3's contributors), which the gymnasium backend puts into `info`;
+- an observation component named `action_mask` (PettingZoo), which the policy then does not observe.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from daedalus.actor.environments.components import ObservationComponent
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
+
+MASK_KEY = "action_mask"
+
+
+class Masks:
+    """The masks of an environment's actions. `spaces` are the action's components, those with masks marked."""
+
+    def __init__(self, spaces: dict[str, ActionSpace], example: Any) -> None:
+        """Construct from one batch of masks, or None if the environment has no masks.
+
+        Raises EnvironmentSetupError if it does not fit the actions.
+        """
+        self._spaces = {name: space for name, space in spaces.items() if isinstance(space, DiscreteSpace)}
+        masked = set(self._by_component(example)) if example is not None else set()
+        self._names = tuple(name for name in spaces if name in masked)
+        self.spaces: dict[str, ActionSpace] = {
+            name: space.model_copy(update={"masked": True}) if name in masked else space
+            for name, space in spaces.items()
+        }
+
+    def __call__(self, action_mask: Any, needed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the masks {name: [E, choices]} bool; see Transforms.observe."""
+        if not self._names:
+            return {}
+        if action_mask is None:
+            raise EnvironmentSetupError(f"the environment's info has no {MASK_KEY!r} any more: give it in every step")
+        given = self._by_component(action_mask)
+        return {name: self._checked(name, given.get(name), needed) for name in self._names}
+
+    def _by_component(self, action_mask: Any) -> dict[str, np.ndarray]:
+        """Return masks {name: [E, choices]} bool from a map by component, or one array for the only discrete one."""
+        if isinstance(action_mask, dict):
+            parts = {str(name): np.asarray(mask) for name, mask in action_mask.items() if str(name)[:1] != "_"}
+        elif len(self._spaces) == 1:
+            parts = {next(iter(self._spaces)): np.asarray(action_mask)}
+        else:
+            raise EnvironmentSetupError(
+                f"the {MASK_KEY} is one array, but the action has {len(self._spaces)} discrete components: "
+                "give a map of one mask for each"
+            )
+        return {name: _flags(name, mask, self._spaces.get(name)) for name, mask in parts.items()}
+
+    def _checked(self, name: str, mask: np.ndarray | None, needed: np.ndarray) -> np.ndarray:
+        if mask is None:
+            raise EnvironmentSetupError(f"the {MASK_KEY} has no entry for {name!r} any more: give it in every step")
+        first = 0
+        for variable, count in enumerate(self._spaces[name].counts):
+            forbidden = ~mask[:, first : first + count].any(axis=1)  # [E]
+            if (forbidden & needed).any():
+                environment = int(np.flatnonzero(forbidden & needed)[0])
+                raise EnvironmentSetupError(
+                    f"the {MASK_KEY} of {name!r} forbids every choice of variable {variable} in environment "
+                    f"{environment}: one must be legal while an episode goes on"
+                )
+            if forbidden.any():  # no action is taken from here, but probabilities must be defined
+                mask = mask.copy()
+                mask[forbidden, first : first + count] = True
+            first += count
+        return mask
+
+
+def mask_component(
+    components: tuple[ObservationComponent, ...], actions: dict[str, ActionSpace]
+) -> ObservationComponent | None:
+    """Return the observation component that is the mask of the only discrete action, or None."""
+    discrete = [space for space in actions.values() if isinstance(space, DiscreteSpace)]
+    for component in components:
+        is_mask = component.leaf.path == (MASK_KEY,) and component.first is None
+        if is_mask and len(discrete) == 1 and component.shape == (discrete[0].choices,):
+            return component
+    return None
+
+
+def _flags(name: str, mask: np.ndarray, space: DiscreteSpace | None) -> np.ndarray:
+    if space is None:
+        raise EnvironmentSetupError(f"the {MASK_KEY} names {name!r}, which is no discrete component of the action")
+    flat = mask.reshape(len(mask), -1) if mask.ndim else mask
+    if flat.ndim != 2 or flat.shape[1] != space.choices or flat.dtype.kind not in "biuf":
+        raise EnvironmentSetupError(
+            f"the {MASK_KEY} of {name!r} has shape {mask.shape[1:]}, but the action has {space.choices} choices"
+        )
+    return flat.astype(np.bool_)
+
+
+def mask_of_one(action_mask: Any) -> Any:
+    """Return a mask, or a map of masks, with a first axis of 1."""
+    if isinstance(action_mask, dict):
+        return {name: np.asarray(mask)[None] for name, mask in action_mask.items()}
+    return np.asarray(action_mask)[None]

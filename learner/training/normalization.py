@@ -1,0 +1,116 @@
+"""Running statistics of observations and returns, and the normalisation of rewards. State; no I/O, no threads."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.batch import Batch
+from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.protocol.messages import Rollout, RolloutIdentity
+
+_LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
+_MAX_STREAMS = 4096  # actors whose running returns are kept
+
+
+class RunningMoments:
+    """Mean and variance of all values seen, each value weighted equally, in float64.
+
+    Batches are merged by the parallel formula of Chan, Golub and LeVeque (1979).
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.mean = torch.zeros(shape, dtype=torch.float64)
+        self.squares = torch.zeros(shape, dtype=torch.float64)  # sum of squared deviations from the mean
+        self.count = torch.zeros((), dtype=torch.float64)
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance [*shape]; 1 before any value was seen."""
+        return self.squares / self.count if self.count > 0 else torch.ones_like(self.squares)
+
+    def add(self, values: Tensor) -> None:
+        """Add values [N, *shape]."""
+        number = len(values)
+        if not number:
+            return
+        values = values.to("cpu", torch.float64)
+        mean = values.mean(0)
+        total, difference = self.count + number, mean - self.mean
+        self.squares += (values - mean).square().sum(0) + difference.square() * self.count * number / total
+        self.mean += difference * number / total
+        self.count += number
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the state for a checkpoint."""
+        return {"mean": self.mean, "squares": self.squares, "count": self.count}
+
+
+class ObservationStatistics:
+    """The statistics of a network's ObservationNormalizer, updated from batches."""
+
+    def __init__(self, normalizer: ObservationNormalizer) -> None:
+        self._normalizer = normalizer
+        self.moments = {
+            name: RunningMoments(tuple(mean.shape))
+            for name, mean in zip(normalizer.names, normalizer.means, strict=True)
+        }
+
+    def add(self, batch: Batch) -> None:
+        """Add the observations of the valid rows, and set the normaliser's statistics.
+
+        Call after the updates of the batch: they learn with the statistics that the actors acted with.
+        """
+        rows = batch.valid.bool()
+        for name, moments in self.moments.items():
+            moments.add(batch.observations[name][:-1][rows])
+            self._normalizer.set_statistics(name, moments.mean, moments.variance)
+
+
+class RewardNormalizer:
+    """Division of rewards by the running standard deviation of the discounted return.
+
+    The return of row t is G_t = r_t + discount_factor * G_{t-1}, which begins at 0 with each episode: a sum over the
+    past, whose deviation is that of the values to within the mean (Engstrom et al. 2020, section 3). It runs on from
+    rollout to rollout of an actor.
+    """
+
+    def __init__(self, discount_factor: float) -> None:
+        self._discount_factor = discount_factor
+        self.moments = RunningMoments(())
+        self._running: dict[str, tuple[RolloutIdentity, np.ndarray]] = {}  # by actor: last rollout, G of it [E]
+
+    def normalize(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
+        """Add the returns of a batch to the statistics, and scale the rewards of the batch in place.
+
+        Args:
+          batch: the rollouts joined.
+          rollouts: in the same order.
+        """
+        seen = [self._returns(rollout)[rollout.valid] for rollout in rollouts]
+        self.moments.add(torch.from_numpy(np.concatenate(seen)))
+        deviation = float(self.moments.variance.sqrt())
+        batch.rewards.div_(max(deviation, 1e-8)).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
+
+    def _returns(self, rollout: Rollout) -> np.ndarray:
+        """Return G [T, E] of a rollout, and remember its last row."""
+        identity = rollout.identity
+        running = np.zeros(rollout.environments)
+        last, carried = self._running.pop(identity.actor, (None, running))
+        if last is not None and _follows(identity, last) and len(carried) == len(running):
+            running = carried
+        returns = np.empty((rollout.rows, rollout.environments))
+        goes_on = ~(rollout.terminated | rollout.truncated)
+        for row in range(rollout.rows):
+            running = rollout.rewards[row] + self._discount_factor * running
+            returns[row] = running
+            running = running * goes_on[row]
+        self._running[identity.actor] = identity, running
+        while len(self._running) > _MAX_STREAMS:
+            del self._running[next(iter(self._running))]
+        return returns
+
+
+def _follows(identity: RolloutIdentity, last: RolloutIdentity) -> bool:
+    return identity.incarnation == last.incarnation and identity.sequence == last.sequence + 1

@@ -1,0 +1,37 @@
+"""The random numbers that a policy program makes samples from."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+
+class NoiseSize(NamedTuple):
+    """How many random numbers one sample takes."""
+
+    uniform: int  # U
+    normal: int  # G
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Noise:
+    """The noise of one row of E environments."""
+
+    uniform: np.ndarray  # [E, U] float32, from 0 to 1, 1 excluded
+    normal: np.ndarray  # [E, G] float32, standard normal
+
+
+def draw_noise(size: NoiseSize, rows: int, random: np.random.Generator) -> Noise:
+    """Return noise for sampled actions."""
+    return Noise(
+        uniform=random.random((rows, size.uniform), np.float32),
+        normal=random.standard_normal((rows, size.normal), np.float32),
+    )
+
+
+def neutral_noise(size: NoiseSize, rows: int) -> Noise:
+    """Return the noise that gives greedy actions."""
+    return Noise(
+        uniform=np.full((rows, size.uniform), 0.5, np.float32),
+        normal=np.zeros((rows, size.normal), np.float32),
+    )

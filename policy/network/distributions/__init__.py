@@ -1,0 +1,1 @@
+"""Distributions of actions: one class a file, composed by `ActionDistributions`. Needs torch."""

@@ -1,0 +1,116 @@
+"""The distribution of a whole action: independent distributions of its components."""
+
+import torch
+from torch import Tensor, nn
+
+from daedalus.policy.network.custom_module import find_class
+from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
+from daedalus.policy.network.distributions.distribution import Distribution
+from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGaussian
+from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
+from daedalus.policy.network.distributions.mixture import GaussianMixture
+from daedalus.policy.network.errors import NetworkError
+from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec
+
+Components = dict[str, Tensor]
+
+
+class ActionDistribution(nn.Module):
+    """Independent distributions of the components of an action.
+
+    Log-probability and entropy of an action are the sums over its components. The parameters and the noise of all
+    components lie side by side, in the order of the components.
+    """
+
+    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
+        """Raise NetworkError if a distribution does not support its component."""
+        super().__init__()
+        self._names, self._masked = tuple(spaces.actions), frozenset(spaces.masks)
+        self.components = nn.ModuleList([_distribution(spec, name, space) for name, space in spaces.actions.items()])
+        self._sizes = [component.parameter_count for component in self._distributions()]
+        self.parameter_count = sum(self._sizes)
+        self.uniform_count = sum(component.uniform_count for component in self._distributions())
+        self.normal_count = sum(component.normal_count for component in self._distributions())
+
+    def sample(self, parameters: Tensor, uniform: Tensor, normal: Tensor, masks: Components) -> Components:
+        """Return one sample of each row.
+
+        Args:
+          parameters: [N, P].
+          uniform: [N, U], from 0 to 1, 1 excluded.
+          normal: [N, G], standard normal.
+          masks: of the masked components [N, choices] bool.
+
+        Returns: actions of each component [N, D].
+        """
+        uniforms = uniform.split([component.uniform_count for component in self._distributions()], -1)
+        normals = normal.split([component.normal_count for component in self._distributions()], -1)
+        parts = zip(self._parts(parameters, masks), uniforms, normals, strict=True)
+        return {name: part.sample(own, u, n) for (name, part, own), u, n in parts}
+
+    def log_prob(self, parameters: Tensor, actions: Components, masks: Components) -> Tensor:
+        """Return log pi(a | s): parameters [..., P], actions [..., D], masks [..., choices] -> [...], in nats."""
+        parts = self._parts(parameters, masks)
+        return _sum([part.log_prob(own, actions[name]) for name, part, own in parts])
+
+    def log_prob_and_entropy(self, parameters: Tensor, actions: Components, masks: Components) -> tuple[Tensor, Tensor]:
+        """Return log pi(a | s) and H(pi(. | s)), both [...], in nats; arguments as for `log_prob`."""
+        parts = self._parts(parameters, masks)
+        results = [part.log_prob_and_entropy(own, actions[name]) for name, part, own in parts]
+        return _sum([log_prob for log_prob, _ in results]), _sum([entropy for _, entropy in results])
+
+    def _parts(self, parameters: Tensor, masks: Components) -> list[tuple[str, Distribution, Tensor]]:
+        """Return name, distribution and parameters of each component; illegal choices have probability 0."""
+        owns = parameters.split(self._sizes, -1) if len(self._sizes) > 1 else (parameters,)
+        parts = zip(self._names, self._distributions(), owns, strict=True)
+        return [
+            (name, part, without_illegal(own, masks[name]) if name in self._masked else own)
+            for name, part, own in parts
+        ]
+
+    def _distributions(self) -> list[Distribution]:
+        return [component for component in self.components if isinstance(component, Distribution)]
+
+
+def _sum(terms: list[Tensor]) -> Tensor:
+    return terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
+
+
+def _distribution(spec: PolicySpec, name: str, space: DiscreteSpace | ContinuousSpace) -> Distribution:
+    """Return the distribution of one component. Raises NetworkError if it does not support the component."""
+    if ":" in spec.distribution:
+        return _custom(spec.distribution, name, space)
+    if isinstance(space, DiscreteSpace):
+        return Categorical(space)
+    if not space.bounded and spec.distribution in ("squashed_gaussian", "kumaraswamy"):
+        raise NetworkError(
+            f"policy.distribution={spec.distribution} needs bounded actions, but {name!r} is {space}: "
+            "set policy.distribution to gaussian"
+        )
+    match spec.distribution:
+        case "squashed_gaussian":
+            return SquashedGaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
+        case "gaussian_mixture":
+            return GaussianMixture(space, initial_std=spec.initial_std, components=spec.mixture_components)
+        case "kumaraswamy":
+            return Kumaraswamy(space)
+        case _:
+            return Gaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
+
+
+def _custom(reference: str, name: str, space: DiscreteSpace | ContinuousSpace) -> Distribution:
+    """Return the user's distribution `module:Class`, for continuous components; discrete ones stay categorical."""
+    if isinstance(space, DiscreteSpace):
+        return Categorical(space)
+    try:
+        distribution = find_class(reference, Distribution)(space)
+        counts = (distribution.parameter_count, distribution.uniform_count, distribution.normal_count)
+        if not all(isinstance(count, int) and count >= 0 for count in counts) or not counts[0]:
+            raise NetworkError(f"has counts {counts}: parameter_count must be at least 1, the others at least 0")
+    except NetworkError as error:
+        raise NetworkError(f"policy.distribution={reference}, for {name!r}: {error}") from error.__cause__
+    except Exception as error:  # the user's code may raise anything
+        first_line = next(iter(str(error).strip().splitlines()), "")
+        raise NetworkError(f"policy.distribution={reference}: {type(error).__name__}: {first_line}") from error
+    return distribution
