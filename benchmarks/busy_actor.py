@@ -26,7 +26,7 @@ def main() -> None:
         spaces, _ = collector.prepare(spec)
         network = ActorCritic(spec.policy, spaces)
         weights = {name: parameter.detach().numpy() for name, parameter in network.named_parameters()}
-        collector.begin(OnnxRuntime(export_program(network, spaces.observation)), spec, seed=1)
+        collector.begin(OnnxRuntime(export_program(network, spaces)), spec, seed=1)
         collector.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=weights))
         sequence = 0
         print("busy", flush=True)

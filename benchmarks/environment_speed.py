@@ -31,7 +31,7 @@ def rate(preset: str, backend: str, seconds: float) -> float:
         random = np.random.default_rng(1)
         steps, began, ends = 0, time.process_time(), time.monotonic() + seconds
         while time.monotonic() < ends:
-            environments.step(random.integers(0, environments.spaces.action.count, _ENVIRONMENTS))
+            environments.step(random.integers(0, environments.spaces.actions["action"].count, _ENVIRONMENTS))
             steps += _ENVIRONMENTS
         return steps / (time.process_time() - began)
     finally:

@@ -36,7 +36,10 @@ def _intake() -> Intake:
     spec = RunSpec.model_validate(
         {"environment": {"id": "CartPole-v1"}, "collection": {"rollout_length": 3, "envs_per_actor": 2}}
     )
-    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=6))
+    spaces = Spaces(
+        observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+        actions={"action": DiscreteSpace(counts=(6,))},
+    )
     fleet = Fleet(1, spaces)
     fleet.join(Join(actor="wing-1", incarnation=2**61 + 1, spaces=spaces, environments=2), 0.0)
     intake = Intake(spec, 2**60 + 3, fleet)

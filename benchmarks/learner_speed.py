@@ -48,7 +48,9 @@ NETWORKS: dict[str, tuple[PolicySpec, ArraySpace, int, int]] = {
 
 def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int, bfloat16: bool) -> Callable[[], None]:
     """Return a function that makes one update from the same random batch."""
-    network = ActorCritic(policy, Spaces(observation=space, action=DiscreteSpace(count=6)))
+    network = ActorCritic(
+        policy, Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(6,))})
+    )
     flat = FlatParameters(network.parameters())
     optimizer = Adam(flat.values, 1e-5)
     shape = (rows, environments, *space.stacked_shape)

@@ -77,13 +77,17 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
     environments = make_environments(spec, ENVIRONMENTS)
     try:
         environments.reset(1)
-        actions = np.random.default_rng(1).integers(0, environments.spaces.action.count, (1000, ENVIRONMENTS))
+        actions = np.random.default_rng(1).integers(
+            0, environments.spaces.actions["action"].count, (1000, ENVIRONMENTS)
+        )
         stepping = _per_call(lambda index: environments.step(actions[index % 1000]), seconds)
-        count = environments.spaces.action.count
+        count = environments.spaces.actions["action"].count
     finally:
         environments.close()
     policy, space, _, _ = NETWORKS["nature"]
-    network = ActorCritic(policy, Spaces(observation=space, action=DiscreteSpace(count=count)))
+    network = ActorCritic(
+        policy, Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(count,))})
+    )
     runtime = OnnxRuntime(export_program(network, space))
     runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
     random = np.random.default_rng(1)

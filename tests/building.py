@@ -5,16 +5,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from plain import vector_spaces
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec, TrainingSpec
 
 EPOCH = 77
 ROWS, ENVIRONMENTS = 6, 3
-SPACES = Spaces(observation=ArraySpace(shape=(3,), dtype="float32"), action=DiscreteSpace(count=4))
+SPACES = vector_spaces(3, 4)
 POLICY = PolicySpec(hidden=(8,))
 RECURRENT = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
 
@@ -44,7 +45,7 @@ def make_rollout(
     stack: int = 1,
     state_size: int = 0,
     seed: int = 0,
-    **replaced: np.ndarray,
+    **replaced: Any,
 ) -> Rollout:
     """Return a rollout with random content: terminations, truncations and the reset rows after them."""
     random = np.random.default_rng(seed)
@@ -59,9 +60,10 @@ def make_rollout(
     cells = (rows, environments)
     ends = int(np.count_nonzero(terminated | truncated))
     content: dict[str, Any] = {
-        "frames": random.standard_normal((stack + rows, environments, *shape), np.float32),
+        "frames": {"observation": random.standard_normal((stack + rows, environments, *shape), np.float32)},
         "initial_state": random.standard_normal((environments, state_size), np.float32),
-        "actions": random.integers(0, SPACES.action.count, cells, np.uint8),
+        "actions": {"action": random.integers(0, 4, (*cells, 1), np.uint8)},
+        "masks": {},
         "behaviour_log_probs": -random.uniform(0.5, 2.5, cells).astype(np.float32),
         "rewards": random.standard_normal(cells, np.float32),
         "terminated": terminated,
@@ -78,9 +80,9 @@ def make_rollouts(seed: int, count: int = 2, state_size: int = 0) -> list[Rollou
     return [make_rollout(seed=seed * 100 + number, state_size=state_size) for number in range(count)]
 
 
-def join(rollouts: Sequence[Rollout], observation: ArraySpace = SPACES.observation) -> Batch:
+def join(rollouts: Sequence[Rollout], spaces: Spaces = SPACES) -> Batch:
     """Return a batch of rollouts in new memory."""
-    return BatchAssembler(observation, torch.device("cpu")).join(rollouts)
+    return BatchAssembler(spaces, torch.device("cpu")).join(rollouts)
 
 
 def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces = SPACES, seed: int = 1) -> Fleet:

@@ -10,16 +10,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from plain import vector_spaces
 
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
-CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+CARTPOLE = vector_spaces(4, 2)
 ANSWER_SECONDS = 60.0
 
 

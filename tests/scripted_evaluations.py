@@ -6,6 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
+from plain import vector_spaces
 from processes import LIMIT
 
 from daedalus.actor.evaluation.evaluator import Evaluator
@@ -27,7 +28,6 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -42,9 +42,9 @@ def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
     )
 
 
-SPACES = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=DiscreteSpace(count=4))
+SPACES = vector_spaces(2, 4)
 NETWORK = ActorCritic(PolicySpec(hidden=()), SPACES)
-MODEL = export_program(NETWORK, SPACES.observation)
+MODEL = export_program(NETWORK, SPACES)
 
 
 class ScriptedLearner:

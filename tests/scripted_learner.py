@@ -5,6 +5,7 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
+from plain import vector_spaces
 from processes import LIMIT
 
 from daedalus.actor.collecting.collector import Collector
@@ -27,7 +28,7 @@ from daedalus.protocol.messages import (
     SnapshotRequest,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -35,7 +36,7 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 SPEC = RunSpec.model_validate(
     {"environment": {"id": "CartPole-v1"}, "collection": {"envs_per_actor": 2, "rollout_length": 4, "window": 2}}
 )
-SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+SPACES = vector_spaces(4, 2)
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Policy:
     @classmethod
     def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
         network = ActorCritic(spec, spaces)
-        return cls(network, export_program(network, spaces.observation))
+        return cls(network, export_program(network, spaces))
 
 
 POLICY = Policy.of(PolicySpec(), SPACES)

@@ -121,7 +121,10 @@ def stops(count: int) -> list[tuple[str, str]]:
 def damaged(count: int) -> list[tuple[str, str]]:
     """Damage the newest checkpoint in many ways: the previous one must be loaded each time."""
     choose = random.Random(4)
-    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+    spaces = Spaces(
+        observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+        actions={"action": DiscreteSpace(counts=(2,))},
+    )
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"), policy=PolicySpec(hidden=(64, 64)))
     learner = Learner(spec.training, spec.policy, spaces)
     kinds, accepted = Counter[str](), 0

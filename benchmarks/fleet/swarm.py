@@ -26,7 +26,10 @@ from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutId
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.connecting import connect_with_retry
 
-SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+SPACES = Spaces(
+    observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+    actions={"action": DiscreteSpace(counts=(2,))},
+)
 ENVIRONMENTS = 16
 _LIMITS = Limits()
 _WAIT_SECONDS = 120.0

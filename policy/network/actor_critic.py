@@ -68,6 +68,11 @@ class ActorCritic(nn.Module):
         with torch.autocast(remembered.device.type, enabled=False):
             return self.policy_head(remembered.float()), self.value_head(critic.float()).squeeze(-1)
 
+    def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the policies of one row: state [N, S] -> parameters of the distributions [N, P], next state [N, S]."""
+        remembered, state = self.memory.step(self.encoder(self.normalizer(observations)), state)
+        return self.policy_head(remembered), state
+
     def act(
         self, observations: Components, state: Tensor, uniform: Tensor, normal: Tensor, masks: Components
     ) -> tuple[Components, Tensor, Tensor]:
@@ -82,7 +87,6 @@ class ActorCritic(nn.Module):
 
         Returns: actions of each component [N, D], their log-probability [N], next state [N, S].
         """
-        remembered, state = self.memory.step(self.encoder(self.normalizer(observations)), state)
-        parameters = self.policy_head(remembered)
+        parameters, state = self.step(observations, state)
         actions = self.distribution.sample(parameters, uniform, normal, masks)
         return actions, self.distribution.log_prob(parameters, actions, masks), state

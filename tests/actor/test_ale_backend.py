@@ -19,14 +19,14 @@ def _spec(name: str, **fields) -> EnvironmentSpec:
 @pytest.mark.parametrize("name", ["Pong", "Pong-v5", "ALE/Pong-v5", "pong"])
 def test_game_is_found_by_its_usual_names(name: str) -> None:
     environments = make_environments(_spec(name, grey=True, resize=(84, 84), frame_stack=4), 2)
-    assert environments.spaces.observation.stacked_shape == (4, 84, 84)
-    assert environments.spaces.action.count == 6
+    assert environments.spaces.observations["observation"].stacked_shape == (4, 84, 84)
+    assert environments.spaces.actions["action"].count == 6
     environments.close()
 
 
 def test_game_with_a_name_of_several_words_is_found() -> None:
     environments = make_environments(_spec("ALE/MsPacman-v5"), 1)
-    assert environments.spaces.action.count == 9  # eight directions and no move; Pong has 6
+    assert environments.spaces.actions["action"].count == 9  # eight directions and no move; Pong has 6
     environments.close()
 
 
@@ -39,7 +39,7 @@ def test_frames_are_single_and_have_the_specified_shape(fields: dict, shape: tup
     first = environments.reset(2**32 - 1)
     before = first.copy()
     frames = environments.step(np.zeros(2, np.int64))[0]
-    assert environments.spaces.observation.shape == shape
+    assert environments.spaces.observations["observation"].shape == shape
     assert (first.shape, frames.shape, frames.dtype) == ((2, *shape), (2, *shape), np.uint8)
     for _ in range(30):
         environments.step(np.full(2, 2))

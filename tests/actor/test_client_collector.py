@@ -37,7 +37,7 @@ class Played:
         environments.close()
         policy = spec.policy.model_copy(update={"memory": "gru", "memory_units": 4, "hidden": (8,)})
         self.network = ActorCritic(policy, self.spaces)
-        self.model = export_program(self.network, self.spaces.observation)
+        self.model = export_program(self.network, self.spaces)
 
     def runtime(self) -> OnnxRuntime:
         return OnnxRuntime(self.model)

@@ -29,7 +29,7 @@ def test_environments_follow_the_next_step_rule(name: str, backend: Literal["gym
     _needs(backend)
     environments = make_environments(EnvironmentSpec(id=name, backend=backend, max_episode_steps=4), 2)
     observations = environments.reset(5)
-    assert observations.shape == (2, *environments.spaces.observation.shape)
+    assert observations.shape == (2, *environments.spaces.observations["observation"].shape)
     for step in range(1, 11):
         _, rewards, terminated, truncated = environments.step(np.full(2, step % 2))
         if step in (5, 10):
@@ -102,7 +102,7 @@ def test_table_rows_are_the_actions() -> None:
     for table in (((0.0,), (0.0,)), ((0.0,), (2.0,))):
         environments = make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
         environments.reset(1)
-        assert environments.spaces.action.count == 2
+        assert environments.spaces.actions["action"].count == 2
         rewards.append(float(environments.step(np.array([1]))[1][0]))
     assert rewards[0] - rewards[1] == pytest.approx(0.004)
 
@@ -143,5 +143,5 @@ def test_action_indices_start_at_zero_for_a_discrete_space_that_does_not() -> No
     gymnasium.register("StartsAtFive-v0", lambda **_kwargs: _StartsAtFive())
     environments = make_environments(EnvironmentSpec(id="StartsAtFive-v0"), 2)
     environments.reset(1)
-    assert environments.spaces.action.count == 2
+    assert environments.spaces.actions["action"].count == 2
     np.testing.assert_array_equal(environments.step(np.array([0, 1]))[1], [5.0, 6.0])

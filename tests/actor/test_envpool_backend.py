@@ -61,7 +61,7 @@ def test_repeated_actions_equal_single_steps(
     environments = make_environments(_spec(name, action_repeat=repeat, max_episode_steps=limit, action_table=table), 3)
     oracle = _OneByOne(name, count, seed=5, repeat=repeat, limit=limit)
     np.testing.assert_array_equal(environments.reset(5), oracle.first)
-    actions = np.random.default_rng(1).integers(0, environments.spaces.action.count, (rows, count))
+    actions = np.random.default_rng(1).integers(0, environments.spaces.actions["action"].count, (rows, count))
     ends = np.zeros(2, np.int64)
     for row in actions:
         chosen = np.asarray(table, np.float32)[row] if table else row
@@ -153,7 +153,11 @@ def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
         environments.close()
     assert shown["gymnasium"] == shown["envpool"]
     spaces, shape, dtype, _, _ = shown["envpool"]
-    assert (spaces.observation.shape, spaces.observation.frames, spaces.action.count) == ((84, 84), 4, 12)
+    assert (
+        spaces.observations["observation"].shape,
+        spaces.observations["observation"].frames,
+        spaces.actions["action"].count,
+    ) == ((84, 84), 4, 12)
     assert (shape, dtype) == ((2, 84, 84), np.uint8)
 
 
@@ -169,7 +173,7 @@ def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
 )
 def test_atari_frames_are_single_and_have_the_specified_shape(fields: dict, shape: tuple[int, ...]) -> None:
     environments = make_environments(_spec("Pong-v5", frame_stack=4, action_repeat=4, **fields), 2)
-    assert environments.spaces.observation.shape == shape
+    assert environments.spaces.observations["observation"].shape == shape
     assert environments.reset(1).shape == (2, *shape)
     frames, rewards, _, _ = environments.step(np.zeros(2, np.int64))
     assert (frames.shape, frames.dtype, rewards.shape) == ((2, *shape), np.uint8, (2,))

@@ -248,8 +248,8 @@ def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
     environments = make_environments(spec, 2)
     assert environments.reset(1).shape == (2, 84, 84)
     assert environments.step(np.zeros(2, np.int64))[0].shape == (2, 84, 84)
-    assert environments.spaces.action.count == 6
+    assert environments.spaces.actions["action"].count == 6
     environments.close()
     plain = make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
-    assert plain.spaces.observation.shape == (210, 160, 3)
+    assert plain.spaces.observations["observation"].shape == (210, 160, 3)
     plain.close()

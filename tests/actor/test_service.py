@@ -34,7 +34,9 @@ def test_frame_stack_and_memory_follow_the_run(network: MemoryNetwork) -> None:
     policy = PolicySpec(hidden=(8,), memory="gru", memory_units=5)
     environment = SPEC.environment.model_copy(update={"frame_stack": 3})
     spec = SPEC.model_copy(update={"environment": environment, "policy": policy})
-    spaces = SPACES.model_copy(update={"observation": SPACES.observation.model_copy(update={"frames": 3})})
+    spaces = SPACES.model_copy(
+        update={"observation": SPACES.observations["observation"].model_copy(update={"frames": 3})}
+    )
     learner = ScriptedLearner(network, spec, policy=Policy.of(policy, spaces))
     actor = RunningActor(network)
     learner.publish(0)

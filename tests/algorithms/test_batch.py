@@ -84,7 +84,7 @@ def test_stack_contains_no_frame_of_the_previous_episode(rows: int) -> None:
         assert_holds(batch, [rollout], depth=4)
 
 
-@pytest.mark.parametrize(("space", "make"), [(SPACES.observation, make_rollout), (PIXELS, pixels)])
+@pytest.mark.parametrize(("space", "make"), [(SPACES.observations["observation"], make_rollout), (PIXELS, pixels)])
 def test_memory_is_reused_and_completely_overwritten(space: ArraySpace, make: Any) -> None:
     assembler = BatchAssembler(space, CPU)
     places = set()

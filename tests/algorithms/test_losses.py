@@ -67,7 +67,7 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     logits = normal(random, ROWS, COLUMNS, 4).requires_grad_()
     actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
     advantages = normal(random)
-    log_probs, _ = Categorical(DiscreteSpace(count=4)).log_prob_and_entropy(logits, actions)
+    log_probs, _ = Categorical(DiscreteSpace(counts=(4,))).log_prob_and_entropy(logits, actions)
     policy_gradient_loss(log_probs, advantages, valid).backward()
     chosen = torch.nn.functional.one_hot(actions, 4)
     expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)

@@ -34,7 +34,7 @@ def test_the_environment_can_be_played(folder: Path) -> None:
     (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
     spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8})
     environments = make_environments(spec, 2, wrap="corridor_wrappers:step_costs")
-    assert environments.spaces.action.count == 2
+    assert environments.spaces.actions["action"].count == 2
     environments.reset(0)
     steps = [environments.step(np.array([1, 0])) for _ in range(8)]
     assert steps[-1][1].tolist() == [0.99, -0.01]
@@ -52,7 +52,7 @@ def test_the_preset_is_a_run(folder: Path) -> None:
 def test_the_network_becomes_a_program(folder: Path) -> None:
     (folder / "my_network.py").write_text(example("network.md"))
     space = ArraySpace(shape=(12, 12), dtype="uint8", frames=3)
-    spaces = Spaces(observation=space, action=DiscreteSpace(count=4))
+    spaces = Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(4,))})
     learner = Learner(TrainingSpec(), PolicySpec(encoder="my_network:Encoder"), spaces)
     runtime = OnnxRuntime(learner.program())
     runtime.load(learner.weights())

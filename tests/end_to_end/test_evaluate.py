@@ -154,7 +154,9 @@ def test_the_backend_is_that_of_the_run_or_of_the_option(tmp_path: Path, evaluat
 
 
 def test_spaces_that_differ_from_those_of_the_policy_are_reported(tmp_path: Path, refused: Callable[..., str]) -> None:
-    spaces = make_environments(CARTPOLE, 1).spaces.model_copy(update={"action": DiscreteSpace(count=3)})
+    spaces = make_environments(CARTPOLE, 1).spaces.model_copy(
+        update={"actions": {"action": DiscreteSpace(counts=(3,))}}
+    )
     run = save(tmp_path / "run", CARTPOLE, 1, spaces=spaces)
     line = refused(1, run, "--episodes", 1)
     assert "gymnasium's CartPole-v1 has observation: float32 array of shape (4,); action: 2 choices" in line

@@ -4,17 +4,18 @@ import struct
 from collections.abc import Callable, Iterator
 
 import pytest
+from plain import vector_spaces
 from processes import Running, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Message, Refusal, Welcome
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.transport.interface import Transport
 from daedalus.transport.zenoh_transport import connect, listen
 
-CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+CARTPOLE = vector_spaces(4, 2)
 Start = Callable[..., Running]
 
 
@@ -54,7 +55,7 @@ def test_another_protocol_version_is_refused_and_both_versions_are_named(client:
 def test_mismatching_spaces_are_refused_and_both_are_named(client: Transport) -> None:
     first = ask(client, keys.join("*"), join(spaces=CARTPOLE, environments=2))
     assert isinstance(first, Welcome)
-    other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
+    other = CARTPOLE.model_copy(update={"actions": {"action": DiscreteSpace(counts=(3,))}})
     answer = ask(client, keys.join("run"), join(spaces=other, environments=2))
     assert isinstance(answer, Refusal)
     assert "3 choices" in answer.reason
@@ -112,7 +113,7 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
 
 
 def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transport, address: str) -> None:
-    other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
+    other = CARTPOLE.model_copy(update={"actions": {"action": DiscreteSpace(counts=(3,))}})
     ask(client, keys.join("run"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1

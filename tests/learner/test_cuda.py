@@ -18,7 +18,10 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 
-IMAGES = Spaces(observation=ArraySpace(shape=(42, 42), dtype="uint8", frames=4), action=SPACES.action)
+IMAGES = Spaces(
+    observations={"observation": ArraySpace(shape=(42, 42), dtype="uint8", frames=4)},
+    actions={"action": SPACES.actions["action"]},
+)
 KINDS: dict[str, tuple[PolicySpec, Spaces]] = {
     "mlp": (PolicySpec(hidden=(8,)), SPACES),
     "gru": (PolicySpec(hidden=(8,), memory="gru", memory_units=5), SPACES),
@@ -33,7 +36,7 @@ def learner(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) ->
 
 
 def rollouts(seed: int, spaces: Spaces, state_size: int) -> list[Rollout]:
-    space = spaces.observation
+    space = spaces.observations["observation"]
     made = [make_rollout(seed=100 * seed + number, state_size=state_size) for number in range(2)]
     if space.dtype != "uint8":
         return made
@@ -69,7 +72,9 @@ def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
     there.step(rollouts(1, spaces, 0), progress=0.0)
     runtime = OnnxRuntime(there.program())
     runtime.load({name: array.copy() for name, array in there.weights().items()})
-    observations = np.random.default_rng(1).integers(0, 256, (5, *spaces.observation.stacked_shape), np.uint8)
+    observations = np.random.default_rng(1).integers(
+        0, 256, (5, *spaces.observations["observation"].stacked_shape), np.uint8
+    )
     actions, _, _ = runtime.act(observations, np.zeros((5, 0), np.float32), None)
     assert actions.shape == (5,)
     directory = save_checkpoint(

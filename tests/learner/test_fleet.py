@@ -74,7 +74,9 @@ def test_large_jump_counts_all_skipped_numbers_as_gaps() -> None:
 
 # --------------------------------------------------------------------------------------------- joining
 
-OTHER = Spaces(observation=ArraySpace(shape=(5,), dtype="uint8"), action=DiscreteSpace(count=2))
+OTHER = Spaces(
+    observations={"observation": ArraySpace(shape=(5,), dtype="uint8")}, actions={"action": DiscreteSpace(counts=(2,))}
+)
 
 
 def test_join_without_spaces_changes_nothing() -> None:

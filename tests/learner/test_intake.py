@@ -9,12 +9,13 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from plain import vector_spaces
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RunEnded
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace
 
 VERSION, MAX_LAG = 10, 4
 
@@ -159,7 +160,7 @@ def test_oversized_rollout_is_rejected_before_it_is_unpacked(harness: Harness) -
     assert_rejected(harness, encode(bomb), "malformed", "the limit is")
 
 
-@pytest.mark.parametrize("action", [-1, SPACES.action.count, 2**31 - 1])
+@pytest.mark.parametrize("action", [-1, SPACES.actions["action"].count, 2**31 - 1])
 def test_action_out_of_range_is_rejected_as_unfit(harness: Harness, action: int) -> None:
     actions = good().actions.astype(np.int32)
     actions[-1, -1] = action
@@ -463,7 +464,7 @@ def test_rewards_that_no_gradient_survives_are_rejected_as_unfit(harness: Harnes
 
 # ---------------------------------------------------------------------------------------- at most once
 
-TINY = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=DiscreteSpace(count=4))
+TINY = vector_spaces(1, 4)
 NAMES = st.sampled_from(["a", "b"])
 SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([2**62, 2**62 - 1500, 2**63 - 1]))
 

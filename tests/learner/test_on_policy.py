@@ -30,7 +30,7 @@ POLICIES = {
 def make_runtime(kind: str, policy: PolicySpec, spaces: Spaces, network: ActorCritic) -> PolicyRuntime:
     if kind == "torch":
         return TorchRuntime(policy, spaces)
-    return OnnxRuntime(export_program(network, spaces.observation))
+    return OnnxRuntime(export_program(network, spaces))
 
 
 @pytest.mark.parametrize("runtime", ["onnx", "torch"])
@@ -59,7 +59,7 @@ def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
     for _ in range(6):
         rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY)), Limits()))
         assert isinstance(rollout, Rollout)
-        batch = join([rollout], spaces.observation)
+        batch = join([rollout], spaces.observations["observation"])
         with torch.no_grad():
             parameters, _ = network(batch.observations, batch.initial_state, batch.starts)
             log_probs, _ = network.distribution.log_prob_and_entropy(parameters[:-1], batch.actions)

@@ -4,12 +4,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from plain import array_space, plain_spaces
 
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
 Weights = dict[str, np.ndarray]
@@ -41,7 +42,7 @@ class Policy(NamedTuple):
         return {name for name, _ in self.network.named_parameters() if not name.startswith("value_head")}
 
     def observations(self, count: int, seed: int = 1) -> np.ndarray:
-        return observations(self.spaces.observation, (count,), seed)
+        return observations(array_space(self.spaces), (count,), seed)
 
     def states(self, count: int, seed: int = 2) -> np.ndarray:
         return np.random.default_rng(seed).uniform(-1, 1, (count, self.network.state_size)).astype(np.float32)
@@ -60,13 +61,13 @@ def observations(space: ArraySpace, leading: tuple[int, ...], seed: int = 1) -> 
 
 def spaces(shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1, actions: int = 4) -> Spaces:
     space = ArraySpace.model_validate({"shape": shape, "dtype": dtype, "frames": frames})
-    return Spaces(observation=space, action=DiscreteSpace(count=actions))
+    return plain_spaces(space, actions)
 
 
 def make_policy(spec: dict[str, Any], where: Spaces) -> Policy:
     checked = PolicySpec.model_validate(spec)
     network = ActorCritic(checked, where)
-    return Policy(network, checked, where, export_program(network, where.observation))
+    return Policy(network, checked, where, export_program(network, where))
 
 
 _GRU = {"memory": "gru", "memory_units": 24}

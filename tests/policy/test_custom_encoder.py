@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from plain import NAME, act, array_space
 from policies import make_policy, observations, spaces
 from torch import nn
 
@@ -59,8 +60,8 @@ def test_class_in_the_working_directory_is_imported_and_exported(build: Building
     runtime.load(weights)
     seen, states = policy.observations(5), policy.states(5)
     with torch.no_grad():
-        logits, expected = policy.network.act(torch.from_numpy(seen), torch.from_numpy(states))
-    actions, log_probs, state = runtime.act(seen, states, np.random.default_rng(0))
+        logits, expected = policy.network.step({NAME: torch.from_numpy(seen)}, torch.from_numpy(states))
+    actions, log_probs, state = act(runtime, seen, states, np.random.default_rng(0))
     np.testing.assert_allclose(state, expected.numpy(), atol=1e-5)
     np.testing.assert_allclose(log_probs, logits.log_softmax(-1).numpy()[np.arange(5), actions], atol=1e-5)
 
@@ -77,7 +78,7 @@ class Net(Base):
 """
     )
     seen = torch.full((2, 4, 3, 9, 11), 7, dtype=torch.uint8)
-    logits, _ = network(seen, torch.zeros(4, 0), torch.zeros(2, 4, dtype=torch.bool))
+    logits, _ = network({NAME: seen}, torch.zeros(4, 0), torch.zeros(2, 4, dtype=torch.bool))
     assert logits.shape == (2, 4, 4)
 
 
@@ -132,12 +133,12 @@ def test_shared_weights_and_constants_are_exported(build: Building) -> None:
     network = build(FORWARD + "self.tied(self.first(x) * self.constant)")
     for parameter in network.parameters():
         nn.init.normal_(parameter, 0.0, 0.2)
-    runtime = OnnxRuntime(export_program(network, SPACES.observation))
+    runtime = OnnxRuntime(export_program(network, SPACES))
     runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
-    seen = observations(SPACES.observation, (3,))
-    _, log_probs, _ = runtime.act(seen, np.zeros((3, 0), np.float32), None)
+    seen = observations(array_space(SPACES), (3,))
+    _, log_probs, _ = act(runtime, seen, np.zeros((3, 0), np.float32))
     with torch.no_grad():
-        logits, _ = network.act(torch.from_numpy(seen), torch.zeros(3, 0))
+        logits, _ = network.step({NAME: torch.from_numpy(seen)}, torch.zeros(3, 0))
     np.testing.assert_allclose(log_probs, logits.log_softmax(-1).amax(-1).numpy(), atol=1e-4)
 
 
@@ -145,11 +146,11 @@ def test_shared_weights_and_constants_are_exported(build: Building) -> None:
     ("returned", "message"),
     [
         ("torch.linalg.eigvals(x[:, :4, None] * torch.ones(4)).real", "cannot be exported to ONNX"),
-        ("torch.atan(x.double()).float()", "actors cannot run the program of the encoder: the program cannot be run"),
+        ("torch.atan(x.double()).float()", "actors cannot run the program of the policy: the program cannot be run"),
     ],
 )
 def test_encoder_that_cannot_be_exported_is_rejected(build: Building, returned: str, message: str) -> None:
     network = build(FORWARD + returned)
     with pytest.raises(NetworkError, match=message) as caught:
-        export_program(network, SPACES.observation)
+        export_program(network, SPACES)
     assert "\n" not in str(caught.value)

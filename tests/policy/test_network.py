@@ -1,19 +1,22 @@
 """The network gives the same results step by step and unrolled, for one row and many, in every image layout."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import NAME, array_space, choices, vector_spaces
 from policies import POLICIES, Policy, make_policy, observations, spaces
 from torch import Tensor, nn
 from torch.nn import functional
 
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.policy.network.encoders import MultilayerPerceptron, build_encoder
+from daedalus.policy.network.encoders import Encoder, FlatEncoder, build_encoder
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.memory import Gru
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec
 
 ENCODERS = ("small", "nature", "impala", "article")
@@ -40,20 +43,20 @@ def step_by_step(network: ActorCritic, seen: Tensor, state: Tensor, starts: Tens
         for environment in range(len(state)):
             if starts[row, environment]:
                 state[environment] = 0.0
-        logits, state = network.act(seen[row], state)
+        logits, state = network.step({NAME: seen[row]}, state)
         rows.append(logits)
     return torch.stack(rows)
 
 
 def check_unroll(policy: Policy, starts: np.ndarray, seed: int) -> None:
     rows, environments = starts.shape
-    seen = torch.from_numpy(observations(policy.spaces.observation, (rows, environments), seed))
+    seen = torch.from_numpy(observations(array_space(policy.spaces), (rows, environments), seed))
     state = torch.from_numpy(policy.states(environments, seed))
     begins = torch.from_numpy(starts)
     with torch.no_grad():
-        logits, values = policy.network(seen, state.clone(), begins)
+        logits, values = policy.network({NAME: seen}, state.clone(), begins)
         expected = step_by_step(policy.network, seen, state.clone(), begins)
-    assert logits.shape == (rows, environments, policy.spaces.action.count)
+    assert logits.shape == (rows, environments, choices(policy.spaces))
     assert values.shape == (rows, environments)
     torch.testing.assert_close(logits, expected, atol=2e-5, rtol=1e-4)
 
@@ -76,18 +79,18 @@ def test_episodes_may_start_anywhere(recurrent: Policy, starts: list[list[bool]]
 
 
 def test_memory_is_reset_only_at_episode_starts(recurrent: Policy) -> None:
-    seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 1)))
+    seen = torch.from_numpy(observations(array_space(recurrent.spaces), (4, 1)))
     starts = torch.tensor([[False], [False], [True], [False]])
     states = [torch.zeros(1, 12), torch.ones(1, 12)]
     with torch.no_grad():
-        one, other = (recurrent.network(seen, state, starts)[0] for state in states)
+        one, other = (recurrent.network({NAME: seen}, state, starts)[0] for state in states)
     torch.testing.assert_close(one[2:], other[2:])
     assert (one[:2] - other[:2]).abs().amax(-1).min() > 1e-4
 
 
 def test_gradients_flow_through_the_memory_of_all_rows(recurrent: Policy) -> None:
-    seen = torch.from_numpy(observations(recurrent.spaces.observation, (4, 2))).requires_grad_()
-    logits, _ = recurrent.network(seen, torch.zeros(2, 12), torch.zeros(4, 2, dtype=torch.bool))
+    seen = torch.from_numpy(observations(array_space(recurrent.spaces), (4, 2))).requires_grad_()
+    logits, _ = recurrent.network({NAME: seen}, torch.zeros(2, 12), torch.zeros(4, 2, dtype=torch.bool))
     logits[3, 0].square().sum().backward()
     assert seen.grad is not None
     assert (seen.grad[:, 0].abs().sum(-1) > 0).all()
@@ -110,18 +113,18 @@ def test_gru_matches_torch() -> None:
 def test_one_row_and_many_rows_give_the_same(policy: Policy) -> None:
     seen, states = torch.from_numpy(policy.observations(6)), torch.from_numpy(policy.states(6))
     with torch.no_grad():
-        together, _ = policy.network.act(seen, states)
-        alone = [policy.network.act(seen[row : row + 1], states[row : row + 1])[0] for row in range(6)]
+        together, _ = policy.network.step({NAME: seen}, states)
+        alone = [policy.network.step({NAME: seen[row : row + 1]}, states[row : row + 1])[0] for row in range(6)]
     torch.testing.assert_close(together, torch.cat(alone), atol=2e-5, rtol=1e-4)
 
 
 def test_heads_are_float32_under_autocast(policy: Policy) -> None:
-    seen = torch.from_numpy(observations(policy.spaces.observation, (3, 4)))
+    seen = torch.from_numpy(observations(array_space(policy.spaces), (3, 4)))
     state, starts = torch.from_numpy(policy.states(4)), torch.zeros(3, 4, dtype=torch.bool)
-    logits, values = policy.network(seen, state, starts)
+    logits, values = policy.network({NAME: seen}, state, starts)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        rough_logits, rough_values = policy.network(seen, state, starts)
-        _, next_state = policy.network.act(seen[0], state)
+        rough_logits, rough_values = policy.network({NAME: seen}, state, starts)
+        _, next_state = policy.network.step({NAME: seen[0]}, state)
     assert (rough_logits.dtype, rough_values.dtype, next_state.dtype) == (torch.float32,) * 3
     assert (logits - rough_logits).abs().max() < 0.05 * max(1.0, float(logits.detach().abs().max()))
     assert (values - rough_values).abs().max() < 0.05 * max(1.0, float(values.detach().abs().max()))
@@ -132,9 +135,9 @@ def test_heads_are_float32_under_autocast(policy: Policy) -> None:
 def test_new_policies_are_nearly_uniform() -> None:
     for spec, where in POLICIES.values():
         network = ActorCritic(PolicySpec.model_validate(spec), where)
-        seen = torch.from_numpy(observations(where.observation, (1, 8)))
+        seen = torch.from_numpy(observations(array_space(where), (1, 8)))
         state, starts = torch.zeros(8, network.state_size), torch.zeros(1, 8, dtype=torch.bool)
-        logits, values = network(seen, state, starts)
+        logits, values = network({NAME: seen}, state, starts)
         assert logits.detach().abs().max() < 0.2
         assert torch.isfinite(values).all()
 
@@ -149,7 +152,21 @@ def test_convolutional_is_true_for_image_encoders(policy: Policy) -> None:
 def encoder_of(name: str, shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1) -> nn.Module:
     torch.manual_seed(0)  # the same weights for equal shapes
     space = ArraySpace.model_validate({"shape": shape, "dtype": dtype, "frames": frames})
-    return build_encoder(PolicySpec(encoder=name), space).requires_grad_(False)
+    return _Plain(build_encoder(PolicySpec(encoder=name), {NAME: space})).requires_grad_(False)
+
+
+class _Plain(nn.Module):
+    """An encoder of one component that takes a tensor in place of a map."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        super().__init__()
+        self.encoder, self.features = encoder, encoder.features
+
+    def named_parameters(self, *arguments: Any, **options: Any) -> Any:
+        return self.encoder.named_parameters(*arguments, **options)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        return self.encoder({NAME: observations})
 
 
 @pytest.mark.parametrize(
@@ -234,10 +251,10 @@ def test_article_encoder_normalises_each_image() -> None:
 
 
 def test_mlp_without_layers_flattens_stacks() -> None:
-    encoder = MultilayerPerceptron(ArraySpace(shape=(3,), dtype="float32", frames=2), (), "tanh")
+    encoder = FlatEncoder({NAME: ArraySpace(shape=(3,), dtype="float32", frames=2)}, PolicySpec(hidden=()))
     assert encoder.features == 6
     seen = torch.arange(12.0).reshape(2, 2, 3)
-    torch.testing.assert_close(encoder(seen), seen.reshape(2, 6))
+    torch.testing.assert_close(encoder({NAME: seen}), seen.reshape(2, 6))
 
 
 @pytest.mark.parametrize("name", ENCODERS)
@@ -261,7 +278,7 @@ def test_smallest_accepted_images() -> None:
 
 def test_values_near_100_that_differ_by_a_tenth_stay_distinct_under_autocast() -> None:
     """A head that ran in bfloat16 would keep 8 bits: steps of 0.5 between 64 and 128."""
-    spaces = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=DiscreteSpace(count=2))
+    spaces = vector_spaces(1, 2)
     network = ActorCritic(PolicySpec(hidden=()), spaces)
     with torch.no_grad():
         for head in (network.policy_head, network.value_head):
@@ -269,6 +286,6 @@ def test_values_near_100_that_differ_by_a_tenth_stay_distinct_under_autocast() -
     seen = (100.0 + torch.arange(10) / 10).reshape(1, 10, 1)
     state, starts = torch.zeros(10, 0), torch.zeros(1, 10, dtype=torch.bool)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        logits, values = network(seen, state, starts)
+        logits, values = network({NAME: seen}, state, starts)
     assert torch.equal(values[0], seen[0, :, 0])
     assert torch.equal(logits[0, :, 0], seen[0, :, 0])

@@ -5,30 +5,41 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 import torch
-from daedalus.policy.acting.sampling import LOGITS
 from onnx import TensorProto, helper
+from plain import ACTION, NAME, act, choices
 from policies import CARTPOLE, POLICIES, Policy, make_policy, spaces
 
+from daedalus.policy.acting.noise import neutral_noise
 from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import (
+    LOG_PROB,
     NEXT_STATE,
-    OBSERVATIONS,
     STATE,
+    UNIFORM,
     OnnxRuntime,
     PolicyError,
     PolicyRuntime,
+    action_name,
+    observation_name,
     program_hash,
 )
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 
-NO_STATE = np.zeros((1, 0), np.float32)
+OBSERVATIONS, ACTIONS = observation_name(NAME), action_name(ACTION)
+
+
+def act_without_memory(
+    runtime: PolicyRuntime, observations: np.ndarray, random: np.random.Generator | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return act(runtime, observations, np.zeros((len(observations), 0), np.float32), random)
 
 
 @pytest.fixture(scope="module", params=POLICIES)
@@ -63,7 +74,7 @@ def test_both_runtimes_choose_the_same_actions(
         results = []
         for runtime in both:
             runtime.load(policy.weights(seed))
-            results.append(runtime.act(policy.observations(rows), policy.states(rows), random()))
+            results.append(act(runtime, policy.observations(rows), policy.states(rows), random()))
         (actions, log_probs, state), (torch_actions, torch_log_probs, torch_state) = results
         assert (actions.shape, actions.dtype) == ((rows,), np.int64)
         assert (log_probs.shape, log_probs.dtype) == ((rows,), np.float32)
@@ -79,8 +90,8 @@ def test_state_is_carried_from_row_to_row(policy: Policy) -> None:
         runtime.load(policy.weights())
         given = policy.states(rows)
         before = given.copy()
-        _, log_probs, state = runtime.act(policy.observations(rows), given, None)
-        _, again, _ = runtime.act(policy.observations(rows), state, None)
+        _, log_probs, state = act(runtime, policy.observations(rows), given)
+        _, again, _ = act(runtime, policy.observations(rows), state)
         np.testing.assert_array_equal(given, before)
         if policy.network.state_size:
             assert runtime.state_size == policy.spec.memory_units
@@ -97,15 +108,15 @@ def test_acting_matches_the_policy_of_learning(policy: Policy) -> None:
     observations, states = policy.observations(rows), policy.states(rows)
     with torch.no_grad():
         logits, values = policy.network(
-            torch.from_numpy(observations)[None], torch.from_numpy(states), torch.zeros(1, rows, dtype=torch.bool)
+            {NAME: torch.from_numpy(observations)[None]},
+            torch.from_numpy(states),
+            torch.zeros(1, rows, dtype=torch.bool),
         )
-    assert (logits.shape, values.shape) == ((1, rows, policy.spaces.action.count), (1, rows))
-    assert (logits.std() > 0.05) | (
-        policy.spaces.action.count == 1
-    )  # otherwise the comparison below would prove nothing
+    assert (logits.shape, values.shape) == ((1, rows, choices(policy.spaces)), (1, rows))
+    assert (logits.std() > 0.05) | (choices(policy.spaces) == 1)  # otherwise the comparison below would prove nothing
     for runtime in policy.runtimes():
         runtime.load(weights)
-        actions, log_probs, _ = runtime.act(observations, states, generator())
+        actions, log_probs, _ = act(runtime, observations, states, generator())
         expected = logits[0].log_softmax(-1).numpy()[np.arange(rows), actions]
         np.testing.assert_allclose(log_probs, expected, atol=2e-5, rtol=0)
 
@@ -113,7 +124,9 @@ def test_acting_matches_the_policy_of_learning(policy: Policy) -> None:
 def test_samples_depend_only_on_the_generator(runtime: PolicyRuntime, one_policy: Policy) -> None:
     runtime.load(one_policy.weights())
     observations = one_policy.observations(256)
-    first, again, other = (runtime.act(observations, NO_STATE, np.random.default_rng(seed))[0] for seed in (5, 5, 6))
+    first, again, other = (
+        act_without_memory(runtime, observations, np.random.default_rng(seed))[0] for seed in (5, 5, 6)
+    )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
@@ -125,7 +138,7 @@ def test_bytes_are_scaled_to_the_unit_interval() -> None:
     weights["policy_head.weight"][0, 0] = 1.0  # logits are (observation / 255, 0)
     for runtime in policy.runtimes():
         runtime.load(weights)
-        _, log_probs, _ = runtime.act(np.array([[255], [0]], np.uint8), NO_STATE, None)
+        _, log_probs, _ = act_without_memory(runtime, np.array([[255], [0]], np.uint8))
         np.testing.assert_allclose(log_probs, [-np.log1p(np.exp(-1)), -np.log(2)], atol=1e-6)
 
 
@@ -151,10 +164,10 @@ def test_inputs_of_a_program_are_the_acting_parameters(policy: Policy) -> None:
 
 def test_program_contains_no_weights(policy: Policy) -> None:
     graph = onnx.load_model_from_string(policy.program).graph
-    inputs, outputs = ([OBSERVATIONS, STATE], [LOGITS, NEXT_STATE])
-    ends = 2 if policy.network.state_size else 1
-    assert [entry.name for entry in graph.input if entry.name not in policy.acting_names()] == inputs[:ends]
-    assert [entry.name for entry in graph.output] == outputs[:ends]
+    remembers = policy.network.state_size > 0
+    inputs = [entry.name for entry in graph.input if entry.name not in policy.acting_names()]
+    assert inputs == [OBSERVATIONS, *([STATE] if remembers else []), UNIFORM]
+    assert [entry.name for entry in graph.output] == [ACTIONS, LOG_PROB, *([NEXT_STATE] if remembers else [])]
     assert not graph.initializer
     assert len(policy.program) < 32_768
 
@@ -168,7 +181,7 @@ def test_program_depends_only_on_the_architecture(policy: Policy) -> None:
     for value in (0.0, 1.0, None):  # also for parameters with equal values
         for parameter in policy.network.parameters():
             torch.nn.init.normal_(parameter) if value is None else torch.nn.init.constant_(parameter, value)
-        again = export_program(policy.network, policy.spaces.observation)
+        again = export_program(policy.network, policy.spaces)
         assert program_hash(again) == program_hash(policy.program)
     assert program_hash(make_policy({"hidden": (5,)}, spaces((2,), "float32")).program) != program_hash(policy.program)
 
@@ -191,32 +204,46 @@ def model(nodes: list[onnx.NodeProto], inputs: Shapes, outputs: Shapes, *initial
     return helper.make_model(graph, opset_imports=[opset], ir_version=8).SerializeToString()
 
 
-def other_program(inputs: tuple[str, ...], output: str) -> bytes:
-    """Return a model that adds its inputs."""
-    node = helper.make_node("Sum", list(inputs), [output])
-    return model([node], {name: [None, 2] for name in inputs}, {output: [None, 2]})
+def acting(nodes: list[onnx.NodeProto], inputs: Shapes, outputs: Shapes | None = None, **changed: Any) -> bytes:
+    """Return a model whose `nodes` compute "sum" [N, 2]: the action, and by its columns' sum the log-probability."""
+    ends = [
+        helper.make_node("Identity", ["sum"], [changed.get("actions", ACTIONS)]),
+        helper.make_node("ReduceSum", ["sum", "axis"], [LOG_PROB], keepdims=changed.get("keepdims", 0)),
+    ]
+    axis = helper.make_tensor("axis", TensorProto.INT64, [1], [1])
+    shapes: Shapes = {changed.get("actions", ACTIONS): [None, None], LOG_PROB: None}
+    return model([*nodes, *ends], inputs, shapes | (outputs or {}), axis, *changed.get("initializers", ()))
+
+
+def other_program(inputs: tuple[str, ...], **changed: Any) -> bytes:
+    """Return a program that acts by the sum of its inputs."""
+    node = helper.make_node("Sum", list(inputs), ["sum"])
+    return acting([node], {name: [None, 2] for name in inputs}, **changed)
 
 
 def test_foreign_program_runs_if_its_names_are_right() -> None:
-    runtime = OnnxRuntime(other_program((OBSERVATIONS,), LOGITS))
+    runtime = OnnxRuntime(other_program((OBSERVATIONS,)))
     runtime.load({})
-    actions, _, _ = runtime.act(np.array([[1, 2], [2, 1]], np.float32), NO_STATE, None)
-    np.testing.assert_array_equal(actions, [1, 0])
+    seen = np.array([[1, 2], [2, 1]], np.float32)
+    noise = neutral_noise(runtime.noise_size, 2)
+    choice = runtime.act({NAME: seen}, np.zeros((2, 0), np.float32), noise, {})
+    np.testing.assert_array_equal(choice.actions[ACTION], seen)
+    np.testing.assert_array_equal(choice.log_probs, [3, 3])
 
 
-@pytest.mark.parametrize(("inputs", "output"), [(("pixels",), LOGITS), ((OBSERVATIONS,), "values")])
-def test_program_with_wrong_inputs_or_outputs_is_rejected(inputs: tuple[str, ...], output: str) -> None:
-    with pytest.raises(PolicyError, match="must compute 'logits' from 'observations'"):
-        OnnxRuntime(other_program(inputs, output))
+def test_program_with_wrong_outputs_is_rejected() -> None:
+    for name in ("logits", "actions", LOG_PROB.upper()):
+        with pytest.raises(PolicyError, match="must compute 'actions/NAME' and 'log_prob'"):
+            OnnxRuntime(other_program((OBSERVATIONS,), actions=name))
 
 
 def remembering(state: list[int | None] | None, made_of_it: str = "Identity") -> bytes:
     """Return a model with a memory of this shape."""
     nodes = [
-        helper.make_node("Identity", [OBSERVATIONS], [LOGITS]),
+        helper.make_node("Identity", [OBSERVATIONS], ["sum"]),
         helper.make_node(made_of_it, [STATE], [NEXT_STATE]),
     ]
-    return model(nodes, {OBSERVATIONS: [None, 2], STATE: state}, {LOGITS: [None, 2], NEXT_STATE: None})
+    return acting(nodes, {OBSERVATIONS: [None, 2], STATE: state}, {NEXT_STATE: None})
 
 
 def test_state_size_is_read_from_the_program() -> None:
@@ -224,10 +251,11 @@ def test_state_size_is_read_from_the_program() -> None:
     runtime.load({})
     state = np.arange(6, dtype=np.float32).reshape(2, 3)
     assert runtime.state_size == 3
-    np.testing.assert_array_equal(runtime.act(np.ones((2, 2), np.float32), state, None)[2], state)
+    choice = runtime.act({NAME: np.ones((2, 2), np.float32)}, state, neutral_noise(runtime.noise_size, 2), {})
+    np.testing.assert_array_equal(choice.state, state)
 
 
-@pytest.mark.parametrize("shape", [[None, None], [None, 0], [None, 1 << 40], [3], [None, 3, 3], []])
+@pytest.mark.parametrize("shape", [[None, None], [None, -1], [None, 1 << 40], [3], [None, 3, 3], []])
 def test_memory_of_invalid_size_is_rejected(shape: list[int | None]) -> None:
     with pytest.raises(PolicyError, match=r"'state'|cannot be run"):
         OnnxRuntime(remembering(shape))
@@ -236,29 +264,45 @@ def test_memory_of_invalid_size_is_rejected(shape: list[int | None]) -> None:
 def test_next_state_of_another_shape_is_rejected() -> None:
     runtime = OnnxRuntime(remembering([None, 3], "Transpose"))
     runtime.load({})
+    seen, state = {NAME: np.ones((2, 2), np.float32)}, np.zeros((2, 3), np.float32)
     with pytest.raises(PolicyError, match=r"'next_state' \(3, 2\)"):
-        runtime.act(np.ones((2, 2), np.float32), np.zeros((2, 3), np.float32), None)
+        runtime.act(seen, state, neutral_noise(runtime.noise_size, 2), {})
 
 
-@pytest.mark.parametrize("operation", ["Transpose", "Size", "Neg"])
-def test_output_that_is_not_logits_is_rejected(operation: str) -> None:
+@pytest.mark.parametrize("operation", ["Transpose", "Size"])
+def test_actions_of_another_shape_are_rejected(operation: str) -> None:
+    nodes = [
+        helper.make_node(operation, [OBSERVATIONS], ["own"]),
+        helper.make_node("Identity", [OBSERVATIONS], ["sum"]),
+    ]
+    nodes.append(helper.make_node("ReduceSum", ["sum", "axis"], [LOG_PROB], keepdims=0))
     kind = TensorProto.INT64 if operation == "Size" else TensorProto.FLOAT
-    result = helper.make_tensor_value_info(LOGITS, kind, None)
+    outputs = [
+        helper.make_tensor_value_info("own", kind, None),
+        helper.make_tensor_value_info(LOG_PROB, TensorProto.FLOAT, None),
+    ]
+    nodes[0].output[0] = outputs[0].name = ACTIONS
     source = helper.make_tensor_value_info(OBSERVATIONS, TensorProto.FLOAT, [None, None])
-    graph = helper.make_graph([helper.make_node(operation, [OBSERVATIONS], [LOGITS])], "other", [source], [result])
+    axis = helper.make_tensor("axis", TensorProto.INT64, [1], [1])
+    graph = helper.make_graph(nodes, "other", [source], outputs, [axis])
     program = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
-    columns = 0 if operation == "Neg" else 3
-    with pytest.raises(PolicyError, match="'logits'"):
-        OnnxRuntime(program).act(np.ones((2, columns), np.float32), NO_STATE, None)
+    with pytest.raises(PolicyError, match="returns 'action'"):
+        act_without_memory(OnnxRuntime(program), np.ones((2, 3), np.float32))
+
+
+def test_log_probability_of_another_shape_is_rejected() -> None:
+    runtime = OnnxRuntime(other_program((OBSERVATIONS,), keepdims=1))
+    with pytest.raises(PolicyError, match=r"returns 'log_prob' float32 \(2, 1\)"):
+        act_without_memory(runtime, np.ones((2, 2), np.float32))
 
 
 def test_program_that_fails_while_acting_raises_policy_error(one_policy: Policy) -> None:
     runtime = OnnxRuntime(one_policy.program)
     with pytest.raises(PolicyError, match="the program failed"):  # nothing is loaded yet
-        runtime.act(one_policy.observations(1), NO_STATE, None)
+        act_without_memory(runtime, one_policy.observations(1))
     runtime.load(one_policy.weights())
     with pytest.raises(PolicyError, match="the program failed"):
-        runtime.act(np.zeros((1, 9), np.float32), NO_STATE, None)
+        act_without_memory(runtime, np.zeros((1, 9), np.float32))
 
 
 def test_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,15 +311,15 @@ def test_program_reads_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[2], data_location=TensorProto.EXTERNAL)
     for key, value in (("location", "secret"), ("offset", "0"), ("length", "8")):
         tensor.external_data.add(key=key, value=value)
-    node = helper.make_node("Max", [OBSERVATIONS, "w"], [LOGITS])
-    program = model([node], {OBSERVATIONS: [None, 2]}, {LOGITS: [None, 2]}, tensor)
+    node = helper.make_node("Max", [OBSERVATIONS, "w"], ["sum"])
+    program = acting([node], {OBSERVATIONS: [None, 2]}, initializers=(tensor,))
     with pytest.raises(PolicyError, match="External data path"):
         OnnxRuntime(program)
     assert os.listdir() == ["secret"]
 
 
 def test_weights_without_a_fixed_shape_are_rejected() -> None:
-    runtime = OnnxRuntime(other_program((OBSERVATIONS, "w"), LOGITS))
+    runtime = OnnxRuntime(other_program((OBSERVATIONS, "w")))
     with pytest.raises(PolicyError, match="'w'"):
         runtime.load({"w": np.zeros((1, 2), np.float32)})
 
@@ -332,12 +376,12 @@ def test_missing_weight_is_named(runtime: PolicyRuntime, one_policy: Policy) -> 
 def test_acting_does_not_need_the_value_head(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations = one_policy.observations(32)
     runtime.load(one_policy.weights())
-    _, with_head, _ = runtime.act(observations, NO_STATE, None)
+    _, with_head, _ = act_without_memory(runtime, observations)
     acting = {name: array for name, array in one_policy.weights().items() if name in one_policy.acting_names()}
     runtime.load(acting)
-    np.testing.assert_array_equal(runtime.act(observations, NO_STATE, None)[1], with_head)
+    np.testing.assert_array_equal(act_without_memory(runtime, observations)[1], with_head)
     runtime.load({**acting, "unheard.of": np.zeros(3, np.float32)})
-    np.testing.assert_array_equal(runtime.act(observations, NO_STATE, None)[1], with_head)
+    np.testing.assert_array_equal(act_without_memory(runtime, observations)[1], with_head)
 
 
 @pytest.mark.parametrize("shape", [(64, 5), (63, 4), (4, 64), (256,), (64, 4, 1), (0, 4), ()])
@@ -360,17 +404,17 @@ def test_rejected_weights_leave_the_loaded_ones_in_use(policy: Policy) -> None:
     observations, states = policy.observations(8), policy.states(8)
     for runtime in policy.runtimes():
         runtime.load(policy.weights())
-        _, before, _ = runtime.act(observations, states, None)
+        _, before, _ = act(runtime, observations, states)
         with pytest.raises(PolicyError):
             runtime.load(policy.weights(seed=2) | {"policy_head.bias": np.zeros(9, np.float32)})
-        np.testing.assert_array_equal(runtime.act(observations, states, None)[1], before)
+        np.testing.assert_array_equal(act(runtime, observations, states)[1], before)
 
 
 def test_new_weights_change_the_actions_and_old_ones_restore_them(runtime: PolicyRuntime, one_policy: Policy) -> None:
     observations, outputs = one_policy.observations(64), []
     for seed in (0, 1, 0):
         runtime.load(one_policy.weights(seed))
-        outputs.append(runtime.act(observations, NO_STATE, generator()))
+        outputs.append(act_without_memory(runtime, observations, generator()))
     assert (outputs[0][1] != outputs[1][1]).any()
     assert (outputs[0][0] != outputs[1][0]).any()
     np.testing.assert_array_equal(outputs[0][:2], outputs[2][:2])
@@ -381,7 +425,7 @@ def test_weights_may_be_read_only(runtime: PolicyRuntime, one_policy: Policy) ->
     for array in weights.values():
         array.flags.writeable = False
     runtime.load(weights)
-    assert runtime.act(one_policy.observations(2), NO_STATE, None)[0].shape == (2,)
+    assert act_without_memory(runtime, one_policy.observations(2))[0].shape == (2,)
 
 
 def test_onnxruntime_sends_no_telemetry() -> None:

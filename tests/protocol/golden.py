@@ -28,7 +28,7 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.status import ActorStatus, RunStatus
 
@@ -38,13 +38,17 @@ _PIXELS = np.arange((_K + _T) * _E * 6 * 5, dtype=np.uint8).reshape(_E, _K + _T,
 
 
 def _rollout(frames: np.ndarray) -> Rollout:
-    cells = np.arange(_T * _E).reshape(_T, _E)
+    cells, cells4 = np.arange(_T * _E).reshape(_T, _E), np.arange((_T + 1) * _E).reshape(_T + 1, _E)
     return Rollout(
         identity=RolloutIdentity(actor="wing-1", incarnation=2**61 + 1, sequence=7, learner_epoch=2**60 + 3),
         policy_version=41,
-        frames=frames,
+        frames={"camera": frames, "state.goal": np.stack([cells4 % 3, cells4 % 4], -1).astype(np.uint8)},
         initial_state=np.full((_E, 2), 0.25, np.float32),
-        actions=cells.astype(np.uint8),
+        actions={
+            "gripper": cells.astype(np.uint8)[..., None],
+            "arm": np.stack([cells / 8, -cells / 4], -1).astype(np.float32),
+        },
+        masks={"gripper": np.arange(_T * _E * 6).reshape(_T, _E, 6) % 7 != 0},
         behaviour_log_probs=(-0.5 - cells).astype(np.float32),
         rewards=(cells / 4).astype(np.float32),
         terminated=cells == 2,
@@ -60,8 +64,14 @@ MESSAGES: dict[str, Message] = {
         actor="wing-1",
         incarnation=5,
         spaces=Spaces(
-            observation=ArraySpace(shape=(6, 5), dtype="uint8", frames=4),
-            action=DiscreteSpace(kind="discrete", count=6),
+            observations={
+                "camera": ArraySpace(shape=(6, 5), dtype="uint8", frames=4),
+                "state.goal": DiscreteSpace(counts=(3, 4)),
+            },
+            actions={
+                "gripper": DiscreteSpace(counts=(6,), masked=True),
+                "arm": ContinuousSpace(low=(-1.0, None), high=(1.0, None)),
+            },
         ),
         environments=2,
     ),

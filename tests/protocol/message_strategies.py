@@ -23,7 +23,7 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
     EnvironmentSpec,
@@ -39,16 +39,28 @@ text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)
 positive = st.integers(1, 10_000)
 floats = st.floats(allow_nan=False, allow_infinity=False)
+sizes = st.integers(1, 4)
 generators = st.integers(0, 2**32).map(np.random.default_rng)
+names = st.text("abcXYZ019_.-", min_size=1, max_size=64)
+array_spaces = st.builds(
+    ArraySpace,
+    shape=st.lists(st.integers(1, 20), min_size=1, max_size=4).map(tuple),  # four of them have at most 64 MiB, stacked
+    dtype=st.sampled_from(["float32", "uint8"]),
+    frames=st.integers(1, 16),
+)
+discrete_spaces = st.builds(
+    DiscreteSpace,
+    counts=st.lists(st.integers(1, 16_384), min_size=1, max_size=4).map(tuple),
+    masked=st.booleans(),
+)
+bounds = st.lists(
+    st.tuples(st.none() | st.floats(-1e6, 0.0), st.none() | st.floats(0.5, 1e6)), min_size=1, max_size=5
+).map(lambda pairs: tuple(zip(*pairs, strict=True)))
+continuous_spaces = bounds.map(lambda pair: ContinuousSpace(low=pair[0], high=pair[1]))
 spaces = st.builds(
     Spaces,
-    observation=st.builds(
-        ArraySpace,
-        shape=st.lists(st.integers(1, 28), min_size=1, max_size=4).map(tuple),  # of at most 64 MiB, stacked
-        dtype=st.sampled_from(["float32", "uint8"]),
-        frames=st.integers(1, 16),
-    ),
-    action=st.builds(DiscreteSpace, count=st.integers(1, 65_536)),
+    observations=st.dictionaries(names, array_spaces | discrete_spaces, min_size=1, max_size=4),
+    actions=st.dictionaries(names, discrete_spaces | continuous_spaces, min_size=1, max_size=4),
 )
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | floats | text,
@@ -66,7 +78,7 @@ run_specs = st.builds(
         crop=st.none() | st.tuples(*[st.integers(0, 99)] * 4),
         grey=st.booleans(),
         resize=st.none() | st.tuples(positive, positive),
-        frame_stack=st.integers(1, 16),
+        frame_stack=st.integers(1, 16) | st.dictionaries(names, st.integers(1, 16), max_size=3),
         reward_clip=st.none() | st.floats(0.1, 10),
         reward_scale=st.floats(1e-6, 1e6),
         bootstrap_terminations=st.booleans(),
@@ -130,9 +142,15 @@ def rollouts(draw: st.DrawFn) -> Rollout:
             st.builds(RolloutIdentity, actor=text, incarnation=counters, sequence=counters, learner_epoch=counters)
         ),
         policy_version=draw(counters),
-        frames=frames,
+        frames=dict.fromkeys(draw(st.lists(names, min_size=1, max_size=3, unique=True)), frames),
         initial_state=bits(random, "<f4", (environments, draw(st.integers(0, 3)))),
-        actions=bits(random, draw(st.sampled_from(["|u1", "<u2", "<i4", "<i8"])), shape),
+        actions={
+            name: bits(random, draw(st.sampled_from(["|u1", "<u2", "<i4", "<i8", "<f4"])), (*shape, draw(sizes)))
+            for name in draw(st.lists(names, min_size=1, max_size=3, unique=True))
+        },
+        masks={
+            name: bits(random, "|b1", (*shape, draw(sizes))) for name in draw(st.lists(names, max_size=2, unique=True))
+        },
         behaviour_log_probs=bits(random, "<f4", shape),
         rewards=bits(random, "<f4", shape),
         terminated=bits(random, "|b1", shape),

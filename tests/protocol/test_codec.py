@@ -77,14 +77,15 @@ def test_arrays_of_any_memory_layout_are_encoded() -> None:
 def test_swapped_memory_order_is_kept() -> None:
     data = encode(some_rollout(PIXELS))
     flags, content, body = unwire(data)
-    assert content["arrays"][0] == ["frames", "|u1", [9, 4, 2, 3], True]
+    assert content["arrays"][0] == ["frames/observation", "|u1", [9, 4, 2, 3], True]
     assert [swapped for _, _, _, swapped in content["arrays"][1:]] == [False] * 9
     plain = zstandard.ZstdDecompressor().decompress(body) if flags else body
     assert plain.startswith(PIXELS.swapaxes(0, 1).tobytes())
     came = decode(data, LIMITS)
     assert isinstance(came, Rollout)
-    np.testing.assert_array_equal(came.frames, PIXELS)
-    assert came.frames.swapaxes(0, 1).flags.c_contiguous  # no copy has changed the order
+    frames = came.frames["observation"]
+    np.testing.assert_array_equal(frames, PIXELS)
+    assert frames.swapaxes(0, 1).flags.c_contiguous  # no copy has changed the order
     assert encode(came) == data
 
 
@@ -177,7 +178,7 @@ def test_prefix_can_be_read_with_struct() -> None:
     assert list(content) == ["kind", "fields", "arrays", "size"]
     assert content["kind"] == "Rollout"
     assert content["fields"] == {"identity": dataclasses.asdict(IDENTITY), "policy_version": 5}
-    assert content["arrays"][0] == ["frames", "<f4", [9, 4, 3], False]
+    assert content["arrays"][0] == ["frames/observation", "<f4", [9, 4, 3], False]
     start = (12 + length + 7) // 8 * 8
     assert zstandard.ZstdDecompressor().decompress(data[start:]) == bytes(content["size"])
 

@@ -129,7 +129,7 @@ def test_faults_in_a_nested_message_are_named_by_path() -> None:
 
 def test_missing_array_of_a_rollout_is_rejected() -> None:
     rollout = some_rollout()
-    for name in ("frames", "initial_state", "actions", "valid", "episode_lengths"):
+    for name in ("initial_state", "behaviour_log_probs", "valid", "episode_lengths"):
         flags, content, body = unwire(encode(rollout))
         for entry in content["arrays"]:
             entry[0] = f"not_{name}" if entry[0] == name else entry[0]
@@ -153,9 +153,9 @@ def test_body_larger_than_its_arrays_is_rejected() -> None:
 
 def test_inconsistent_shapes_are_rejected_by_the_message_class() -> None:
     flags, content, body = unwire(SAMPLES["rollout"])
-    assert content["arrays"][2][0] == "actions"
-    content["arrays"][2][2] = [4, 8]
-    with pytest.raises(ProtocolError, match="Rollout: frames must be"):
+    assert content["arrays"][2][0] == "actions/action"
+    content["arrays"][2][2] = [4, 8, 1]
+    with pytest.raises(ProtocolError, match="Rollout: actions/action must be"):
         decode(wire(content, body, flags=flags), LIMITS)
 
 

@@ -11,12 +11,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import ACTION, NAME, plain_spaces
 
+from daedalus.actor.environments.interface import Observed, Step
+from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Rollout, RolloutIdentity
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
@@ -70,13 +74,14 @@ class Films:
 
     @property
     def spaces(self) -> Spaces:
-        return Spaces(observation=self.space, action=DiscreteSpace(count=2))
+        return plain_spaces(self.space, 2)
 
-    def reset(self, seed: int) -> np.ndarray:
-        return self.played.reset(seed=seed)[0]
+    def reset(self, seed: int) -> Observed:
+        return Observed({NAME: self.played.reset(seed=seed)[0]}, {})
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        return self.played.step(actions)[:4]
+    def step(self, actions: dict[str, np.ndarray]) -> Step:
+        frames, rewards, terminated, truncated, _ = self.played.step(actions[ACTION][:, 0])
+        return Observed({NAME: frames}, {}), rewards, terminated, truncated
 
     def close(self) -> None:
         self.played.close()
@@ -86,6 +91,7 @@ class Spectator:
     """A policy that records all observations."""
 
     state_size = 0
+    noise_size = NoiseSize(0, 0)
 
     def __init__(self) -> None:
         self.seen: list[np.ndarray] = []
@@ -94,10 +100,11 @@ class Spectator:
         pass
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        self.seen.append(observations.copy())
-        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
+        self.seen.append(observations[NAME].copy())
+        rows = len(state)
+        return Choice({ACTION: np.zeros((rows, 1), np.int64)}, np.zeros(rows, np.float32), state)
 
 
 def collected(films: Films, rows: int, count: int) -> tuple[list[Rollout], np.ndarray]:
@@ -116,7 +123,7 @@ def rebuilt(rollout: Rollout, space: ArraySpace) -> np.ndarray:
     """Return the learner's observations [T+1, E, k, *frame_shape], computed into memory that held other values."""
     shape = (rollout.rows + 1, rollout.environments, space.frames, *space.shape)
     out = np.full(shape, 77, space.dtype)
-    stack_rows(rollout.frames, rollout.valid, out)
+    stack_rows(rollout.frames[NAME], rollout.valid, out)
     return out
 
 
@@ -137,15 +144,15 @@ def test_rows_of_rollouts_match_gymnasiums_frame_stack(
     space = ArraySpace(shape=shape, dtype=dtype, frames=depth)
     rows, count = depth + more_rows, 4
     reference = Films(space, lengths, stacked=True)
-    shown = [reference.reset(1)]
+    shown = [reference.reset(1).frames[NAME]]
     for _ in range(rows * count):
-        shown.append(reference.step(np.zeros(reference.count, np.int64))[0])
+        shown.append(reference.step({ACTION: np.zeros((reference.count, 1), np.int64)})[0].frames[NAME])
     expected = np.stack(shown)  # [count * T + 1, E, k, *frame_shape]
 
     rollouts, seen = collected(Films(space, lengths), rows, count)
     np.testing.assert_array_equal(seen, expected[:-1] if depth > 1 else expected[:-1, :, 0])
     for number, rollout in enumerate(rollouts):
-        assert rollout.frames.shape == (depth + rows, len(lengths), *shape)
+        assert rollout.frames[NAME].shape == (depth + rows, len(lengths), *shape)
         first = number * rows
         np.testing.assert_array_equal(rebuilt(rollout, space), expected[first : first + rows + 1])
 
@@ -190,4 +197,4 @@ def test_float_observations_are_sent_as_float32() -> None:
 def test_images_are_sent_with_environments_first_and_vectors_with_time_first() -> None:
     for shape, swapped in (((2, 3), True), ((4,), False)):
         rollouts, _ = collected(Films(ArraySpace(shape=shape, dtype="uint8"), [[3], [4]]), rows=5, count=1)
-        assert rollouts[0].frames.swapaxes(0, 1).flags.c_contiguous == swapped
+        assert rollouts[0].frames[NAME].swapaxes(0, 1).flags.c_contiguous == swapped

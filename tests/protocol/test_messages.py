@@ -8,11 +8,12 @@ from daedalus.protocol.messages import EvaluationReport, Rollout, RolloutIdentit
 T, E, K = 3, 2, 1
 
 
-def rollout(**changed: np.ndarray) -> Rollout:
+def rollout(**changed: Any) -> Rollout:
     arrays: dict[str, Any] = {
-        "frames": np.zeros((T + 1, E, 4), np.float32),
+        "frames": {"observation": np.zeros((T + 1, E, 4), np.float32)},
         "initial_state": np.zeros((E, 5), np.float32),
-        "actions": np.zeros((T, E), np.int64),
+        "actions": {"action": np.zeros((T, E, 1), np.int64)},
+        "masks": {},
         "behaviour_log_probs": np.zeros((T, E), np.float32),
         "rewards": np.zeros((T, E), np.float32),
         "terminated": np.zeros((T, E), np.bool_),
@@ -43,9 +44,9 @@ def test_rollout_without_ended_episodes_is_valid() -> None:
 ROW_ARRAYS = ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid")
 
 
-@pytest.mark.parametrize("name", ROW_ARRAYS)
+@pytest.mark.parametrize("name", [name for name in ROW_ARRAYS if name != "rewards"])
 @pytest.mark.parametrize("shape", [(T,), (T + 1, E), (T, E + 1), (E, T), (T, E, 1), (0, E), ()])
-def test_array_of_another_shape_than_actions_is_named(name: str, shape: tuple[int, ...]) -> None:
+def test_array_of_another_shape_than_rewards_is_named(name: str, shape: tuple[int, ...]) -> None:
     dtype = getattr(rollout(), name).dtype
     with pytest.raises(ValueError, match=f"^{name} must be"):
         rollout(**{name: np.zeros(shape, dtype)})
@@ -61,13 +62,13 @@ def test_array_of_the_wrong_dtype_is_named(name: str, dtype: type) -> None:
 
 @pytest.mark.parametrize("shape", [(T, E, 4), (T + 1, E + 1, 4), (T + 1, E), (E, T + 1, 4), (0, E, 4), ()])
 def test_frames_need_at_least_one_row_more_than_actions(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"^frames must be \[4 or more, 2, ...\]"):
-        rollout(frames=np.zeros(shape, np.float32))
+    with pytest.raises(ValueError, match=r"^frames/camera must be \[4 or more, 2, ...\]"):
+        rollout(frames={"camera": np.zeros(shape, np.float32)})
 
 
 @pytest.mark.parametrize("shape", [(T + 1, E, 4), (T + 4, E, 4), (T + 4, E, 8, 8, 3)])
 def test_frame_stack_adds_frames_before_the_first_row(shape: tuple[int, ...]) -> None:
-    assert rollout(frames=np.zeros(shape, np.uint8)).rows == T
+    assert rollout(frames={"observation": np.zeros(shape, np.uint8)}).rows == T
 
 
 @pytest.mark.parametrize("shape", [(E + 1, 5), (E,), (T, E, 5), ()])
@@ -80,22 +81,40 @@ def test_state_may_be_empty() -> None:
     assert rollout(initial_state=np.zeros((E, 0), np.float32)).initial_state.shape == (E, 0)
 
 
-@pytest.mark.parametrize("shape", [(), (T,), (T, E, 1)])
-def test_actions_of_another_rank_are_rejected(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"^actions must be"):
-        rollout(actions=np.zeros(shape, np.int64))
+@pytest.mark.parametrize("shape", [(), (T,), (T, E), (T, E + 1, 1), (T + 1, E, 1), (T, E, 1, 1)])
+def test_actions_and_masks_of_another_shape_are_rejected(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^actions/arm must be \[3, 2, D\]"):
+        rollout(actions={"arm": np.zeros(shape, np.float32)})
+    with pytest.raises(ValueError, match=r"^masks/gripper must be \[3, 2, D\]"):
+        rollout(masks={"gripper": np.zeros(shape, np.bool_)})
+
+
+def test_a_rollout_needs_observations_and_actions() -> None:
+    for name in ("frames", "actions"):
+        with pytest.raises(ValueError, match="must have observations and actions"):
+            rollout(**{name: {}})
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.bool_, np.float16])
+def test_actions_are_integers_or_float32(dtype: type) -> None:
+    with pytest.raises(ValueError, match="^actions/action must be float32 or integers"):
+        rollout(actions={"action": np.zeros((T, E, 1), dtype)})
+
+
+def test_masks_are_bool() -> None:
+    with pytest.raises(ValueError, match="^masks/action must be bool"):
+        rollout(masks={"action": np.ones((T, E, 4), np.uint8)})
 
 
 @pytest.mark.parametrize(("rows", "environments"), [(0, E), (T, 0)])
 def test_empty_rollout_is_rejected(rows: int, environments: int) -> None:
     with pytest.raises(ValueError, match="at least one row and one environment"):
-        rollout(actions=np.zeros((rows, environments), np.int64))
+        rollout(rewards=np.zeros((rows, environments), np.float32))
 
 
-@pytest.mark.parametrize("name", ["actions", "episode_lengths"])
-def test_actions_and_lengths_must_be_integers(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name}.* integers"):
-        rollout(**{name: getattr(rollout(), name).astype(np.float32)})
+def test_lengths_must_be_integers() -> None:
+    with pytest.raises(ValueError, match=r"episode_lengths.* integers"):
+        rollout(episode_lengths=np.ones(K, np.float32))
 
 
 @pytest.mark.parametrize("shape", [(), (K + 1,), (K, 1)])

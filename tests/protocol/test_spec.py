@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from daedalus.protocol.algorithms import ALGORITHMS
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
     EnvironmentSpec,
@@ -19,7 +19,10 @@ from daedalus.protocol.specification import Specification
 from daedalus.protocol.status import ActorStatus, RunStatus
 
 ENVIRONMENT = {"id": "CartPole-v1"}
-SPACES = {"observation": {"shape": [4], "dtype": "float32"}, "action": {"count": 2}}
+ARRAY = {"kind": "array", "shape": [4], "dtype": "float32"}
+DISCRETE = {"kind": "discrete", "counts": [2]}
+CONTINUOUS = {"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}
+SPACES = {"observations": {"observation": ARRAY}, "actions": {"action": DISCRETE}}
 
 
 def run(**sections: Any) -> RunSpec:
@@ -43,8 +46,9 @@ def test_environment_is_the_only_required_section() -> None:
         (EvaluationSpec, {}),
         (ServiceSpec, {}),
         (Spaces, SPACES),
-        (ArraySpace, SPACES["observation"]),
-        (DiscreteSpace, SPACES["action"]),
+        (ArraySpace, ARRAY),
+        (DiscreteSpace, DISCRETE),
+        (ContinuousSpace, CONTINUOUS),
     ],
 )
 def test_unknown_field_is_rejected_by_name(specification: type[Specification], fields: dict[str, Any]) -> None:
@@ -76,8 +80,19 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
     (ArraySpace, "dtype", "float64"),
     (ArraySpace, "frames", 0),
     (ArraySpace, "frames", 17),
-    (DiscreteSpace, "count", 0),
-    (DiscreteSpace, "count", 65_537),
+    (DiscreteSpace, "counts", []),
+    (DiscreteSpace, "counts", [0]),
+    (DiscreteSpace, "counts", [65_537]),
+    (DiscreteSpace, "counts", [2] * 4097),
+    (ContinuousSpace, "low", []),
+    (ContinuousSpace, "high", [math.inf]),
+    (Spaces, "observations", {}),
+    (Spaces, "actions", {}),
+    (Spaces, "actions", {"": DISCRETE}),
+    (Spaces, "actions", {"a b": DISCRETE}),
+    (Spaces, "actions", {"a" * 65: DISCRETE}),
+    (Spaces, "actions", {str(number): DISCRETE for number in range(65)}),
+    (Spaces, "observations", {"observation": CONTINUOUS}),
     (EnvironmentSpec, "id", ""),
     (EnvironmentSpec, "id", "x" * 201),
     (EnvironmentSpec, "max_episode_steps", 0),
@@ -160,7 +175,8 @@ OUT_OF_RANGE: list[tuple[type[Specification], str, Any]] = [
 def test_value_out_of_range_is_rejected_with_the_name_of_its_field(
     specification: type[Specification], field: str, value: Any
 ) -> None:
-    required = {ArraySpace: {"shape": [4], "dtype": "uint8"}, EnvironmentSpec: ENVIRONMENT}.get(specification, {})
+    all_required = {ArraySpace: ARRAY, EnvironmentSpec: ENVIRONMENT, Spaces: SPACES, ContinuousSpace: CONTINUOUS}
+    required = all_required.get(specification, {})
     with pytest.raises(ValidationError) as refused:
         specification.model_validate({**required, field: value})
     assert {error["loc"][0] for error in refused.value.errors()} == {field}
@@ -228,3 +244,47 @@ def test_observations_too_large_for_memory_are_refused(shape: tuple[int, ...], f
     with pytest.raises(ValidationError, match="use at most 67,108,864"):
         ArraySpace(shape=shape, dtype="float32", frames=frames)
     ArraySpace(shape=(2048, 2048, 3), dtype="uint8", frames=4)
+
+
+@pytest.mark.parametrize(
+    ("space", "fields", "reason"),
+    [
+        (DiscreteSpace, {"counts": [40_000, 40_000]}, "80,000 choices together"),
+        (ContinuousSpace, {"low": [0.0], "high": [1.0, 2.0]}, "1 lower bounds, but 2 upper bounds"),
+        (ContinuousSpace, {"low": [1.0], "high": [1.0]}, "the lower bound 1 is not below the upper bound 1"),
+        (Spaces, {**SPACES, "observations": {str(n): {**ARRAY, "shape": [9 << 20]} for n in range(2)}}, "bytes: use"),
+    ],
+)
+def test_inconsistent_space_is_rejected(space: type[Specification], fields: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        space.model_validate(fields)
+
+
+def test_spaces_of_several_components_have_a_readable_string() -> None:
+    spaces = Spaces.model_validate(
+        {
+            "observations": {"camera": {**ARRAY, "shape": [8, 8], "dtype": "uint8", "frames": 2}, "goal": DISCRETE},
+            "actions": {"arm": CONTINUOUS, "gripper": {**DISCRETE, "counts": [2, 3], "masked": True}},
+        }
+    )
+    assert str(spaces) == (
+        "observation: camera: uint8 array of shape (8, 8), 2 stacked, goal: 2 choices; "
+        "action: arm: 2 continuous, gripper: choices of 2 x 3, masked"
+    )
+    assert spaces.masks == {"gripper": 5}
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "image"),
+    [
+        ((84, 84), "uint8", True),
+        ((210, 160, 3), "uint8", True),
+        ((3, 16, 16), "uint8", True),
+        ((7, 7, 3), "uint8", False),
+        ((128,), "uint8", False),
+        ((84, 84), "float32", False),
+        ((2, 84, 84, 3), "uint8", False),
+    ],
+)
+def test_images_are_told_from_other_arrays(shape: tuple[int, ...], dtype: str, image: bool) -> None:
+    assert ArraySpace.model_validate({"shape": shape, "dtype": dtype}).is_image is image

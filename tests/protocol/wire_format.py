@@ -8,6 +8,7 @@ from typing import Any
 import msgpack
 import numpy as np
 from hypothesis import settings
+from plain import vector_spaces
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
 from daedalus.protocol.limits import Limits
@@ -19,7 +20,6 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 LIMITS = Limits()
@@ -86,7 +86,7 @@ IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=2, learner_epoch=3
 JOIN = Join(
     actor="a",
     incarnation=7,
-    spaces=Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2)),
+    spaces=vector_spaces(4, 2),
 )
 SNAPSHOT = Snapshot(
     learner_epoch=1,
@@ -123,9 +123,10 @@ def some_rollout(frames: np.ndarray | None = None) -> Rollout:
     return Rollout(
         identity=IDENTITY,
         policy_version=5,
-        frames=np.zeros((9, 4, 3), np.float32) if frames is None else frames,
+        frames={"observation": np.zeros((9, 4, 3), np.float32) if frames is None else frames},
         initial_state=np.zeros((4, 2), np.float32),
-        actions=rows.astype(np.int64),
+        actions={"action": rows.astype(np.int64)[..., None]},
+        masks={},
         behaviour_log_probs=rows.astype(np.float32),
         rewards=rows.astype(np.float32),
         terminated=rows.astype(np.bool_),

@@ -1,0 +1,75 @@
+"""Spaces and values that are not composite, for tests of parts that treat all components alike."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from daedalus.actor.environments.interface import VectorEnvironment
+from daedalus.policy.acting.noise import draw_noise, neutral_noise
+from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+
+NAME, ACTION = "observation", "action"
+
+
+def plain_spaces(observation: ArraySpace, choices: int) -> Spaces:
+    """Return spaces of one array and one discrete action."""
+    return Spaces(observations={NAME: observation}, actions={ACTION: DiscreteSpace(counts=(choices,))})
+
+
+def vector_spaces(size: int, choices: int) -> Spaces:
+    """Return spaces of `size` numbers and one discrete action."""
+    return plain_spaces(ArraySpace(shape=(size,), dtype="float32"), choices)
+
+
+def array_space(spaces: Spaces) -> ArraySpace:
+    """Return the only observation space."""
+    (space,) = spaces.observations.values()
+    assert isinstance(space, ArraySpace)
+    return space
+
+
+def choices(spaces: Spaces) -> int:
+    """Return the number of choices of the only action."""
+    (space,) = spaces.actions.values()
+    assert isinstance(space, DiscreteSpace)
+    return space.choices
+
+
+class PlainEnvironments:
+    """Environments of one array and one discrete action, with arrays in place of maps."""
+
+    def __init__(self, environments: VectorEnvironment) -> None:
+        self.environments = environments
+        self.count, self.spaces = environments.count, environments.spaces
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Return frames [E, *frame_shape]."""
+        return self.environments.reset(seed).frames[NAME]
+
+    def step(self, actions: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Take actions [E]; return frames, rewards, terminated, truncated."""
+        observed, *rest = self.environments.step({ACTION: np.asarray(actions)[:, None]})
+        rewards, terminated, truncated = rest
+        return observed.frames[NAME], rewards, terminated, truncated
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.environments.close()
+
+
+def act(
+    runtime: PolicyRuntime, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return actions [E], log-probabilities [E] and the next state: sampled with `random`, else greedy."""
+    size, rows = runtime.noise_size, len(observations)
+    noise = neutral_noise(size, rows) if random is None else draw_noise(size, rows, random)
+    choice = runtime.act({NAME: observations}, state, noise, {})
+    return choice.actions[ACTION][:, 0], choice.log_probs, choice.state
+
+
+def plain(content: Any) -> Any:
+    """Return the only component of a map."""
+    (value,) = content.values()
+    return value
