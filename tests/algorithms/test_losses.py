@@ -16,7 +16,7 @@ from daedalus.algorithms.losses import (
     policy_gradient_loss,
     value_loss,
 )
-from daedalus.policy.network.distributions import Categorical
+from daedalus.policy.network.distributions.categorical import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
 
 ROWS, COLUMNS = 5, 3
@@ -67,7 +67,7 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     logits = normal(random, ROWS, COLUMNS, 4).requires_grad_()
     actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
     advantages = normal(random)
-    log_probs, _ = Categorical(DiscreteSpace(counts=(4,))).log_prob_and_entropy(logits, actions)
+    log_probs, _ = Categorical(DiscreteSpace(counts=(4,))).log_prob_and_entropy(logits, actions.unsqueeze(-1))
     policy_gradient_loss(log_probs, advantages, valid).backward()
     chosen = torch.nn.functional.one_hot(actions, 4)
     expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)

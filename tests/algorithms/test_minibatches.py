@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 from building import ENVIRONMENTS, ROWS, join, make_rollouts
+from plain import ACTION, NAME
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
@@ -29,8 +30,9 @@ class Numbered:
         """Assert that every row of a minibatch equals the row of the batch with the same number."""
         for row, column in torch.cartesian_prod(*map(torch.arange, minibatch.log_probs.shape)).tolist():
             t, b = divmod(int(minibatch.log_probs[row, column]), WIDTH)
-            assert torch.equal(minibatch.observations[row, column], self.batch.observations[t, b])
-            for name in ("starts", "actions", "valid"):
+            assert torch.equal(minibatch.observations[NAME][row, column], self.batch.observations[NAME][t, b])
+            assert torch.equal(minibatch.actions[ACTION][row, column], self.batch.actions[ACTION][t, b])
+            for name in ("starts", "valid"):
                 assert torch.equal(getattr(minibatch, name)[row, column], getattr(self.batch, name)[t, b])
             assert torch.equal(minibatch.targets[row, column], self.targets.values[t, b])
             assert torch.equal(minibatch.advantages[row, column], self.targets.advantages[t, b])
@@ -55,15 +57,15 @@ def test_pass_without_memory_contains_each_valid_row_once(count: int) -> None:
     made = numbered(state_size=0)
     parts = made.pass_of(count)
     assert len(parts) == min(count, int(made.batch.valid.sum()))
-    assert all(minibatch.actions.numel() for minibatch in parts)
-    sizes = [minibatch.actions.numel() for minibatch in parts]
+    assert all(minibatch.valid.numel() for minibatch in parts)
+    sizes = [minibatch.valid.numel() for minibatch in parts]
     assert max(sizes) - min(sizes) <= 1
     taken = torch.cat([minibatch.log_probs.flatten() for minibatch in parts])
     expected = made.numbers[made.batch.valid == 1.0]
     assert torch.equal(taken.sort().values, expected)
     for minibatch in parts:
-        assert len(minibatch.actions) == 1
-        assert minibatch.initial_state.shape == (minibatch.actions.shape[1], 0)
+        assert len(minibatch.valid) == 1
+        assert minibatch.initial_state.shape == (minibatch.valid.shape[1], 0)
         made.assert_holds(minibatch)
 
 
@@ -72,7 +74,7 @@ def test_pass_with_memory_contains_each_environment_once_with_all_rows(count: in
     made = numbered(state_size=5)
     parts = made.pass_of(count)
     assert len(parts) == min(count, WIDTH)
-    widths = [minibatch.actions.shape[1] for minibatch in parts]
+    widths = [minibatch.valid.shape[1] for minibatch in parts]
     assert max(widths) - min(widths) <= 1
     taken = torch.cat([minibatch.log_probs for minibatch in parts], dim=1)  # [T, B] in another order of columns
     columns = taken[0].long()

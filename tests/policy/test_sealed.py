@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
+from plain import vector_spaces
 
 from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, checkpoints, read_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
@@ -199,7 +200,7 @@ def test_leftovers_of_an_earlier_attempt_are_replaced(tmp_path: Path) -> None:
 POLICY_CONTENT: dict[str, Any] = {
     "policy_version": 7,
     "spec": {"environment": {"id": "CartPole-v1"}},
-    "spaces": {"observation": {"shape": [4], "dtype": "float32"}, "action": {"count": 2}},
+    "spaces": vector_spaces(4, 2).model_dump(mode="json"),
 }
 POLICY_FILES = {PROGRAM_FILE: b"program", PARAMETERS_FILE: safetensors.numpy.save({"w": np.ones(3, np.float32)})}
 
