@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime
 
 from daedalus.policy.acting.onnx_initializers import with_initializers
-from daedalus.policy.acting.sampling import SAMPLERS
+from daedalus.policy.acting.sampling import SAMPLERS, RandomSource
 
 OBSERVATIONS, STATE = "observations", "state"
 NEXT_STATE = "next_state"
@@ -38,7 +38,7 @@ class PolicyRuntime(Protocol):
         ...
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Choose one action for each observation: a sample if `random` is given, otherwise the most probable.
 
@@ -113,7 +113,7 @@ class OnnxRuntime:
             self._feed = bound
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
         self._feed[OBSERVATIONS] = observations
