@@ -20,12 +20,11 @@ from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
-from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
-from daedalus.transport.interface import Request, Transport
+from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -89,6 +88,7 @@ class LearnerService:
             start_version=restored.policy.policy_version if restored else 0,
             spaces=restored.policy.spaces if restored else None,
         )
+        self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
             directory.name,
             spec,
@@ -173,8 +173,7 @@ class LearnerService:
                 seconds_to_target = self._reporter.wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
-            for request, message in self._server.evaluations.take():
-                self._serve_evaluator(request, message, learner, checkpointer)
+            self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             if now >= log_at:
                 recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
@@ -198,33 +197,6 @@ class LearnerService:
             _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
-
-    def _serve_evaluator(
-        self,
-        request: Request,
-        message: EvaluationRequest | EvaluationReport,
-        learner: "Learner",
-        checkpointer: "Checkpointer",
-    ) -> None:
-        """Record the report of an evaluator, or answer its request with the newest policy.
-
-        The evaluated policy is saved as a checkpoint first, because it may turn out to be the best.
-        """
-        if isinstance(message, EvaluationReport):
-            answer, text = self._evaluations.report(message)
-            request.reply(encode(answer))
-            if text:
-                _logger.info(text)
-            return
-        directory = checkpointer.save()
-        if directory is None:
-            request.reply(encode(Refusal(code="not_ready", reason="the checkpoint of the policy could not be saved")))
-            return
-        publisher, version = self._server.publisher, learner.policy_version
-        if version != publisher.version:
-            publisher.publish(version, learner.weights())
-        self._evaluations.begin(message.evaluator, directory, version, self._counters.env_steps)
-        request.reply(publisher.newest())
 
     def _close_server(self) -> None:
         stopped = self._stop.is_set()
