@@ -23,7 +23,7 @@ class Health:
     actor_seen: float  # last time with a live actor, or the start
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
-    gradient_fault: bool = False  # whether the last update was skipped
+    gradient_fault: str = ""  # why the last update was skipped, if it was
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -38,7 +38,7 @@ class Health:
         elif now - self.updated > _STALLED_SECONDS:
             found.append(f"no update for {now - self.updated:.0f} s")
         if self.gradient_fault:
-            found.append("updates are skipped: the gradient is not finite")
+            found.append(f"updates are skipped: {self.gradient_fault}")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
         return tuple(found)

@@ -116,6 +116,22 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
+    def count_trained(self, rollouts: list[Rollout], at_fault: list[Rollout]) -> None:
+        """Count the rollouts of a batch for their senders, after its updates.
+
+        Args:
+          rollouts: the rollouts of the batch.
+          at_fault: those for which an update had no finite gradient.
+        """
+        with self._lock:
+            for rollout in rollouts:
+                finite = not any(rollout is each for each in at_fault)
+                actor = self._fleet.find(rollout.identity)
+                if actor is not None:
+                    actor.count_trained(finite=finite)
+                if not finite:
+                    self._counters.rollouts_rejected["non_finite"] += 1
+
     def _take(self, version: int) -> TakenRollouts:
         return self._buffer.take(self._fleet.live, version)
 
