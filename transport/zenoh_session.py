@@ -4,6 +4,7 @@ A session either embeds a full router that listens (the learner, by default) or 
 """
 
 import json
+import resource
 from collections.abc import Callable
 from typing import Literal
 
@@ -11,7 +12,7 @@ import zenoh
 
 from daedalus.transport.credentials import Credentials, diagnose_connection
 from daedalus.transport.interface import AddressInUseError, RefusedError, TransportError
-from daedalus.transport.zenoh_settings import session_settings
+from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 OpenSession = Callable[[], zenoh.Session]
 
@@ -21,15 +22,19 @@ def session_opener(
     listen_on: list[str],
     connect_to: list[str],
     credentials: Credentials | None,
+    max_message_bytes: int,
 ) -> OpenSession:
     """Return a function that opens a session with these settings, each time a new one.
+
+    The session receives messages of at most `max_message_bytes`, and drops larger ones while they arrive.
 
     The function raises AddressInUseError, RefusedError or TransportError. Raises CredentialsError if the folder of
     `credentials` does not list the authorised names and the session listens.
     """
     config = zenoh.Config()
     security = credentials.settings(listens=bool(listen_on)) if credentials else {}
-    settings = session_settings(mode, listen_on, connect_to, security)
+    capacity = Capacity(message_bytes=max_message_bytes, descriptors=_descriptors())
+    settings = session_settings(mode, listen_on, connect_to, security, capacity)
 
     def open_session() -> zenoh.Session:
         try:
@@ -40,6 +45,12 @@ def session_opener(
             raise _opening_error(str(error), listen_on, connect_to, credentials) from None
 
     return open_session
+
+
+def _descriptors() -> int:
+    """Return the number of file descriptors that this process may have open."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return Capacity.descriptors if soft == resource.RLIM_INFINITY else soft
 
 
 def _opening_error(

@@ -7,35 +7,53 @@ Only the files named `zenoh_*.py` import Zenoh. What Zenoh needs of its user (me
 """
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Iterator
 
 import zenoh
 
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Inbox, OnAnswer, Request, Transport, TransportError
 from daedalus.transport.zenoh_callbacks import Callbacks
 from daedalus.transport.zenoh_session import OpenSession, session_opener
+from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
+
+_logger = logging.getLogger(__name__)
 
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
 
 
-def listen(endpoints: list[str], connect: list[str] | None = None, credentials: Credentials | None = None) -> Transport:
+def listen(
+    endpoints: list[str],
+    connect: list[str] | None = None,
+    credentials: Credentials | None = None,
+    *,
+    max_message_bytes: int = MAX_MESSAGE_BYTES,
+) -> Transport:
     """Open a router that listens on `endpoints` and connects to the routers at `connect`.
 
     Endpoints are `tcp/HOST:PORT` or `tls/HOST:PORT`. With `credentials` the router admits the names that their folder
-    lists, and connections over plain TCP.
+    lists, and connections over plain TCP. The router drops messages above `max_message_bytes`.
     Raises AddressInUseError, TransportError or CredentialsError.
     """
-    return ZenohTransport(session_opener("router", endpoints, connect or [], credentials), is_client=False)
+    opener = session_opener("router", endpoints, connect or [], credentials, max_message_bytes)
+    return ZenohTransport(opener, is_client=False)
 
 
-def connect(endpoints: list[str], credentials: Credentials | None = None) -> Transport:
-    """Open a client of the router at one of `endpoints`.
+def connect(
+    endpoints: list[str],
+    credentials: Credentials | None = None,
+    *,
+    max_message_bytes: int = LEARNER_LIMITS.message_bytes,
+) -> Transport:
+    """Open a client of the router at one of `endpoints`; it does not receive messages above `max_message_bytes`.
 
     Raises TransportError at once if none of them can be reached, RefusedError if retrying will not help.
     """
-    return ZenohTransport(session_opener("client", [], endpoints, credentials), is_client=True)
+    opener = session_opener("client", [], endpoints, credentials, max_message_bytes)
+    return ZenohTransport(opener, is_client=True)
 
 
 @contextlib.contextmanager
@@ -113,7 +131,7 @@ class ZenohTransport:
         self._open_session = open_session
         self._is_client = is_client
         self._session = open_session()
-        self._closed = False
+        self._closed = self._warned_of_size = False
         # Each declaration, to be repeated in a new session, and the object that it returned in the present session:
         # Zenoh undeclares that object when it is garbage-collected.
         self._declared: dict[Callable[[zenoh.Session], object], object] = {}
@@ -163,6 +181,14 @@ class ZenohTransport:
 
     def publish(self, key: str, payload: bytes) -> None:
         """See Transport."""
+        if self._is_client and len(payload) > MAX_MESSAGE_BYTES and not self._warned_of_size:
+            self._warned_of_size = True
+            _logger.warning(
+                "a snapshot has %.0f MiB: start the routers with a --max-message-megabytes above this size; "
+                "by default they drop messages above %d MiB",
+                len(payload) / 2**20,
+                MAX_MESSAGE_BYTES >> 20,
+            )
         with _as_transport_error(f"publish {key}"):
             self._publisher(key).put(payload)
 

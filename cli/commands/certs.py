@@ -13,7 +13,7 @@ from daedalus.cli.arguments import command_parser
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import NAMES, Credentials, CredentialsError, read_names
-from daedalus.transport.zenoh_settings import as_config_file, session_settings
+from daedalus.transport.zenoh_settings import Capacity, as_config_file, session_settings
 
 _CA_DAYS, _DAYS = 3650, 825
 _LISTENERS = ("learner", "router")
@@ -171,7 +171,7 @@ def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
         _replace(directory / role / NAMES, json.dumps(names, indent=2) + "\n")
     folder = (directory / "router").resolve()
     security = Credentials(folder, "router", "").settings(listens=True)
-    zenohd = as_config_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security))
+    zenohd = as_config_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security, Capacity()))
     _replace(folder / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
 
 

@@ -77,6 +77,18 @@ def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     assert "its environment has 3 choices" in str(actor.error)
 
 
+def test_actor_whose_rollouts_the_learner_cannot_take_ends_with_the_setting_to_raise(network: MemoryNetwork) -> None:
+    """The network drops such a message in silence: nobody would ever answer it."""
+    service = SPEC.service.model_copy(update={"queue_megabytes": 0.0001})
+    learner = ScriptedLearner(network, SPEC.model_copy(update={"service": service}))
+    actor = RunningActor(network)
+    learner.publish(0)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "fewer environments (--envs), or raise service.queue_megabytes" in str(actor.error)
+    assert learner.rollouts.empty()
+
+
 def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
