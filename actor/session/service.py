@@ -47,7 +47,6 @@ class ActorConfig:
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
     wrap: str | None = None  # module:function, applied to each environment
-    authorization_hint: str = ""  # added to messages that no learner responds
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
 
@@ -67,7 +66,7 @@ class ActorService:
         self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
-        self._queries = LearnerQueries(transport, config.authorization_hint)
+        self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
         self._uploads = UploadSession(transport, config.name, self._presence, self._lock)
         self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, stop)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from daedalus.cli.commands.certs import certs
-from daedalus.transport.credentials import load
+from daedalus.transport.credentials import authorised_names, load
 
 
 def make(directory: Path) -> Path:
@@ -30,21 +30,20 @@ def test_a_key_file_is_readable_by_its_owner_only(tmp_path: Path) -> None:
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
 
 
-def test_issue_and_revoke_update_the_authorised_names_of_learner_and_router(tmp_path: Path) -> None:
+def test_issue_and_revoke_update_the_authorised_clients_of_learner_and_router(tmp_path: Path) -> None:
     made = make(tmp_path / "certs")
     assert certs(["issue", "actor", "arm", "box", "--directory", str(made)]) == 0
     assert certs(["issue", "operator", "ann", "--directory", str(made)]) == 0
     credentials = load(made / "actor-arm", "actor")
     assert (credentials.role, credentials.name) == ("actor", "arm")
     for role in ("learner", "router"):
-        names = json.loads((made / role / "names.json").read_text())
-        assert names == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
+        assert authorised_names(made / role) == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
     zenohd = json.loads((made / "router" / "zenoh.json5").read_text())
     assert {"actor:arm", "actor:box"} < {
         name for subject in zenohd["access_control"]["subjects"] for name in subject.get("cert_common_names", ())
     }
     assert certs(["revoke", "actor", "box", "--directory", str(made)]) == 0
-    assert json.loads((made / "learner" / "names.json").read_text())["actors"] == ["arm"]
+    assert authorised_names(made / "learner")["actors"] == ["arm"]
     assert not (made / "actor-box").exists()
 
 
