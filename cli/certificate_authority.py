@@ -94,11 +94,6 @@ def read_issued(path: Path) -> Issued:
     return Issued(str(name.value), certificate.not_valid_after_utc, hosts)
 
 
-def subject_size(path: Path) -> int:
-    """Return the size of the subject of the certificate in a file, in bytes, as TLS sends it."""
-    return len(x509.load_pem_x509_certificate(path.read_bytes()).subject.public_bytes()) + 2
-
-
 def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, lifetime: datetime.timedelta
 ) -> x509.CertificateBuilder:

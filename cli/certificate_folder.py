@@ -17,7 +17,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-from daedalus.cli.certificate_authority import CertificateAuthority, Issued, read_issued, subject_size
+from daedalus.cli.certificate_authority import CertificateAuthority, Issued, read_issued
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, Credentials, CredentialsError
@@ -28,7 +28,8 @@ CLIENT_ROLES = ("actor", "operator")
 
 _CA_LIFETIME = datetime.timedelta(days=3650)
 _ZENOHD = "zenoh.json5"
-_MAX_SUBJECT_BYTES = 60_000  # of all clients: a listener sends them in each handshake, which has room for 65,535
+# A listener names all issuers in each handshake, which has room for 65,535 bytes: about 2,000 names.
+_MAX_SUBJECT_BYTES, _SUBJECT_OVERHEAD = 60_000, 16
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -85,7 +86,8 @@ class CertificateFolder:
         certificate before. Raises CredentialsError or ValueError if a name is not possible.
         """
         for identity in identities:
-            _check(identity)
+            _check_name(identity)
+        _check_number({*self.identities(), *identities})
         for identity in identities:
             record, folder = self.directory / "ca" / identity.folder, self.directory / identity.folder
             if identity.role in LISTENERS:
@@ -128,11 +130,6 @@ class CertificateFolder:
     def _write_clients(self) -> None:
         """Write clients.pem for learner and router, and the configuration of a standard zenohd."""
         issuers = sorted((self.directory / "ca").glob(f"*/{CA}"))
-        if sum(map(subject_size, issuers)) > _MAX_SUBJECT_BYTES:
-            raise CredentialsError(
-                f"{len(issuers)} certificates are more than a listener can accept: issue one for each host, whose "
-                "actors use it under NAME.1, NAME.2 and so on, and revoke those that are not needed"
-            )
         content = "".join(path.read_text("ascii") for path in (self.directory / "ca" / CA, *issuers))
         for role in LISTENERS:
             if (self.directory / role).exists():
@@ -144,7 +141,16 @@ class CertificateFolder:
             _replace(router / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
 
 
-def _check(identity: Identity) -> None:
+def _check_number(identities: set[Identity]) -> None:
+    clients = [identity for identity in identities if identity.role in CLIENT_ROLES]
+    if sum(len(client.common_name) + _SUBJECT_OVERHEAD for client in clients) > _MAX_SUBJECT_BYTES:
+        raise CredentialsError(
+            f"{len(clients)} certificates are more than a listener can accept: issue one for each host, whose actors "
+            "use it under NAME.1, NAME.2 and so on, and revoke those that are not needed"
+        )
+
+
+def _check_name(identity: Identity) -> None:
     if identity.role in LISTENERS:
         return
     keys.check_name(identity.name, f"{identity.role} name")

@@ -6,18 +6,21 @@ Zenoh assembles a message in memory before anybody can refuse it. The attack sen
 the sender, and three queries of 400 MB to a learner on loopback. Both must stay small and keep working.
 """
 
+import datetime
 import sys
 from contextlib import closing
 from pathlib import Path
 
 from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, resident_mib, scene
+from daedalus.cli.certificate_folder import CertificateFolder, Identity
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
 from daedalus.transport.credentials import load
 from daedalus.transport.zenoh_transport import connect
 
+_LIFETIME = datetime.timedelta(days=365)
 _MEGABYTE = 10**6
 _MOST_GROWTH_MIB = 200.0  # three messages of 64 MiB, the largest that is received
 
@@ -36,9 +39,8 @@ def large_messages() -> Verdict:
 def _router() -> tuple[float, float]:
     """Return the peak memory of a router before and after the attack."""
     with scene() as here:
-        from certificates import make_certificates  # of the tests: benchmarks.chaos adds them to the path
-
-        certificates = make_certificates(here.folder / "certs")
+        certificates = here.folder / "certs"
+        CertificateFolder.create(certificates, [], _LIFETIME).issue([Identity("actor", "arm")], _LIFETIME)
         address = here.address.replace("tcp/", "tls/")
         running = here.start("router", "--listen", address, "--tls", certificates / "router")
         running.expect("listening")
