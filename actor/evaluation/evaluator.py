@@ -80,7 +80,7 @@ class Evaluator:
         program = self._queries.program(welcome.run, snapshot.program)
         if program is None:
             return False
-        runtime = OnnxRuntime(program[1])
+        runtime = OnnxRuntime(program[1], self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
         evaluation = play_episodes(

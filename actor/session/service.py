@@ -138,7 +138,7 @@ class ActorService:
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
             return TorchRuntime(welcome.spec.policy, spaces)
-        return OnnxRuntime(self._await_program(welcome))
+        return OnnxRuntime(self._await_program(welcome), self._stop)
 
     def _await_program(self, welcome: Welcome) -> bytes:
         """Return the program once the learner has it; measure the link by the time that it takes."""
