@@ -1,0 +1,15 @@
+"""Deterministic simulation of the session protocol: real actors and learners, virtual time, a faulty network.
+
+    kernel.py       virtual time; threads that run one at a time, in an order that a seed decides
+    primitives.py   the parts of `threading`, `time` and `queue` that the services use, on the kernel
+    network.py      a Transport whose messages are lost, duplicated, delayed and reordered
+    codec.py        messages that travel as objects, because encoding would take most of the time
+    settings.py     what a seed decides: the run, the fleet, the faults
+    learners.py     the real actor server, and a loop that takes batches in place of training
+    actors.py       the real actor service, and a collector that makes rollouts without environments
+    faults.py       kills, stops, freezes, cuts and restarts of processes
+    ledger.py       what happened to each rollout, and the invariants
+    simulate.py     one simulation from a seed
+
+`python -m tests.simulation --help` runs many seeds.
+"""

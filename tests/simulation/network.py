@@ -1,0 +1,392 @@
+"""A network in virtual time, whose messages are lost, duplicated, delayed and reordered.
+
+Every process has one link to one router. A link is up, cut (nothing passes; presence is lost after the lease), or dead:
+cut until the process opens another session.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from daedalus.transport import memory
+from daedalus.transport.interface import Inbox, OnAnswer, Request, TransportError
+
+from .kernel import Channel, Kernel, Killed, Process
+
+matches = functools.lru_cache(maxsize=4096)(memory.matches)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weather:
+    """How messages travel. Probabilities are of one message."""
+
+    delay: float = 0.005  # seconds: the longest usual delay
+    slow: float = 0.0  # probability of a delay of up to `slow_seconds`
+    slow_seconds: float = 0.0
+    lost: float = 0.0  # probability that a query, an answer or a pushed value is lost
+    noticed: float = 0.0  # probability that the sender of a lost query is told soon, before the timeout
+    duplicated: float = 0.0  # probability that a query arrives twice
+    refused: float = 0.0  # probability that an operation on a cut link raises TransportError
+    lease: float = 1.0  # seconds after which a process whose link is cut is absent for the others
+
+
+CALM = Weather()
+
+
+class Network:
+    """The router, and the links of all processes to it."""
+
+    def __init__(self, kernel: Kernel, weather: Weather) -> None:
+        self.kernel, self.weather = kernel, weather
+        self.links: list[Link] = []
+        self.on_request: Callable[[LinkRequest], None] = lambda request: None
+        self.on_reply: Callable[[LinkRequest, bytes], None] = lambda request, payload: None
+        self._cut = False
+
+    @property
+    def cut(self) -> bool:
+        """Whether the router is out of reach for everybody."""
+        return self._cut
+
+    @cut.setter
+    def cut(self, cut: bool) -> None:
+        self._cut = cut
+        for link in list(self.links):
+            link.reachability_changed()
+
+    def delay(self) -> float:
+        """Return how long one message takes."""
+        random, weather = self.kernel.random.random, self.weather
+        seconds = 0.0002 + weather.delay * random()
+        return seconds + weather.slow_seconds * random() if weather.slow and random() < weather.slow else seconds
+
+    @property
+    def longest_delay(self) -> float:
+        """How long any message may take."""
+        return 0.0004 + 2 * (self.weather.delay + self.weather.slow_seconds)
+
+    def chance(self, probability: float) -> bool:
+        """Return whether something with a probability happens."""
+        return probability > 0.0 and self.kernel.random.random() < probability
+
+    def servers(self, key: str) -> list[tuple["Link", str]]:
+        """Return the links that serve a key, with the key under which they do."""
+        return [
+            (link, served)
+            for link in self.links
+            if not link.expired
+            for served in link.handlers
+            if matches(served, key)
+        ]
+
+    def presence_changed(self, key: str) -> None:
+        """Tell everybody who watches a key, in a while."""
+        for link in self.links:
+            for watch in link.watches:
+                if matches(watch.pattern, key):
+                    watch.look_later(key)
+
+    def is_present(self, key: str, watcher: "Link") -> bool:
+        """Return whether a link sees a key."""
+        return any(
+            key in link.tokens and (link is watcher or not (link.expired or watcher.expired)) for link in self.links
+        )
+
+
+class _Query:
+    """One query that its sender waits for."""
+
+    def __init__(self, link: "Link", on_answer: OnAnswer) -> None:
+        self.link, self.session = link, link.session
+        self._on_answer: OnAnswer | None = on_answer
+        self._channel = Channel(link.process, "answer")
+
+    def finish(self, answer: bytes | None) -> None:
+        on_answer, self._on_answer = self._on_answer, None
+        if on_answer is not None:
+            self.link.queries.pop(self, None)
+            self._channel.deliver(on_answer, answer)
+
+
+class LinkRequest:
+    """A query as its server receives it."""
+
+    def __init__(self, server: "Link", query: _Query, key: str, payload: bytes) -> None:
+        self.server, self.query, self.key, self._payload = server, query, key, payload
+        self.size = len(payload)
+        self._answered = False
+
+    @property
+    def payload(self) -> bytes:
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        server = self.server
+        if server.network.kernel.current.killed:
+            raise Killed
+        if self._answered:
+            return
+        self._answered = True
+        network, client = server.network, self.query.link
+        network.on_reply(self, payload)
+        if server.passes() and not network.chance(network.weather.lost):
+            network.kernel.after(network.delay() + network.delay(), self._arrive, payload)
+        elif network.chance(network.weather.noticed):
+            network.kernel.after(network.kernel.random.random(), self.query.finish, None)
+        else:
+            network.kernel.log("answer lost", server.process.name, client.process.name, self.key)
+
+    def _arrive(self, payload: bytes) -> None:
+        client = self.query.link
+        if client.passes() and client.session == self.query.session:
+            self.query.finish(payload)
+
+
+class _LinkInbox:
+    """The newest unread value of a subscription."""
+
+    def __init__(self, link: "Link", key: str, on_news: Callable[[], None]) -> None:
+        self.key, self._link, self._on_news = key, link, on_news
+        self._newest: bytes | None = None
+        self._channel = Channel(link.process, "value")
+
+    def arrive(self, payload: bytes, session: int) -> None:
+        if self.key and self._link.passes() and self._link.session == session:
+            self._channel.deliver(self._put, payload)
+
+    def _put(self, payload: bytes) -> None:
+        self._newest = payload
+        self._on_news()
+
+    def take(self) -> bytes | None:
+        newest, self._newest = self._newest, None
+        return newest
+
+    def close(self) -> None:
+        self.key = ""
+
+
+class _Watch:
+    """What one link was told about the presence of keys."""
+
+    def __init__(self, link: "Link", pattern: str, on_change: Callable[[str, bool], None]) -> None:
+        self.pattern, self.told = pattern, dict[str, bool]()
+        self._link, self._on_change = link, on_change
+        self._channel = Channel(link.process, "presence")
+
+    def look_later(self, key: str) -> None:
+        network = self._link.network
+        network.kernel.after(network.delay(), self.look, key)
+
+    def look(self, key: str) -> None:
+        self._tell(key, self._link.network.is_present(key, self._link))
+
+    def forget(self, key: str) -> None:
+        """Tell that a key is absent, and look again in a while: the network was wrong."""
+        self._tell(key, False)
+        self.look_later(key)
+
+    def _tell(self, key: str, present: bool) -> None:
+        if self._link.alive and not self._link.dead and self.told.get(key, False) != present:
+            self.told[key] = present
+            self._link.network.kernel.log("presence", self._link.process.name, key, present)
+            self._channel.deliver(self._on_change, key, present)
+
+
+class Link:
+    """The Transport of one process."""
+
+    def __init__(self, network: Network, process: Process, *, is_router: bool = False) -> None:
+        """Open the link. A process that is the router never reopens it."""
+        self.network, self.process, self._is_router = network, process, is_router
+        self.alive = True  # until it is closed
+        self.cut = self.dead = False
+        self.expired = False  # whether the others do not see this process any more
+        self.session = 0
+        self.handlers: dict[str, tuple[Callable[[Request], None], Channel]] = {}
+        self.tokens: dict[str, None] = {}
+        self.inboxes: list[_LinkInbox] = []
+        self.watches: list[_Watch] = []
+        self.queries: dict[_Query, None] = {}
+        network.links.append(self)
+
+    def passes(self) -> bool:
+        """Return whether messages pass this link now."""
+        return self.alive and not (self.cut or self.dead or self.network.cut)
+
+    def reachability_changed(self) -> None:
+        """Lose presence after the lease, or get it back."""
+        if self.passes():
+            if self.expired:
+                self.expired = False
+                self._presence_changed()
+        else:
+            self.network.kernel.after(self.network.weather.lease, self._expire, self.session)
+
+    def process_killed(self) -> None:
+        """Close the link without a word: the others notice after the lease."""
+        self.alive = False
+        self.network.kernel.after(self.network.weather.lease * self.network.kernel.random.random(), self._remove)
+
+    def flicker(self) -> None:
+        """Let all others see this process go and come."""
+        for key in self.tokens:
+            for link in self.network.links:
+                for watch in link.watches:
+                    if link is not self and matches(watch.pattern, key):
+                        watch.forget(key)
+
+    def _expire(self, session: int) -> None:
+        if not self.passes() and self.session == session and not self.expired:
+            self.expired = True
+            self._presence_changed()
+
+    def _presence_changed(self) -> None:
+        for key in self.tokens:
+            self.network.presence_changed(key)
+        for watch in self.watches:
+            for key in {key: None for link in self.network.links for key in link.tokens}:
+                if matches(watch.pattern, key):
+                    watch.look_later(key)
+
+    def _remove(self) -> None:
+        network = self.network
+        if self not in network.links:
+            return
+        network.links.remove(self)
+        for key in self.tokens:
+            network.presence_changed(key)
+
+    # ---------------------------------------------------------------------------------------------- Transport
+
+    def _enter(self, operation: str) -> None:
+        self.network.kernel.preempt()
+        if not self.alive:
+            raise TransportError("the session is closed")
+        if not self.passes() and self.network.chance(self.network.weather.refused):
+            raise TransportError(f"cannot {operation}: the session is being replaced")
+
+    def serve(self, key: str, handler: Callable[[Request], None]) -> None:
+        self.handlers[key] = handler, Channel(self.process, "query")
+
+    def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        self._enter("query")
+        kernel, task = self.network.kernel, self.network.kernel.current
+        answers: list[bytes] = []
+        servers = self.network.servers(key) if self.passes() else []
+        left = len(servers)
+        waits = False
+
+        def on_answer(answer: bytes | None) -> None:
+            nonlocal left
+            left -= 1
+            if answer is not None:
+                answers.append(answer)
+            if left == 0 and waits:
+                kernel.wake(task)
+
+        for server, served in servers:
+            self._send(server, served, key, payload, timeout, on_answer)
+        if servers:
+            waits = True
+            kernel.park(timeout)
+            waits = False
+            return list(answers)
+        kernel.sleep(self.network.delay() if self.passes() or self.network.chance(0.5) else timeout)
+        return []
+
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
+        self._enter("query")
+        servers = self.network.servers(key) if self.passes() else []
+        if servers:
+            self._send(*servers[0], key, payload, timeout, on_answer)
+        else:
+            query = _Query(self, on_answer)
+            self.queries[query] = None
+            noticed = self.passes() or self.network.chance(self.network.weather.noticed)
+            self.network.kernel.after(self.network.delay() if noticed else timeout, query.finish, None)
+
+    def _send(
+        self, server: "Link", served: str, key: str, payload: bytes, timeout: float, on_answer: OnAnswer
+    ) -> None:
+        network, kernel = self.network, self.network.kernel
+        query = _Query(self, on_answer)
+        self.queries[query] = None
+        kernel.after(timeout, query.finish, None)
+        for _ in range(2 if network.chance(network.weather.duplicated) else 1):
+            if network.chance(network.weather.lost):
+                kernel.log("query lost", self.process.name, key)
+                if network.chance(network.weather.noticed):
+                    kernel.after(kernel.random.random(), query.finish, None)
+                continue
+            request = LinkRequest(server, query, key if "*" in served else served, payload)
+            kernel.after(network.delay() + network.delay(), self._arrive, request, served, server.session)
+
+    def _arrive(self, request: LinkRequest, served: str, session: int) -> None:
+        server = request.server
+        if server.passes() and server.session == session:
+            self.network.on_request(request)
+            handler, channel = server.handlers[served]
+            channel.deliver(handler, request)
+        elif self.network.chance(self.network.weather.noticed):
+            request.query.finish(None)
+
+    def publish(self, key: str, payload: bytes) -> None:
+        self._enter("publish")
+        network = self.network
+        if not self.passes():
+            return
+        for link in network.links:
+            for inbox in link.inboxes:
+                if inbox.key == key and not network.chance(network.weather.lost):
+                    network.kernel.after(network.delay() + network.delay(), inbox.arrive, payload, link.session)
+
+    def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
+        inbox = _LinkInbox(self, key, on_news)
+        self.inboxes.append(inbox)
+        return inbox
+
+    def declare_presence(self, key: str) -> None:
+        self.tokens[key] = None
+        self.network.presence_changed(key)
+
+    def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
+        watch = _Watch(self, key, on_change)
+        self.watches.append(watch)
+        for declared in {declared: None for link in self.network.links for declared in link.tokens}:
+            if matches(key, declared):
+                watch.look_later(declared)
+
+    def reopen(self, unless_served: str | None = None) -> bool:
+        network, kernel = self.network, self.network.kernel
+        if self._is_router:
+            return False
+        kernel.sleep(network.delay())
+        if self.cut or network.cut:
+            kernel.sleep(kernel.random.random())
+            raise TransportError("no router can be reached")
+        if unless_served is not None and any(not link.dead for link, _ in network.servers(unless_served)):
+            kernel.sleep(network.delay())
+            return False
+        if not self.alive:
+            return False
+        kernel.log("session reopened", self.process.name)
+        self.session += 1
+        self.dead = self.expired = False
+        for query in list(self.queries):
+            query.finish(None)
+        self.flicker()
+        for watch in self.watches:
+            for key in list(watch.told):
+                watch.forget(key)
+        self._presence_changed()
+        return True
+
+    def close(self) -> None:
+        if self.network.kernel.current.killed or not self.alive:
+            return
+        self.alive = False
+        for query in list(self.queries):
+            query.finish(None)
+        # What was sent before arrives before: a session that is closed sends all that it has.
+        self.network.kernel.after(self.network.longest_delay, self._remove)
