@@ -50,7 +50,7 @@ class ScriptedCollector:
     def has_rollout(self) -> bool:
         return True
 
-    def collect(self, identity: RolloutIdentity) -> Rollout:
+    def collect(self, identity: RolloutIdentity, *_: object) -> Rollout:
         actor, snapshot = self._actor, self._snapshot
         assert snapshot is not None
         actor.ledger.loaded(snapshot, identity.learner_epoch)

@@ -32,6 +32,10 @@ class Life:
     published: set[int] = field(default_factory=set)
     ended: bool = False
 
+    def has_verdict(self, identity: RolloutIdentity) -> bool:
+        """Return whether the learner has decided about a rollout."""
+        return identity in self.judged or bool(self.answers.get(identity, Counter()).keys() - {"busy"})
+
 
 @dataclass(frozen=True, slots=True)
 class Collected:

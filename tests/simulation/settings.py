@@ -49,7 +49,7 @@ def draw(seed: int) -> Settings:
     spec = _spec(random)
     faulty = random.uniform(1.0, 12.0)
     actors = spec.collection.actors
-    collect = random.choice((0.01, 0.05, 0.3))
+    collect = random.choice((0.1, 0.3, 1.0))
     return Settings(
         spec=spec,
         embedded=random.random() < 0.5,

@@ -282,7 +282,7 @@ class World:
                     continue
                 if identity.learner_epoch == self.learner.epoch and identity.sequence not in waiting:
                     in_progress = identity.sequence >= actor.service._sequence
-                    self.ledger.require(in_progress or identity in self.learner.life.judged, f"{identity} was lost")
+                    self.ledger.require(in_progress or self.learner.life.has_verdict(identity), f"{identity} was lost")
 
     def _end(self) -> None:
         """End the run; everybody must notice."""
@@ -290,6 +290,7 @@ class World:
         actors = list(self.actors.values())
         if self.settings.ends_by == "finish":
             self.learner.is_finished = True
+            actors = [actor for actor in actors if actor.link_choice == "lan"]
             self._await_ends(actors, END_SECONDS, "the end of the run")
         else:
             for actor in actors:
