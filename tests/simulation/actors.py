@@ -1,12 +1,13 @@
-"""An actor's process: the real actor service, with a collector that makes rollouts without environments."""
+"""An actor's process: the real actor service, with collectors that make rollouts without environments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from daedalus.actor.session.learner_queries import ActorError, NameInUseError
-from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -16,11 +17,11 @@ from .kernel import Kernel, Process
 from .ledger import Ledger
 from .network import Link, Network
 from .primitives import Event
-from .settings import RUN
 
 _SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 _FALSE = np.zeros((1, 1), np.bool_)
 _ZERO = np.zeros((1, 1), np.float32)
+_KEPT = 2  # rollouts that a client keeps while it cannot send
 
 
 class Runtime:
@@ -28,6 +29,16 @@ class Runtime:
 
     def __init__(self, model: bytes) -> None:
         assert model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorSettings:
+    """What distinguishes one actor from another."""
+
+    kind: Literal["environments", "client"]
+    link: LinkChoice
+    run: str  # its name, or * for any
+    collect_seconds: float  # for one rollout
 
 
 class ScriptedCollector:
@@ -45,19 +56,27 @@ class ScriptedCollector:
         self._snapshot = None
 
     def load(self, snapshot: Snapshot) -> None:
+        previous = self._snapshot
+        older = previous is not None and snapshot.policy_version < previous.policy_version
+        self._actor.ledger.require(not older, "an older policy version is loaded after a newer one")
         self._snapshot = snapshot
 
     def has_rollout(self) -> bool:
         return True
 
-    def collect(self, identity: RolloutIdentity, *_: object) -> Rollout:
-        actor, snapshot = self._actor, self._snapshot
+    def collect(self, identity: RolloutIdentity, *_: object) -> Rollout | None:
+        self._actor.pass_time(self._actor.settings.collect_seconds)
+        return self._rollout(identity)
+
+    def close(self) -> None:
+        pass
+
+    def _rollout(self, identity: RolloutIdentity) -> Rollout:
+        snapshot, ledger = self._snapshot, self._actor.ledger
         assert snapshot is not None
-        actor.ledger.loaded(snapshot, identity.learner_epoch)
-        number = actor.ledger.collect(identity)
-        actor.pass_time(actor.collect_seconds)
+        ledger.used(snapshot, identity.learner_epoch)
         frames = np.zeros((2, 1, 4), np.float32)
-        frames[0, 0] = [*snapshot.weights["w"], number]
+        frames[0, 0] = [*snapshot.weights["w"], ledger.collect(identity)]
         return Rollout(
             identity=identity,
             policy_version=snapshot.policy_version,
@@ -73,11 +92,31 @@ class ScriptedCollector:
             episode_lengths=np.zeros(0, np.int32),
         )
 
-    def close(self) -> None:
-        pass
+
+class ScriptedClient(ScriptedCollector):
+    """A Collector whose rollouts are made on another thread, as those of a Client are."""
+
+    _full = 0
+
+    def act(self) -> None:
+        """Make rollouts for ever. On a thread of its own."""
+        while True:
+            self._actor.pass_time(self._actor.settings.collect_seconds)
+            if self._snapshot is not None:
+                self._full = min(self._full + 1, _KEPT)
+                self._actor.service.wake()
+
+    def has_rollout(self) -> bool:
+        return self._full > 0
+
+    def collect(self, identity: RolloutIdentity, *_: object) -> Rollout | None:
+        if not self._full:
+            return None
+        self._full -= 1
+        return self._rollout(identity)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class ActorProcess:
     """One incarnation of an actor."""
 
@@ -86,30 +125,29 @@ class ActorProcess:
     ledger: Ledger
     name: str
     incarnation: int
-    link_choice: str
-    collect_seconds: float
+    settings: ActorSettings
     on_end: Callable[["ActorProcess"], None]
     process: Process = field(init=False)
     link: Link = field(init=False)
     stop: Event = field(init=False)
     service: ActorService = field(init=False)
-    hang_seconds: float = 0.0  # how long the next rollout hangs
+    hang_seconds: float = 0.0  # how much longer the next rollout takes
+    is_disturbed: bool = False  # whether it was frozen or hung, so that it may end late
     outcome: str = ""  # why the process ended
 
     def start(self) -> None:
         """Start the process."""
+        settings = self.settings
         self.process = Process(self.kernel, f"{self.name}.{self.incarnation}")
         self.link = Link(self.network, self.process)
         self.stop = Event(self.kernel)
-        config = ActorConfig(
-            name=self.name,
-            incarnation=self.incarnation,
-            run=RUN,
-            link=self.link_choice,  # type: ignore[arg-type]
-        )
-        self.service = ActorService(config, self.link, self.stop, ScriptedCollector(self))  # type: ignore[arg-type]
-        self.kernel.log("start", self.process.name, self.link_choice)
+        config = ActorConfig(name=self.name, incarnation=self.incarnation, run=settings.run, link=settings.link)
+        collector = ScriptedClient(self) if settings.kind == "client" else ScriptedCollector(self)
+        self.service = ActorService(config, self.link, self.stop, collector)  # type: ignore[arg-type]
+        self.kernel.log("start", self.process.name, settings.kind, settings.link)
         self.kernel.spawn(self.process, "main", self._main)
+        if isinstance(collector, ScriptedClient):
+            self.kernel.spawn(self.process, "user", collector.act)
 
     def kill(self) -> None:
         """End the process as SIGKILL does."""
@@ -134,6 +172,7 @@ class ActorProcess:
             outcome = f"error: {error}"
             self.ledger.require(False, f"{self.process.name} gives up: {error}")
         self.link.close()
+        self.process.kill()  # the user's thread of a client
         self._end(outcome)
 
     def _end(self, outcome: str) -> None:

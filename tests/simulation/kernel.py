@@ -7,13 +7,16 @@ advances only when no thread is ready.
 
 import _thread
 import heapq
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
 from random import Random
+from types import FrameType
 from typing import Any
 
 _MAX_STEPS = 400_000  # of one simulation; one that goes on is a livelock
+_LINE_RARITY = 10.0  # a line is so much less often interrupted than a lock
 _SLOW_SECONDS = 0.05  # longest time for which a preempted thread does not run
 
 
@@ -102,11 +105,14 @@ class _Worker:
             try:
                 if not task.killed:
                     assert task.target is not None
+                    if kernel.fine_files:
+                        sys.settrace(kernel.trace_call)
                     task.target()
             except Killed:
                 pass
             except BaseException as error:
                 kernel.fail(error)
+            sys.settrace(None)
             self.task = self.kernel = None  # type: ignore[assignment]
             _Worker.idle.append(self)
             kernel.finish(task)
@@ -115,9 +121,16 @@ class _Worker:
 class Kernel:
     """Scheduler of one simulation. The thread that creates it is the driver: it is no thread of any process."""
 
-    def __init__(self, random: Random, preemption: float) -> None:
-        """Construct the kernel. `preemption` is how probable it is that a thread is interrupted at a lock."""
+    def __init__(self, random: Random, preemption: float, fine_files: frozenset[str] = frozenset()) -> None:
+        """Construct the kernel.
+
+        Args:
+          random: decides everything that is left to chance.
+          preemption: probability that a thread is interrupted where it meets a lock or the network.
+          fine_files: source files in which a thread is interrupted at any line, with a tenth of that probability.
+        """
         self.random, self.now = random, 0.0
+        self.fine_files = fine_files
         self.failure: BaseException | None = None
         self._preemption = preemption
         self._events: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
@@ -178,18 +191,27 @@ class Kernel:
             task.parked, task.woken = False, True
             self.enqueue(task)
 
-    def preempt(self) -> None:
+    def preempt(self, rarity: float = 1.0) -> None:
         """Perhaps let other threads run first, for no time or for a short one."""
         task = self.current
         if task.killed:
             raise Killed
-        if task.lock is None or task.process is None or self.random.random() >= self._preemption:
+        if task.lock is None or task.process is None or self.random.random() >= self._preemption / rarity:
             return
         if self.random.random() < 0.2:
             self.park(self.random.random() * _SLOW_SECONDS)
             return
         self.enqueue(task)
         self._switch(task)
+
+    def trace_call(self, frame: FrameType, _event: str, _argument: Any) -> Any:
+        """Decide whether the lines of a function are traced. See sys.settrace."""
+        return self._trace_line if frame.f_code.co_filename in self.fine_files else None
+
+    def _trace_line(self, _frame: FrameType, event: str, _argument: Any) -> Any:
+        if event == "line" and not self.current.killed:
+            self.preempt(_LINE_RARITY)
+        return self._trace_line
 
     def enqueue(self, task: Task) -> None:
         """Make a thread ready to run."""
@@ -297,7 +319,7 @@ class Channel:
         if process.frozen:
             process.defer(self, function, arguments)
             return
-        if self._busy or process.locks_held or kernel.random.random() < 0.1:
+        if self._busy or process.locks_held or kernel.fine_files or kernel.random.random() < 0.1:
             self._waiting.append((function, arguments))
             if not self._busy:
                 self._busy = True

@@ -19,12 +19,12 @@ from .network import Link, Network
 from .primitives import Event
 from .settings import RUN, Settings
 
-PROGRAM = b"program"
+_PROGRAM = b"program"
 
 
 @dataclass(slots=True)
 class Disk:
-    """The learner's checkpoint: what remains of it when it is killed."""
+    """The learner's newest checkpoint: what remains of a learner that was killed."""
 
     version: int = 0
     counters: dict[str, Any] | None = None
@@ -46,8 +46,10 @@ class LearnerProcess:
     link: Link = field(init=False)
     stop: Event = field(init=False)
     life: Life = field(init=False)
-    server: ActorServer = field(init=False)
+    server: ActorServer | None = None
+    version: int = 0
     is_finished: bool = False  # whether the budget is used up
+    hang_seconds: float = 0.0  # how much longer the next update takes
     done: bool = False
 
     def start(self) -> None:
@@ -64,10 +66,15 @@ class LearnerProcess:
         self.kernel.log("kill", self.process.name)
         self.process.kill()
         self.link.process_killed()
-        self._ended()
+        self._end()
+
+    def _end(self) -> None:
+        self.kernel.log("end", self.process.name)
+        self.done = True
+        self.on_end()
 
     def _main(self) -> None:
-        """Do what daedalus.learner.service does, with sleeping in place of learning."""
+        """Do what daedalus.learner.service does."""
         disk, counters = self.disk, RunCounters(100)
         if disk.counters is not None:
             counters.restore(disk.counters)
@@ -82,51 +89,49 @@ class LearnerProcess:
             start_version=disk.version,
             spaces=disk.spaces,
         )
-        observe(server.rollouts._intake, server.rollouts._buffer, self.ledger, self.life)
+        observe(server, self.ledger, self.life)
         try:
             server.open()
-            disk.spaces = server.await_spaces(self.stop)  # type: ignore[arg-type]
+            disk.spaces = server.await_spaces(self.stop)
             if disk.spaces is not None:
-                self._train(counters, before)
+                self._train(server, counters, before)
         except TransportError as error:
             self.kernel.log("failed", self.process.name, str(error))
         finally:
             server.close("the learner was stopped" if self.stop.is_set() else "the learner has finished")
-            self._check(counters, before)
+            self._check(server, counters, before)
             self.link.close()
-            self.kernel.log("end", self.process.name)
-            self._ended()
+        self._end()
 
-    def _ended(self) -> None:
-        self.done = self.life.ended = True
-        self.on_end()
-
-    def _train(self, counters: RunCounters, before: tuple[int, int]) -> None:
-        kernel, server = self.kernel, self.server
-        version = self.disk.version
-        server.offer_policy(PROGRAM, 0)
-        self.life.published.add(version)
-        server.publisher.publish(version, self._weights(version))
+    def _train(self, server: ActorServer, counters: RunCounters, before: tuple[int, int]) -> None:
+        """Take batches, and publish a policy version after each, until the end."""
+        kernel = self.kernel
+        self.version = self.disk.version
+        server.offer_policy(_PROGRAM, 0)
+        server.publisher.publish(self.version, self._weights())
         save_at = kernel.now
         while not (self.stop.is_set() or self.is_finished):
-            rollouts = server.rollouts.take_batch(version)
-            self._check(counters, before)
+            rollouts = server.rollouts.take_batch(self.version)
+            self._check(server, counters, before)
             if rollouts:
-                kernel.sleep(self.settings.train_seconds * kernel.random.random())
-                version += self._updates(rollouts)
-                self.life.published.add(version)
-                server.publisher.publish_if_due(version, self._weights(version), len(rollouts))
+                hang, self.hang_seconds = self.hang_seconds, 0.0
+                kernel.sleep(self.settings.train_seconds * kernel.random.random() + hang)
+                self.version += self._updates(rollouts)
+                server.publisher.publish_if_due(self.version, self._weights(), len(rollouts))
             if kernel.now >= save_at:
-                self.disk.version, self.disk.counters = version, counters.state(0.0)
+                self.disk.version, self.disk.counters = self.version, counters.state(0.0)
                 save_at = kernel.now + self.settings.checkpoint_seconds
 
-    def _weights(self, version: int) -> dict[str, np.ndarray]:
-        return {"w": np.array(self.ledger.token(self.life.number, version), np.float32)}
+    def _weights(self) -> dict[str, np.ndarray]:
+        """Return the weights of the present version, which are about to be published."""
+        self.life.published[self.version] = self.kernel.now
+        return {"w": np.array(self.ledger.token(self.life.number, self.version), np.float32)}
 
     def _updates(self, rollouts: list[Rollout]) -> int:
         return self.settings.spec.training.updates_from(sum(int(rollout.valid.sum()) for rollout in rollouts))
 
-    def _check(self, counters: RunCounters, before: tuple[int, int]) -> None:
-        waiting = len(self.server.rollouts._buffer._waiting)  # type: ignore[attr-defined]
-        accepted, trained = counters.rollouts_accepted - before[0], counters.rollouts_trained - before[1]
-        self.ledger.check_counts(self.life, accepted, trained, waiting)
+    def _check(self, server: ActorServer, counters: RunCounters, before: tuple[int, int]) -> None:
+        with server.lock:
+            waiting = len(server.rollouts._buffer._waiting)  # type: ignore[attr-defined]
+            accepted, trained = counters.rollouts_accepted - before[0], counters.rollouts_trained - before[1]
+            self.ledger.check_counts(self.life, accepted, trained, waiting)

@@ -4,8 +4,9 @@ from collections import Counter
 from collections.abc import Set
 from dataclasses import dataclass, field
 
-from daedalus.learner.serving.intake import Intake, Rejected
-from daedalus.learner.serving.rollout_buffer import RolloutBuffer, TakenRollouts
+from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.intake import Rejected
+from daedalus.learner.serving.rollout_buffer import TakenRollouts
 from daedalus.protocol.messages import Acknowledgement, Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spec import RunSpec
 
@@ -29,7 +30,7 @@ class Life:
     stale: dict[RolloutIdentity, None] = field(default_factory=dict)  # in the buffer
     judged: dict[RolloutIdentity, str] = field(default_factory=dict)  # the first verdict on each
     answers: dict[RolloutIdentity, Counter[str]] = field(default_factory=dict)
-    published: set[int] = field(default_factory=set)
+    published: dict[int, float] = field(default_factory=dict)  # when, by version
     ended: bool = False
 
     def has_verdict(self, identity: RolloutIdentity) -> bool:
@@ -53,7 +54,7 @@ class Ledger:
         self.lives: list[Life] = []
         self.collected: list[Collected] = []  # by the number that each rollout carries
         self._numbers: dict[RolloutIdentity, int] = {}
-        self.last_collected_trained: dict[str, float] = {}  # by actor: when its newest trained rollout was made
+        self.freshest: dict[str, float] = {}  # by actor: when the newest policy was published that it was trained on with
 
     def require(self, holds: bool, text: str) -> None:
         """Raise Violation, and end the simulation, unless something holds."""
@@ -77,8 +78,8 @@ class Ledger:
 
     # ------------------------------------------------------------------------------------------------- actors
 
-    def loaded(self, snapshot: Snapshot, epoch: int) -> None:
-        """Check a snapshot that an actor loads in its session with a learner of an epoch."""
+    def used(self, snapshot: Snapshot, epoch: int) -> None:
+        """Check a snapshot that an actor collects with in its session with a learner of an epoch."""
         self.require(snapshot.learner_epoch == epoch, "an actor loads a snapshot of another learner epoch")
         life = next(life for life in self.lives if life.epoch == epoch)
         weights = snapshot.weights["w"].tolist()
@@ -111,9 +112,10 @@ class Ledger:
             f"an answer mentions version {answer.policy_version}, which was not published",
         )
 
-    def added(self, life: Life, rollout: Rollout) -> None:
-        """Check a rollout that is put into the buffer."""
+    def added(self, life: Life, rollout: Rollout, incarnation: int) -> None:
+        """Check a rollout that is put into the buffer; `incarnation` is the newest of its actor that has joined."""
         identity = rollout.identity
+        self.require(identity.incarnation == incarnation, f"a rollout of an earlier incarnation is accepted: {identity}")
         self.require(identity not in life.added, f"{identity} is put into the buffer twice")
         life.added[identity] = None
         self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
@@ -139,8 +141,8 @@ class Ledger:
             life.trained[identity] = None
             lag = version - rollout.policy_version
             self.require(0 <= lag <= bound, f"{identity} has a policy lag of {lag}, the bound is {bound}")
-            made = self.collected[self._numbers[identity]].at
-            self.last_collected_trained[identity.actor] = max(made, self.last_collected_trained.get(identity.actor, 0.0))
+            published = life.published[rollout.policy_version]
+            self.freshest[identity.actor] = max(published, self.freshest.get(identity.actor, 0.0))
         if taken.rollouts:
             names = [rollout.identity.actor for rollout in taken.rollouts]
             self._kernel.log("train", version, *names)
@@ -161,8 +163,9 @@ class Ledger:
         )
 
 
-def observe(intake: Intake, buffer: RolloutBuffer, ledger: Ledger, life: Life) -> None:
-    """Note every verdict, and everything that is put into the buffer and taken out of it."""
+def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
+    """Note every verdict, and every rollout that is put into the buffer and taken out of it."""
+    intake, buffer = server.rollouts._intake, server.rollouts._buffer
     judge, add, take = intake.judge, buffer.add, buffer.take
 
     def noted_judge(sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
@@ -172,7 +175,7 @@ def observe(intake: Intake, buffer: RolloutBuffer, ledger: Ledger, life: Life) -
         return verdict
 
     def noted_add(rollout: Rollout) -> None:
-        ledger.added(life, rollout)
+        ledger.added(life, rollout, server.fleet.actors[rollout.identity.actor].incarnation)
         add(rollout)
 
     def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:

@@ -39,7 +39,6 @@ class Network:
     def __init__(self, kernel: Kernel, weather: Weather) -> None:
         self.kernel, self.weather = kernel, weather
         self.links: list[Link] = []
-        self.on_request: Callable[[LinkRequest], None] = lambda request: None
         self.on_reply: Callable[[LinkRequest, bytes], None] = lambda request, payload: None
         self._cut = False
 
@@ -114,6 +113,7 @@ class LinkRequest:
     def __init__(self, server: "Link", query: _Query, key: str, payload: bytes) -> None:
         self.server, self.query, self.key, self._payload = server, query, key, payload
         self.size = len(payload)
+        self.finds_others = False  # whether a router far away sends it to whoever serves the key by then
         self._answered = False
 
     @property
@@ -228,6 +228,11 @@ class Link:
         self.alive = False
         self.network.kernel.after(self.network.weather.lease * self.network.kernel.random.random(), self._remove)
 
+    def die(self) -> None:
+        """Let nothing pass until the session is opened again; the process itself is not told."""
+        self.dead = True
+        self.reachability_changed()
+
     def flicker(self) -> None:
         """Let all others see this process go and come."""
         for key in self.tokens:
@@ -286,7 +291,7 @@ class Link:
                 kernel.wake(task)
 
         for server, served in servers:
-            self._send(server, served, key, payload, timeout, on_answer)
+            self._send(server, served, key, payload, timeout, on_answer, finds_others=False)
         if servers:
             waits = True
             kernel.park(timeout)
@@ -299,7 +304,7 @@ class Link:
         self._enter("query")
         servers = self.network.servers(key) if self.passes() else []
         if servers:
-            self._send(*servers[0], key, payload, timeout, on_answer)
+            self._send(*servers[0], key, payload, timeout, on_answer, finds_others=True)
         else:
             query = _Query(self, on_answer)
             self.queries[query] = None
@@ -307,7 +312,15 @@ class Link:
             self.network.kernel.after(self.network.delay() if noticed else timeout, query.finish, None)
 
     def _send(
-        self, server: "Link", served: str, key: str, payload: bytes, timeout: float, on_answer: OnAnswer
+        self,
+        server: "Link",
+        served: str,
+        key: str,
+        payload: bytes,
+        timeout: float,
+        on_answer: OnAnswer,
+        *,
+        finds_others: bool,
     ) -> None:
         network, kernel = self.network, self.network.kernel
         query = _Query(self, on_answer)
@@ -320,15 +333,20 @@ class Link:
                     kernel.after(kernel.random.random(), query.finish, None)
                 continue
             request = LinkRequest(server, query, key if "*" in served else served, payload)
+            request.finds_others = finds_others
             kernel.after(network.delay() + network.delay(), self._arrive, request, served, server.session)
 
     def _arrive(self, request: LinkRequest, served: str, session: int) -> None:
-        server = request.server
+        network, server = self.network, request.server
+        if not server.alive and request.finds_others:
+            others = [link for link in network.links if link.alive and served in link.handlers]
+            if others:
+                request.server = server = others[0]
+                session = server.session
         if server.passes() and server.session == session:
-            self.network.on_request(request)
             handler, channel = server.handlers[served]
             channel.deliver(handler, request)
-        elif self.network.chance(self.network.weather.noticed):
+        elif network.chance(network.weather.noticed):
             request.query.finish(None)
 
     def publish(self, key: str, payload: bytes) -> None:

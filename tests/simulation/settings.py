@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from random import Random
 
+from daedalus.protocol.keys import ANY_RUN
 from daedalus.protocol.spec import RunSpec
 
+from .actors import ActorSettings
 from .network import Weather
 
 RUN = "r"
@@ -12,14 +14,17 @@ FAULTS = (
     "kill actor",
     "stop actor",
     "freeze actor",
-    "hang environment",
+    "hang actor",
+    "twin",
     "cut actor",
-    "dead session",
+    "dead actor session",
     "flicker",
     "kill learner",
     "stop learner",
     "freeze learner",
     "cut learner",
+    "hang learner",
+    "dead learner session",
     "cut router",
     "new actor",
 )
@@ -35,12 +40,12 @@ class Settings:
     weather: Weather  # before the network is healed
     faulty_seconds: float
     faults: tuple[tuple[float, str, float], ...]  # when, which, for how long
-    links: tuple[str, ...]  # of each actor: lan, wan or auto
-    collect_seconds: tuple[float, ...]  # of each actor: how long it collects one rollout
+    actors: tuple[ActorSettings, ...]  # two more than start
     train_seconds: float  # of one batch
     checkpoint_seconds: float
     ends_by: str  # finish or stop
     real_codec: bool  # whether messages are encoded
+    fine: bool  # whether threads are interrupted at any line
 
 
 def draw(seed: int) -> Settings:
@@ -48,7 +53,6 @@ def draw(seed: int) -> Settings:
     random = Random(seed)
     spec = _spec(random)
     faulty = random.uniform(1.0, 12.0)
-    actors = spec.collection.actors
     collect = random.choice((0.1, 0.3, 1.0))
     return Settings(
         spec=spec,
@@ -57,12 +61,22 @@ def draw(seed: int) -> Settings:
         weather=_weather(random),
         faulty_seconds=faulty,
         faults=_faults(random, faulty),
-        links=tuple(random.choice(("lan", "lan", "lan", "wan", "auto")) for _ in range(actors + 2)),
-        collect_seconds=tuple(collect * random.uniform(0.7, 1.3) for _ in range(actors + 2)),
-        train_seconds=random.choice((0.0, 0.01, 0.1)),
+        actors=tuple(_actor(random, spec, collect) for _ in range(spec.collection.actors + 2)),
+        train_seconds=random.choice((0.0, 0.01, 0.1, 0.5)),
         checkpoint_seconds=random.choice((0.1, 2.0, 60.0)),
         ends_by=random.choice(("finish", "stop")),
         real_codec=random.random() < 0.05,
+        fine=random.random() < 0.03,
+    )
+
+
+def _actor(random: Random, spec: RunSpec, seconds: float) -> ActorSettings:
+    is_client = not spec.algorithm.synchronous and random.random() < 0.2
+    return ActorSettings(
+        kind="client" if is_client else "environments",
+        link=random.choice(("lan", "lan", "lan", "wan", "auto")),
+        run=random.choice((RUN, ANY_RUN)),
+        collect_seconds=seconds * random.uniform(0.7, 1.3),
     )
 
 
