@@ -7,6 +7,7 @@ cut until the process opens another session.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from daedalus.transport import memory
 from daedalus.transport.interface import Inbox, OnAnswer, Request, TransportError
@@ -58,11 +59,6 @@ class Network:
         random, weather = self.kernel.random.random, self.weather
         seconds = 0.0002 + weather.delay * random()
         return seconds + weather.slow_seconds * random() if weather.slow and random() < weather.slow else seconds
-
-    @property
-    def longest_delay(self) -> float:
-        """How long any message may take."""
-        return 0.0004 + 2 * (self.weather.delay + self.weather.slow_seconds)
 
     def chance(self, probability: float) -> bool:
         """Return whether something with a probability happens."""
@@ -130,7 +126,7 @@ class LinkRequest:
         network, client = server.network, self.query.link
         network.on_reply(self, payload)
         if server.passes() and not network.chance(network.weather.lost):
-            network.kernel.after(network.delay() + network.delay(), self._arrive, payload)
+            server.send(self._arrive, payload)
         elif network.chance(network.weather.noticed):
             network.kernel.after(network.kernel.random.random(), self.query.finish, None)
         else:
@@ -208,11 +204,23 @@ class Link:
         self.inboxes: list[_LinkInbox] = []
         self.watches: list[_Watch] = []
         self.queries: dict[_Query, None] = {}
+        self._sent_until = 0.0  # when the last message will have arrived
         network.links.append(self)
 
     def passes(self) -> bool:
         """Return whether messages pass this link now."""
         return self.alive and not (self.cut or self.dead or self.network.cut)
+
+    @property
+    def seconds_to_send(self) -> float:
+        """How long the messages under way need."""
+        return max(self._sent_until - self.network.kernel.now, 0.0)
+
+    def send(self, arrive: Callable[..., None], *arguments: Any) -> None:
+        """Let a message of this process arrive in a while."""
+        seconds = self.network.delay() + self.network.delay()
+        self._sent_until = max(self._sent_until, self.network.kernel.now + seconds)
+        self.network.kernel.after(seconds, arrive, *arguments)
 
     def reachability_changed(self) -> None:
         """Lose presence after the lease, or get it back."""
@@ -334,7 +342,7 @@ class Link:
                 continue
             request = LinkRequest(server, query, key if "*" in served else served, payload)
             request.finds_others = finds_others
-            kernel.after(network.delay() + network.delay(), self._arrive, request, served, server.session)
+            self.send(self._arrive, request, served, server.session)
 
     def _arrive(self, request: LinkRequest, served: str, session: int) -> None:
         network, server = self.network, request.server
@@ -357,7 +365,7 @@ class Link:
         for link in network.links:
             for inbox in link.inboxes:
                 if inbox.key == key and not network.chance(network.weather.lost):
-                    network.kernel.after(network.delay() + network.delay(), inbox.arrive, payload, link.session)
+                    self.send(inbox.arrive, payload, link.session)
 
     def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         inbox = _LinkInbox(self, key, on_news)
@@ -406,5 +414,5 @@ class Link:
         self.alive = False
         for query in list(self.queries):
             query.finish(None)
-        # What was sent before arrives before: a session that is closed sends all that it has.
-        self.network.kernel.after(self.network.longest_delay, self._remove)
+        # A session that is closed sends all that it has: what was sent before arrives before.
+        self.network.kernel.after(self.seconds_to_send, self._remove)

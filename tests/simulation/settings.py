@@ -63,7 +63,7 @@ def draw(seed: int) -> Settings:
         faults=_faults(random, faulty),
         actors=tuple(_actor(random, spec, collect) for _ in range(spec.collection.actors + 2)),
         train_seconds=random.choice((0.0, 0.01, 0.1, 0.5)),
-        checkpoint_seconds=random.choice((0.1, 2.0, 60.0)),
+        checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
         real_codec=random.random() < 0.05,
         fine=random.random() < 0.03,
@@ -108,7 +108,7 @@ def _weather(random: Random) -> Weather:
     return Weather(
         delay=random.choice((0.001, 0.02, 0.1)),
         slow=perhaps(0.02, 0.2),
-        slow_seconds=random.choice((0.5, 3.0)),
+        slow_seconds=random.choice((0.5, 3.0, 3.0)),
         lost=perhaps(0.02, 0.1, 0.3),
         noticed=random.choice((0.0, 0.5, 1.0)),
         duplicated=perhaps(0.1, 0.5),
@@ -119,6 +119,8 @@ def _weather(random: Random) -> Weather:
 
 def _faults(random: Random, seconds: float) -> tuple[tuple[float, str, float], ...]:
     kinds = random.sample(FAULTS, random.randint(1, 4))
+    if random.random() < 0.4:
+        kinds.append(random.choice(("kill learner", "stop learner")))
     count = random.choice((0, 1, 2, 4, 8))
     drawn = [
         (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0)))

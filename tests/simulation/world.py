@@ -61,7 +61,7 @@ class World:
 
     def _on_learner_end(self) -> None:
         if self.settings.embedded:
-            self.kernel.after(self.network.longest_delay, self._lose_router)
+            self.kernel.after(self.learner.link.seconds_to_send, self._lose_router)
         if self.supervised:
             self.kernel.after(self.kernel.random.choice((0.01, 0.3, 3.0)), self.start_learner)
 
