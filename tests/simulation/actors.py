@@ -13,10 +13,12 @@ from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
-from .kernel import Kernel, Process
+from .kernel import Kernel
 from .ledger import Ledger
-from .network import Link, Network
+from .link import Link
+from .network import Network
 from .primitives import Event
+from .process import Process
 
 _SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
 _FALSE = np.zeros((1, 1), np.bool_)

@@ -1,7 +1,8 @@
-"""The faults of a simulation: kills, stops, freezes, hangs, cuts and false absences, each at a time that the seed says."""
+"""The faults of a simulation: kills, stops, freezes, hangs, cuts and false absences."""
 
 from .actors import ActorProcess
-from .network import CALM, Link
+from .link import Link
+from .network import CALM
 from .world import World
 
 

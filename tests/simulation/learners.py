@@ -13,13 +13,19 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import TransportError
 
-from .kernel import Kernel, Process
+from .kernel import Kernel, SimulationError
 from .ledger import Ledger, Life, observe
-from .network import Link, Network
+from .link import Link
+from .network import Network
 from .primitives import Event
+from .process import Process
 from .settings import RUN, Settings
 
 _PROGRAM = b"program"
+
+
+def _no_status() -> RunStatus:
+    raise SimulationError("nobody asks a simulated learner for its status")
 
 
 @dataclass(slots=True)
@@ -84,7 +90,7 @@ class LearnerProcess:
             self.settings.spec,
             self.link,
             counters,
-            RunStatus,
+            _no_status,
             learner_epoch=self.epoch,
             start_version=disk.version,
             spaces=disk.spaces,
@@ -92,7 +98,7 @@ class LearnerProcess:
         observe(server, self.ledger, self.life)
         try:
             server.open()
-            disk.spaces = server.await_spaces(self.stop)
+            disk.spaces = server.await_spaces(self.stop)  # type: ignore[arg-type] - a simulated Event
             if disk.spaces is not None:
                 self._train(server, counters, before)
         except TransportError as error:

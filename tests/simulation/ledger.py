@@ -15,7 +15,7 @@ from .kernel import Kernel
 _BASE = 128  # numbers below 257 survive the bfloat16 of compact snapshots
 
 
-class Violation(Exception):  # noqa: N818 - the word for it
+class Violation(Exception):  # noqa: N818 - the usual word
     """An invariant does not hold."""
 
 
@@ -54,7 +54,9 @@ class Ledger:
         self.lives: list[Life] = []
         self.collected: list[Collected] = []  # by the number that each rollout carries
         self._numbers: dict[RolloutIdentity, int] = {}
-        self.freshest: dict[str, float] = {}  # by actor: when the newest policy was published that it was trained on with
+        self.freshest: dict[
+            str, float
+        ] = {}  # by actor: when the newest policy was published that it was trained on with
 
     def require(self, holds: bool, text: str) -> None:
         """Raise Violation, and end the simulation, unless something holds."""
@@ -115,15 +117,19 @@ class Ledger:
     def added(self, life: Life, rollout: Rollout, incarnation: int) -> None:
         """Check a rollout that is put into the buffer; `incarnation` is the newest of its actor that has joined."""
         identity = rollout.identity
-        self.require(identity.incarnation == incarnation, f"a rollout of an earlier incarnation is accepted: {identity}")
+        self.require(
+            identity.incarnation == incarnation, f"a rollout of an earlier incarnation is accepted: {identity}"
+        )
         self.require(identity not in life.added, f"{identity} is put into the buffer twice")
         life.added[identity] = None
         self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
-        self.require(identity.learner_epoch == life.epoch, f"a rollout of another learner epoch is accepted: {identity}")
+        self.require(
+            identity.learner_epoch == life.epoch, f"a rollout of another learner epoch is accepted: {identity}"
+        )
         life_number, high, low, number = rollout.frames[0, 0].tolist()
         self.require(
             [life_number, high, low] == self.token(life.number, rollout.policy_version),
-            f"{identity} claims version {rollout.policy_version}, but was made with the weights {life_number, high, low}",
+            f"{identity} claims version {rollout.policy_version}, but its weights were {life_number, high, low}",
         )
         self.require(self._numbers.get(identity) == int(number), f"{identity} carries another rollout's content")
 
@@ -153,8 +159,8 @@ class Ledger:
     def check_counts(self, life: Life, accepted: int, trained: int, waiting: int) -> None:
         """Check that accepted = trained + stale + waiting in the buffer, and the learner's counters."""
         balance = (
-            f"{accepted} accepted ({len(life.added)} put into the buffer), {trained} trained ({len(life.trained)} taken), "
-            f"{len(life.stale)} stale, {waiting} waiting"
+            f"{accepted} accepted ({len(life.added)} put into the buffer), {trained} trained "
+            f"({len(life.trained)} taken), {len(life.stale)} stale, {waiting} waiting"
         )
         self.require(accepted == len(life.added), f"the counter of accepted rollouts is wrong: {balance}")
         self.require(trained == len(life.trained), f"the counter of trained rollouts is wrong: {balance}")

@@ -123,7 +123,6 @@ def _faults(random: Random, seconds: float) -> tuple[tuple[float, str, float], .
         kinds.append(random.choice(("kill learner", "stop learner")))
     count = random.choice((0, 1, 2, 4, 8))
     drawn = [
-        (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0)))
-        for _ in range(count)
+        (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0))) for _ in range(count)
     ]
     return tuple(sorted(drawn))

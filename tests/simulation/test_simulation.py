@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from simulation.simulate import simulate
 
 from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
@@ -19,6 +18,8 @@ from daedalus.learner.serving.fleet import Actor, Fleet, SequenceWindow
 from daedalus.learner.serving.intake import Intake
 from daedalus.learner.serving.rollout_buffer import StreamBuffer
 from daedalus.protocol.messages import Acknowledgement, Rollout
+
+from .simulate import simulate
 
 SEEDS = 200
 SEEDS_TO_FIND = 200  # within which a break must be found
@@ -48,13 +49,12 @@ def test_a_seed_repeats_exactly() -> None:
     here = [digest(seed) for seed in seeds]
     assert [digest(seed) for seed in seeds] == here
     code = f"""
-import logging, sys
-sys.path.insert(0, "tests/simulation/..")
+import logging
 from simulation.test_simulation import digest
 logging.disable(logging.CRITICAL)
 print(*(digest(seed) for seed in {seeds}))
 """
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONHASHSEED": "7"}
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "PYTHONHASHSEED": "7"}
     words = [sys.executable, "-c", code]
     process = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     assert process.stdout.split() == here

@@ -8,8 +8,9 @@ from .actors import ActorProcess
 from .kernel import Kernel
 from .learners import Disk, LearnerProcess
 from .ledger import Ledger
-from .network import LinkRequest, Network
+from .network import Network
 from .settings import Settings
+from .traffic import LinkRequest
 
 STOP_SECONDS = 11.0  # in which a process ends that is asked to stop: two queries of 5 s may have no answer
 
@@ -109,7 +110,9 @@ class World:
 
     def _require_end(self, actor: ActorProcess) -> None:
         excused = actor.process.frozen or actor.is_disturbed
-        self.ledger.require(bool(actor.outcome) or excused, f"{actor.process.name} did not end {STOP_SECONDS} s after its stop")
+        self.ledger.require(
+            bool(actor.outcome) or excused, f"{actor.process.name} did not end {STOP_SECONDS} s after its stop"
+        )
 
     def _on_actor_end(self, actor: ActorProcess) -> None:
         del self._running[actor]
