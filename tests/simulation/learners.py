@@ -60,7 +60,7 @@ class LearnerProcess:
 
     def start(self) -> None:
         """Start the process."""
-        self.life = self.ledger.begin_life(self.epoch)
+        self.life = self.ledger.begin_life(self.epoch, self.disk.version)
         self.process = Process(self.kernel, f"learner{self.life.number}")
         self.link = Link(self.network, self.process, is_router=self.settings.embedded)
         self.stop = Event(self.kernel)

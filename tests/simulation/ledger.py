@@ -28,7 +28,7 @@ class Life:
     added: dict[RolloutIdentity, None] = field(default_factory=dict)  # to the buffer
     trained: dict[RolloutIdentity, None] = field(default_factory=dict)
     stale: dict[RolloutIdentity, None] = field(default_factory=dict)  # in the buffer
-    judged: dict[RolloutIdentity, str] = field(default_factory=dict)  # the first verdict on each
+    judged: dict[RolloutIdentity, None] = field(default_factory=dict)
     answers: dict[RolloutIdentity, Counter[str]] = field(default_factory=dict)
     published: dict[int, float] = field(default_factory=dict)  # when, by version
     ended: bool = False
@@ -73,9 +73,9 @@ class Ledger:
         """Return the weights of a policy version: numbers that say which life of the learner made it."""
         return [float(life), float(version // _BASE), float(version % _BASE)]
 
-    def begin_life(self, epoch: int) -> Life:
-        """Note the start of a learner."""
-        self.lives.append(Life(len(self.lives), epoch))
+    def begin_life(self, epoch: int, version: int) -> Life:
+        """Note the start of a learner with a policy version."""
+        self.lives.append(Life(len(self.lives), epoch, published={version: self._kernel.now}))
         return self.lives[-1]
 
     # ------------------------------------------------------------------------------------------------- actors
@@ -114,12 +114,17 @@ class Ledger:
             f"an answer mentions version {answer.policy_version}, which was not published",
         )
 
-    def added(self, life: Life, rollout: Rollout, incarnation: int) -> None:
-        """Check a rollout that is put into the buffer; `incarnation` is the newest of its actor that has joined."""
+    def judged(self, life: Life, rollout: Rollout, verdict: Rollout | Rejected, incarnation: int) -> None:
+        """Check the verdict on a rollout; `incarnation` is the newest of its actor that has joined."""
         identity = rollout.identity
-        self.require(
-            identity.incarnation == incarnation, f"a rollout of an earlier incarnation is accepted: {identity}"
-        )
+        if verdict is rollout:
+            text = f"a rollout of an earlier incarnation is accepted: {identity}"
+            self.require(identity.incarnation == incarnation, text)
+        life.judged[identity] = None
+
+    def added(self, life: Life, rollout: Rollout) -> None:
+        """Check a rollout that is put into the buffer."""
+        identity = rollout.identity
         self.require(identity not in life.added, f"{identity} is put into the buffer twice")
         life.added[identity] = None
         self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
@@ -177,11 +182,11 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
     def noted_judge(sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
         verdict = judge(sender, content, policy_version, now)
         if isinstance(content, Rollout):
-            life.judged.setdefault(content.identity, "accepted" if verdict is content else str(verdict))
+            ledger.judged(life, content, verdict, server.fleet.actors[sender].incarnation)
         return verdict
 
     def noted_add(rollout: Rollout) -> None:
-        ledger.added(life, rollout, server.fleet.actors[rollout.identity.actor].incarnation)
+        ledger.added(life, rollout)
         add(rollout)
 
     def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:
