@@ -189,8 +189,8 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
         ledger.added(life, rollout)
         add(rollout)
 
-    def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:
-        taken = take(live, policy_version)
+    def noted_take(live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+        taken = take(live, policy_version, now)
         ledger.took(life, taken, policy_version, live)
         return taken
 

@@ -119,9 +119,9 @@ def waits_for_the_departed(patch: pytest.MonkeyPatch) -> None:
 def trains_on_stale_rollouts(patch: pytest.MonkeyPatch) -> None:
     take = StreamBuffer.take
 
-    def greedy(buffer: StreamBuffer, live: frozenset[str], policy_version: int) -> Any:
+    def greedy(buffer: StreamBuffer, live: frozenset[str], policy_version: int, now: float) -> Any:
         buffer._max_policy_lag = 10**9
-        return take(buffer, live, policy_version)
+        return take(buffer, live, policy_version, now)
 
     patch.setattr(StreamBuffer, "take", greedy)
 
