@@ -88,7 +88,7 @@ def _spec(random: Random) -> RunSpec:
     if algorithm in ("impala", "appo"):
         training["batch_rollouts"] = random.choice((None, 1, 2, 3))
     if algorithm != "a2c" and random.random() < 0.5:
-        training["max_policy_lag"] = random.choice((2, 4 * actors * window))
+        training["max_policy_lag"] = random.choice((2, 4)) * actors * window
     return RunSpec.model_validate(
         {
             "environment": {"id": "simulated"},
