@@ -29,7 +29,7 @@ _KEPT = 2  # rollouts that a client keeps while it cannot send
 class Runtime:
     """In place of OnnxRuntime: a policy that is never run."""
 
-    def __init__(self, model: bytes) -> None:
+    def __init__(self, model: bytes, *_: object) -> None:
         assert model
 
 

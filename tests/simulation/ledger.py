@@ -138,8 +138,8 @@ class Ledger:
         )
         self.require(self._numbers.get(identity) == int(number), f"{identity} carries another rollout's content")
 
-    def took(self, life: Life, taken: TakenRollouts, version: int, live: Set[str]) -> None:
-        """Check what is taken out of the buffer."""
+    def took(self, life: Life, taken: TakenRollouts, version: int, awaited: Set[str]) -> None:
+        """Check what is taken out of the buffer; a synchronous batch waits for the `awaited` actors."""
         for rollout in taken.stale:
             self.require(rollout.identity not in life.stale, f"{rollout.identity} is stale twice")
             life.stale[rollout.identity] = None
@@ -159,7 +159,7 @@ class Ledger:
             self._kernel.log("train", version, *names)
             if synchronous:
                 self.require(len(set(names)) == len(names), f"a batch has two rollouts of one actor: {names}")
-                self.require(live <= set(names), f"a batch misses a live actor: {names} of {sorted(live)}")
+                self.require(awaited <= set(names), f"a batch misses a live actor: {names} of {sorted(awaited)}")
 
     def check_counts(self, life: Life, accepted: int, trained: int, waiting: int) -> None:
         """Check that accepted = trained + stale + waiting in the buffer, and the learner's counters."""
@@ -189,9 +189,9 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
         ledger.added(life, rollout)
         add(rollout)
 
-    def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:
-        taken = take(live, policy_version)
-        ledger.took(life, taken, policy_version, live)
+    def noted_take(live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+        taken = take(live, policy_version, now)
+        ledger.took(life, taken, policy_version, live - buffer.left_out)
         return taken
 
     intake.judge = noted_judge  # type: ignore[method-assign]

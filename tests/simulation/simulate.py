@@ -11,13 +11,13 @@ from random import Random
 from typing import Any
 
 from daedalus.actor.session import service
-from daedalus.learner.serving import actor_server  # noqa: F401 - imports all modules that are patched
+from daedalus.learner.serving import stragglers
 from daedalus.protocol import codec as real_codec
 
 from . import codec, faults, primitives
 from .actors import Runtime
 from .kernel import Kernel
-from .settings import draw
+from .settings import Settings, draw
 from .world import World
 
 _PATCHED = ("daedalus.actor.session.", "daedalus.learner.serving.")
@@ -49,7 +49,7 @@ def simulate(seed: int) -> Result:
     kernel = Kernel(Random(seed + 2**32), settings.preemption, _fine_files() if settings.fine else frozenset())
     world = World(kernel, settings)
     seconds_to_progress = 0.0
-    with _patched(kernel, objects=not settings.real_codec):
+    with _patched(kernel, settings):
         try:
             _faulty_phase(world)
             seconds_to_progress = _await_progress(world)
@@ -79,7 +79,7 @@ def _fine_files() -> frozenset[str]:
 
 
 @contextlib.contextmanager
-def _patched(kernel: Kernel, *, objects: bool) -> Iterator[None]:
+def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     """Give the services the kernel's threads and time, and a policy that is never run."""
     replaced: list[tuple[Any, str, Any]] = []
     fakes = primitives.modules(kernel)
@@ -89,13 +89,15 @@ def _patched(kernel: Kernel, *, objects: bool) -> Iterator[None]:
         id(queue): fakes["queue"],
         id(service.OnnxRuntime): Runtime,
     }
-    if objects:
+    if not settings.real_codec:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
     for module in _services():
         for attribute, value in list(vars(module).items()):
             if id(value) in replacements:
                 replaced.append((module, attribute, value))
                 setattr(module, attribute, replacements[id(value)])
+    replaced.append((stragglers, "_PATIENCE_SECONDS", stragglers._PATIENCE_SECONDS))
+    stragglers._PATIENCE_SECONDS = settings.patience_seconds
     try:
         yield
     finally:
