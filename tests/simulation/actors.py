@@ -172,7 +172,7 @@ class ActorProcess:
             outcome = "name in use"
         except ActorError as error:
             outcome = f"error: {error}"
-            self.ledger.require(False, f"{self.process.name} gives up: {error}")
+            self.ledger.require(False, self.process.name, "gives up:", error)
         self.link.close()
         self.process.kill()  # the user's thread of a client
         self._end(outcome)

@@ -128,8 +128,7 @@ def _await_progress(world: World) -> float:
         if not late and live == world.actors.keys():
             return taken
         world.ledger.require(
-            taken < _PROGRESS_SECONDS,
-            f"{taken:g} s without faults: no progress of {late}, live are {sorted(live)}",
+            taken < _PROGRESS_SECONDS, f"{taken:g} s without faults: no progress of", late, "live are", sorted(live)
         )
         kernel.sleep(0.5)
 
@@ -139,11 +138,10 @@ def _require_no_loss(world: World) -> None:
     learner = world.learner
     for actor in world.running:
         uploads = actor.service._uploads.in_flight.rollouts
-        for collected in world.ledger.collected:
-            identity = collected.identity
+        for identity in world.ledger.collected:
             if (identity.incarnation, identity.learner_epoch) == (actor.incarnation, learner.epoch):
                 is_waiting = identity.sequence in uploads or identity.sequence >= actor.service._sequence
-                world.ledger.require(is_waiting or learner.life.has_verdict(identity), f"{identity} was lost")
+                world.ledger.require(is_waiting or learner.life.has_verdict(identity), "lost:", identity)
 
 
 def _end(world: World) -> None:
@@ -154,8 +152,8 @@ def _end(world: World) -> None:
         learner.is_finished = True
         end = kernel.now + _END_SECONDS
         while world.running:
-            left = ", ".join(actor.process.name for actor in world.running)
-            world.ledger.require(kernel.now < end, f"{left} did not end {_END_SECONDS:g} s after the end of the run")
+            left = [actor.process.name for actor in world.running]
+            world.ledger.require(kernel.now < end, left, f"did not end {_END_SECONDS:g} s after the end of the run")
             kernel.sleep(0.1)
     for actor in world.running:
         actor.is_disturbed = False

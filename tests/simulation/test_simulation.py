@@ -131,9 +131,9 @@ def trains_on_stale_rollouts(patch: pytest.MonkeyPatch) -> None:
     [
         (accepts_duplicates, "twice"),
         (does_not_fence, "is accepted"),
-        (counts_twice, "accepted"),
+        (counts_twice, "a counter is wrong"),
         (does_not_send_again, "no progress"),
-        (drops_without_an_answer, "was lost"),
+        (drops_without_an_answer, "lost:"),
         (requests_no_lost_snapshot, "no progress"),
         (waits_for_the_departed, "no progress"),
         (trains_on_stale_rollouts, "policy lag"),

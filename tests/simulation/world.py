@@ -110,9 +110,8 @@ class World:
 
     def _require_end(self, actor: ActorProcess) -> None:
         excused = actor.process.frozen or actor.is_disturbed
-        self.ledger.require(
-            bool(actor.outcome) or excused, f"{actor.process.name} did not end {STOP_SECONDS} s after its stop"
-        )
+        ended = bool(actor.outcome) or excused
+        self.ledger.require(ended, actor.process.name, f"did not end {STOP_SECONDS:g} s after its stop")
 
     def _on_actor_end(self, actor: ActorProcess) -> None:
         del self._running[actor]
