@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from daedalus.actor.session import service
-from daedalus.learner.serving import stragglers
+from daedalus.learner.serving import actor_server  # noqa: F401 - imports all modules that are patched
 from daedalus.protocol import codec as real_codec
 
 from . import codec, faults, primitives
@@ -81,6 +81,11 @@ def _fine_files() -> frozenset[str]:
 @contextlib.contextmanager
 def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     """Give the services the kernel's threads and time, and a policy that is never run."""
+    constants = {
+        "_HEARTBEAT_SECONDS": settings.heartbeat_seconds,
+        "HEARTBEAT_SECONDS": settings.heartbeat_seconds,
+        "_PATIENCE_SECONDS": settings.patience_seconds,
+    }
     replaced: list[tuple[Any, str, Any]] = []
     fakes = primitives.modules(kernel)
     replacements: dict[int, Any] = {
@@ -93,11 +98,9 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
     for module in _services():
         for attribute, value in list(vars(module).items()):
-            if id(value) in replacements:
+            if id(value) in replacements or attribute in constants:
                 replaced.append((module, attribute, value))
-                setattr(module, attribute, replacements[id(value)])
-    replaced.append((stragglers, "_PATIENCE_SECONDS", stragglers._PATIENCE_SECONDS))
-    stragglers._PATIENCE_SECONDS = settings.patience_seconds
+                setattr(module, attribute, constants.get(attribute, replacements.get(id(value))))
     try:
         yield
     finally:
@@ -161,7 +164,7 @@ def _end(world: World) -> None:
     while world.running:
         kernel.sleep(0.1)
     learner.stop.set()
-    end = kernel.now + 5.0
+    end = kernel.now + 5.0 + world.settings.heartbeat_seconds
     while not learner.done:
         world.ledger.require(kernel.now < end, "the learner does not end")
         kernel.sleep(0.1)
