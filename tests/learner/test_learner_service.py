@@ -1,9 +1,9 @@
 """learner/service.py with an actor and an evaluator in one process, over the memory transport."""
 
-import re
 import csv
 import io
 import json
+import re
 import threading
 import time
 from pathlib import Path
