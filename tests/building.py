@@ -61,7 +61,7 @@ def make_rollout(
     ends = int(np.count_nonzero(terminated | truncated))
     content: dict[str, Any] = {
         "frames": {"observation": random.standard_normal((stack + rows, environments, *shape), np.float32)},
-        "initial_state": random.standard_normal((environments, state_size), np.float32),
+        "initial_state": np.tanh(random.standard_normal((environments, state_size), np.float32)),
         "actions": {"action": random.integers(0, 4, (*cells, 1), np.uint8)},
         "masks": {},
         "behaviour_log_probs": -random.uniform(0.5, 2.5, cells).astype(np.float32),

@@ -37,7 +37,11 @@ class VectorEnvironment(Protocol):
         ...
 
     def reset(self, seed: int) -> Observed:
-        """Start an episode in each environment."""
+        """Start an episode in each environment, with seed + e in environment e.
+
+        The environments of some backends share one random generator, with the seed `seed`, unless they are made for
+        evaluation (see make_environments).
+        """
         ...
 
     def step(self, actions: dict[str, np.ndarray]) -> Step:

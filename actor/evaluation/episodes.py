@@ -6,20 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_counter import EpisodeCounter, FinishedEpisodes
-from daedalus.actor.environments.interface import VectorEnvironment
-from daedalus.policy.acting.noise import draw_noise, neutral_noise
+from daedalus.actor.environments.interface import Observed, VectorEnvironment
+from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import EnvironmentSpec
 
 _MAX_ENVIRONMENTS = 100
+_SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
 _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """The results of an evaluation's episodes, in no particular order."""
+    """The results of an evaluation's episodes, in the order of their seeds."""
 
     returns: np.ndarray  # [episodes] float32, undiscounted and unscaled
     lengths: np.ndarray  # [episodes] int32, env_steps
@@ -46,63 +46,118 @@ def play_episodes(
     sampled: bool,
     progress: Callable[[int, float], None] = _no_progress,
 ) -> Evaluation:
-    """Play `episodes` episodes and return their results.
+    """Play `episodes` episodes and return their results, in the order of their numbers.
 
-    Each environment plays its share of the episodes, and any further ones are not counted: counting whichever episodes
-    end first would favour short ones.
+    Episode i has seeds of its own, made of `seed` and i, for its environment and its sampled actions. So its result
+    does not depend on how many environments there are, if a reset with a seed determines the whole episode.
+
+    The episodes are played in rounds, one episode in each environment. All episodes that begin are counted: counting
+    whichever end first would favour short ones.
 
     Args:
       runtime: the policy, with its weights loaded.
-      environments: E environments; they are reset first, and not closed.
-      episodes: how many to count.
+      environments: E environments, made for evaluation; they are reset first, and not closed.
+      episodes: how many to play.
       seed: of the environments and of sampled actions.
       sampled: sample the actions instead of choosing the most probable ones.
-      progress: called after every step with the number of episodes counted and their mean return (NaN at first).
+      progress: called after every step with the number of episodes that ended and their mean return (NaN at first).
     """
-    count = environments.count
-    environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
-    random = np.random.default_rng(action_seed)
-    counter, counted = EpisodeCounter(count), _CountedEpisodes(episodes, count)
-    stacks = ObservationStacks(environments.spaces, count)
-    state = np.zeros((count, runtime.state_size), np.float32)
-    observed = environments.reset(int(environment_seed))
-    stacks.push(observed.frames, np.ones(count, np.bool_))
-    neutral = neutral_noise(runtime.noise_size, count)
-    while not counted.complete:
-        valid = counter.valid
-        noise = draw_noise(runtime.noise_size, count, random) if sampled else neutral
-        choice = runtime.act(stacks.observations, state, noise, observed.masks)
-        observed, rewards, terminated, truncated = environments.step(choice.actions)
-        # As in RolloutWriter: the frame stack and the memory begin anew with each episode.
-        stacks.push(observed.frames, ~valid)
-        state = choice.state * valid[:, None]
-        counter.step(rewards, terminated, truncated)
-        ended = terminated | truncated
-        if ended.any():
-            counted.add(ended, counter.take_finished())
-        progress(len(counted.returns), counted.mean_return)
-    return Evaluation(returns=counted.returns, lengths=counted.lengths)
+    environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
+    results = _Results(episodes)
+    for first in range(0, episodes, environments.count):
+        random = _EpisodeNoise(runtime.noise_size, action_seed, first, _rows(environments.count), sampled)
+        observed = environments.reset(environment_seed % _SEEDS + first)  # environment e gets this seed + e
+        _play_round(runtime, environments, observed, random, first, results, progress)
+    return Evaluation(returns=results.returns.astype(np.float32), lengths=results.lengths)
 
 
-class _CountedEpisodes:
-    """The results of the episodes that count: of each environment, its share from its first episode on."""
+class _EpisodeNoise:
+    """The noise of a round: row e draws from the generator of episode `first` + e; neutral if not sampled."""
 
-    def __init__(self, episodes: int, count: int) -> None:
-        self._missing = np.full(count, episodes // count)  # [E] episodes of each environment's share
-        self._missing[: episodes % count] += 1
-        self.returns, self.lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
-        self.mean_return = float("nan")
+    def __init__(self, size: NoiseSize, seed: int, first: int, rows: int, sampled: bool) -> None:
+        self._size, self._neutral = size, None if sampled else neutral_noise(size, rows)
+        self._generators = [np.random.default_rng([seed, first + row]) for row in range(rows)]
+
+    def draw(self) -> Noise:
+        """Return the noise of one step."""
+        if self._neutral is not None:
+            return self._neutral
+        drawn = [draw_noise(self._size, 1, generator) for generator in self._generators]
+        return Noise(
+            uniform=np.concatenate([noise.uniform for noise in drawn]),
+            normal=np.concatenate([noise.normal for noise in drawn]),
+        )
+
+
+class _Results:
+    """Running returns and lengths of all episodes, by number."""
+
+    def __init__(self, episodes: int) -> None:
+        self.returns = np.zeros(episodes, np.float64)
+        self.lengths = np.zeros(episodes, np.int32)
+        self.ended = np.zeros(episodes, np.bool_)
 
     @property
-    def complete(self) -> bool:
-        """Whether every environment has played its share."""
-        return not self._missing.any()
+    def mean_return(self) -> float:
+        """Mean return of the episodes that ended; NaN without one."""
+        return float(self.returns[self.ended].mean()) if self.ended.any() else float("nan")
 
-    def add(self, ended: np.ndarray, finished: FinishedEpisodes) -> None:
-        """Add the episodes that finished in the environments `ended` [E] bool, those beyond a share excepted."""
-        counted = self._missing[ended] > 0
-        self.returns = np.concatenate([self.returns, finished.returns[counted]])
-        self.lengths = np.concatenate([self.lengths, finished.lengths[counted]])
-        self._missing[ended] = np.maximum(self._missing[ended] - 1, 0)
-        if len(self.returns):
-            self.mean_return = float(self.returns.mean(dtype=np.float64))
+
+def _play_round(
+    runtime: PolicyRuntime,
+    environments: VectorEnvironment,
+    observed: Observed,
+    random: _EpisodeNoise,
+    first: int,
+    results: _Results,
+    progress: Callable[[int, float], None],
+) -> None:
+    """Play episode `first` + e in each environment e, from the first observations on. See play_episodes.
+
+    What an environment does after the end of its episode is ignored.
+    """
+    count = environments.count
+    numbers = first + np.arange(count)  # of the episodes
+    stacks = ObservationStacks(environments.spaces, count)
+    state = np.zeros((count, runtime.state_size), np.float32)
+    stacks.push(observed.frames, np.ones(count, np.bool_))
+    playing = numbers < len(results.returns)
+    while playing.any():
+        actions, state = _act(runtime, stacks.observations, state, random.draw(), observed.masks)
+        observed, rewards, terminated, truncated = environments.step(actions)
+        stacks.push(observed.frames, np.zeros(count, np.bool_))
+        results.returns[numbers[playing]] += rewards[playing]
+        results.lengths[numbers[playing]] += 1
+        ended = playing & (terminated | truncated)
+        results.ended[numbers[ended]] = True
+        playing &= ~ended
+        progress(int(results.ended.sum()), results.mean_return)
+
+
+def _act(
+    runtime: PolicyRuntime,
+    observations: dict[str, np.ndarray],
+    state: np.ndarray,
+    noise: Noise,
+    masks: dict[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return actions {name: [E, D]} and the next state [E, S].
+
+    A single row is computed twice, as a batch of two: for a batch of one, matrix products use another kernel, which
+    rounds differently.
+    """
+    count, repeats = len(state), _rows(len(state)) // len(state)
+    if repeats > 1:
+        observations, masks = _repeated(observations, repeats), _repeated(masks, repeats)
+        state = state.repeat(repeats, axis=0)
+    choice = runtime.act(observations, state, noise, masks)
+    return {name: actions[:count] for name, actions in choice.actions.items()}, choice.state[:count]
+
+
+def _repeated(components: dict[str, np.ndarray], repeats: int) -> dict[str, np.ndarray]:
+    return {name: values.repeat(repeats, axis=0) for name, values in components.items()}
+
+
+def _rows(count: int) -> int:
+    """Return the number of rows of the policy's batches for `count` environments."""
+    return max(count, 2)

@@ -6,6 +6,7 @@ from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be higher, and float32 hold the noise
+_LARGEST_OBSERVATION = 1e15  # beyond it squares overflow float32
 _MAX_ACTION = 1e6  # of a continuous action: beyond it squares lose all precision
 
 
@@ -41,7 +42,14 @@ def _observation_violation(rollout: Rollout, frames: np.ndarray, space: ArraySpa
         return f"is {frames.dtype} {frames.shape}, expected {space.dtype} {expected} ({space})"
     if isinstance(space, DiscreteSpace):
         return "" if (frames < np.array(space.counts)).all() else f"has a value outside {space}"
-    return "" if np.isfinite(frames).all() else "has a value that is not finite"
+    if frames.dtype == np.uint8:
+        return ""
+    low, high = float(frames.min()), float(frames.max())  # nan if there is a nan
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return "has a value that is not finite"
+    if max(-low, high) > _LARGEST_OBSERVATION:
+        return f"has a value beyond +-{_LARGEST_OBSERVATION:g}: scale or clip the observations"
+    return ""
 
 
 def _action_violation(rollout: Rollout, actions: np.ndarray, space: DiscreteSpace | ContinuousSpace) -> str:

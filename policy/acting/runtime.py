@@ -4,23 +4,22 @@ TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actor
 """
 
 import hashlib
-import os
+import threading
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import onnxruntime
 
+from daedalus.policy.acting.call_watchdog import CallWatchdog
+from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import Noise, NoiseSize
 from daedalus.policy.acting.onnx_initializers import with_initializers
+from daedalus.policy.acting.program_check import check_program
+from daedalus.policy.acting.program_session import ProgramSession
 
 STATE, UNIFORM, NORMAL = "state", "uniform", "normal"
 LOG_PROB, NEXT_STATE = "log_prob", "next_state"
 _OBSERVATIONS, _MASKS, _ACTIONS = "observations/", "masks/", "actions/"
 _MAX_STATE_SIZE = _MAX_NOISE_SIZE = 1 << 16
-
-
-class PolicyError(Exception):
-    """A program or weights that do not fit together or do not fit the spaces: a fault of the sender."""
 
 
 class Choice(NamedTuple):
@@ -92,15 +91,20 @@ class OnnxRuntime:
     convolutions is instead loaded again for each snapshot, with the weights as constants.
     """
 
-    def __init__(self, model: bytes) -> None:
-        """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it."""
+    def __init__(self, model: bytes, stop: threading.Event | None = None) -> None:
+        """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it.
+
+        `stop` ends a call that is in progress; it then raises PolicyError.
+        """
+        check_program(model, _is_input)
         self._model = model
-        self._session = _session(model)
-        inputs = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
-        self._actions = _action_components([entry.name for entry in self._session.get_outputs()], STATE in inputs)
-        self._integers = {
-            entry.name for entry in self._session.get_inputs() if entry.type == "tensor(int64)"
-        }  # discrete observations, which messages hold in fewer bits
+        self._watchdog = CallWatchdog(stop)
+        self._session = ProgramSession(model, self._watchdog)
+        onnx_inputs, onnx_outputs = self._session.onnx.get_inputs(), self._session.onnx.get_outputs()
+        inputs = {entry.name: tuple(entry.shape) for entry in onnx_inputs}
+        self._actions = _action_components([entry.name for entry in onnx_outputs], STATE in inputs)
+        # Discrete observations, which messages hold in fewer bits.
+        self._integers = {entry.name for entry in onnx_inputs if entry.type == "tensor(int64)"}
         self._components = {name for name in inputs if name.startswith((_OBSERVATIONS, _MASKS))}
         self._state_size = _size(inputs, STATE, _MAX_STATE_SIZE)
         self._noise_size = NoiseSize(_size(inputs, UNIFORM, _MAX_NOISE_SIZE), _size(inputs, NORMAL, _MAX_NOISE_SIZE))
@@ -136,7 +140,7 @@ class OnnxRuntime:
                 )
         bound = {name: weights[name] for name in self._shapes}
         if self._convolutional:
-            self._session = _session(with_initializers(self._model, bound))
+            self._session = ProgramSession(with_initializers(self._model, bound), self._watchdog)
         else:
             self._feed = bound
 
@@ -155,11 +159,7 @@ class OnnxRuntime:
             feed[UNIFORM] = noise.uniform
         if self._noise_size.normal:
             feed[NORMAL] = noise.normal
-        try:
-            outputs: Any = self._session.run(None, feed)
-        except Exception as error:  # onnxruntime's exceptions share no base of their own
-            raise PolicyError(f"the program failed: {_first_line(error)}") from None
-        return self._checked(outputs, state)
+        return self._checked(self._session.run(feed), state)
 
     def _set(self, name: str, values: np.ndarray) -> None:
         """Set an input. One that the network does not use, such as by an encoder of the user, is not in the program."""
@@ -198,18 +198,9 @@ def _action_components(outputs: list[str], remembers: bool) -> tuple[str, ...]:
     return names
 
 
-def _session(model: bytes) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    # An actor has one core at most; spinning threads would take time from other processes.
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    # A model may name files to read weights from. A received program must not read files: no such file exists here.
-    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
-    try:
-        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
+def _is_input(name: str) -> bool:
+    """Return whether an input changes from call to call. All others are weights."""
+    return name in (STATE, UNIFORM, NORMAL) or name.startswith((_OBSERVATIONS, _MASKS))
 
 
 def _size(inputs: dict[str, tuple[Any, ...]], name: str, largest: int) -> int:
@@ -221,7 +212,3 @@ def _size(inputs: dict[str, tuple[Any, ...]], name: str, largest: int) -> int:
             raise PolicyError(
                 f"the program's {name!r} has shape {shape}, it must be [rows, size] with size up to {largest}"
             )
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

@@ -67,7 +67,7 @@ def generator() -> np.random.Generator:
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
 @pytest.mark.parametrize("rows", [1, 17])
 def test_both_runtimes_choose_the_same_actions(
-    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
+    policy: Policy, rows: int, random: Callable[[], RandomSource | None]
 ) -> None:
     both = policy.runtimes()
     for seed in (0, 1):  # also after weights are replaced
@@ -356,10 +356,10 @@ def test_only_programs_with_convolutions_use_constants(policy: Policy) -> None:
     runtime = OnnxRuntime(policy.program)
     runtime.load(policy.weights())
     weights = policy.acting_names()
-    fed = {entry.name for entry in runtime._session.get_inputs()} & weights
+    fed = {entry.name for entry in runtime._session.onnx.get_inputs()} & weights
     assert fed == (set() if policy.network.convolutional else weights)
     # onnxruntime does not arrange constants that an input could override.
-    assert not runtime._session.get_overridable_initializers()
+    assert not runtime._session.onnx.get_overridable_initializers()
 
 
 # ------------------------------------------------------------------------------------------ the weights
