@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 import pytest
 from collectors import collect, started_collector
-
 from daedalus.policy.acting.sampling import RandomSource
+
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import EnvironmentSpec
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from counting_environment import Counting
+from daedalus.policy.acting.sampling import RandomSource
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, play_episodes
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.policy.acting.sampling import RandomSource
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 from counting_environment import Counting
+from daedalus.policy.acting.sampling import RandomSource
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
-from daedalus.policy.acting.sampling import RandomSource
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
