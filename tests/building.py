@@ -47,7 +47,10 @@ def make_rollout(
     seed: int = 0,
     **replaced: Any,
 ) -> Rollout:
-    """Return a rollout with random content: terminations, truncations and the reset rows after them."""
+    """Return a rollout with random content: terminations, truncations and the reset rows after them.
+
+    `frames` and `actions` [T, E] may be arrays: they are then the only component.
+    """
     random = np.random.default_rng(seed)
     terminated, truncated = np.zeros((2, rows, environments), np.bool_)
     valid = np.ones((rows, environments), np.bool_)
@@ -72,6 +75,10 @@ def make_rollout(
         "episode_returns": np.full(ends, -1.5, np.float32),
         "episode_lengths": np.full(ends, 4, np.int32),
     }
+    if isinstance(replaced.get("frames"), np.ndarray):
+        replaced["frames"] = {"observation": replaced["frames"]}
+    if isinstance(replaced.get("actions"), np.ndarray):
+        replaced["actions"] = {"action": replaced["actions"][..., None]}
     return Rollout(identity=rollout_identity or identity(), policy_version=version, **{**content, **replaced})
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from building import SPACES
 from oracles import Stream, lambda_return, rho, vtrace, vtrace_advantage
+from plain import plain
 from torch import Tensor, nn
 
 from daedalus.algorithms.batch import Batch
@@ -31,7 +32,7 @@ class PlainLearner:
         """Make all updates of a batch, and return the means of their metrics."""
         with torch.no_grad():
             before, _, values = self._play_back(batch)
-        streams = [self._stream(batch, b, before, values) for b in range(batch.actions.shape[1])]
+        streams = [self._stream(batch, b, before, values) for b in range(batch.rewards.shape[1])]
         targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
         measured = [self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
         return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
@@ -42,7 +43,7 @@ class PlainLearner:
         if self.spec.algorithm != "appo":
             return [cells]
         if self.network.state_size:
-            columns = evenly(list(range(batch.actions.shape[1])), self.spec.minibatches)
+            columns = evenly(list(range(batch.rewards.shape[1])), self.spec.minibatches)
             parts = [[cell for cell in cells if cell[1] in part] for part in columns]
         else:
             parts = evenly(cells, self.spec.minibatches)
@@ -93,29 +94,29 @@ class PlainLearner:
     def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:
         """Return log-probabilities, entropies and values by cell, from one forward pass per row."""
         log_probs, entropies, values = {}, {}, {}
-        rows, environments = batch.actions.shape
+        rows, environments = batch.rewards.shape
         for b in range(environments):
             state = batch.initial_state[b : b + 1]
             for t in range(rows + 1):
                 if batch.starts[t, b]:
                     state = torch.zeros_like(state)
-                seen = batch.observations[t, b : b + 1]
+                seen = plain(batch.observations)[t, b : b + 1]
                 _, value = self.network(seen.unsqueeze(0), state, torch.zeros(1, 1, dtype=torch.bool))
                 logits, state = self.network.act(seen, state)
                 values[t, b] = value.squeeze()
                 if t < rows:
                     policy = torch.distributions.Categorical(logits=logits[0])
-                    log_probs[t, b] = policy.log_prob(batch.actions[t, b])
+                    log_probs[t, b] = policy.log_prob(plain(batch.actions)[t, b, 0])
                     entropies[t, b] = policy.entropy()
         return log_probs, entropies, values
 
     @staticmethod
     def _stream(batch: Batch, b: int, log_probs: Played, values: Played) -> Stream:
         """Return the rows of an environment in the papers' notation."""
-        rows = range(len(batch.actions))
+        rows = range(len(batch.rewards))
         return Stream(
             r=batch.rewards[:, b].tolist(),
-            V=[values[t, b].item() for t in range(len(batch.actions) + 1)],
+            V=[values[t, b].item() for t in range(len(batch.rewards) + 1)],
             log_ratios=[(log_probs[t, b] - batch.behaviour_log_probs[t, b]).item() for t in rows],
             terminated=batch.terminated[:, b].tolist(),
             truncated=batch.truncated[:, b].tolist(),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
+from plain import NAME, act, array_space
 
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
@@ -36,13 +37,13 @@ def learner(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) ->
 
 
 def rollouts(seed: int, spaces: Spaces, state_size: int) -> list[Rollout]:
-    space = spaces.observations["observation"]
+    space = array_space(spaces)
     made = [make_rollout(seed=100 * seed + number, state_size=state_size) for number in range(2)]
     if space.dtype != "uint8":
         return made
     random = np.random.default_rng(seed)
     shape = (space.frames + ROWS, ENVIRONMENTS, *space.shape)
-    return [replace(rollout, frames=random.integers(0, 256, shape, np.uint8)) for rollout in made]
+    return [replace(rollout, frames={NAME: random.integers(0, 256, shape, np.uint8)}) for rollout in made]
 
 
 def trained_learner(device: str, policy: PolicySpec, spaces: Spaces, **training: Any) -> Learner:
@@ -72,10 +73,8 @@ def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
     there.step(rollouts(1, spaces, 0), progress=0.0)
     runtime = OnnxRuntime(there.program())
     runtime.load({name: array.copy() for name, array in there.weights().items()})
-    observations = np.random.default_rng(1).integers(
-        0, 256, (5, *spaces.observations["observation"].stacked_shape), np.uint8
-    )
-    actions, _, _ = runtime.act(observations, np.zeros((5, 0), np.float32), None)
+    observations = np.random.default_rng(1).integers(0, 256, (5, *array_space(spaces).stacked_shape), np.uint8)
+    actions, _, _ = act(runtime, observations, np.zeros((5, 0), np.float32))
     assert actions.shape == (5,)
     directory = save_checkpoint(
         tmp_path,

@@ -9,7 +9,7 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from plain import vector_spaces
+from plain import ACTION, choices, plain, plain_spaces, vector_spaces
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
@@ -64,7 +64,8 @@ def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "",
 
 def with_value(name: str, value: float) -> Rollout:
     """Return a valid rollout with one value of one array replaced."""
-    array = getattr(good(), name).copy()
+    value_of = getattr(good(), name)
+    array = (plain(value_of) if isinstance(value_of, dict) else value_of).copy()
     array.flat[-1] = value
     return good(**{name: array})
 
@@ -77,7 +78,7 @@ def test_valid_rollout_is_accepted_unchanged(harness: Harness) -> None:
     verdict = harness.receive(encode(rollout), now=5.0)
     assert isinstance(verdict, Rollout)
     assert verdict.identity == rollout.identity
-    np.testing.assert_array_equal(verdict.frames, rollout.frames)
+    np.testing.assert_array_equal(plain(verdict.frames), plain(rollout.frames))
     actor = harness.fleet.actors["a"]
     assert (actor.accepted, actor.policy_lag, actor.last_seen) == (1, 2, 5.0)
     assert not actor.rejected
@@ -150,7 +151,7 @@ def test_rollout_with_wrong_number_of_rows_or_environments_is_rejected_as_unfit(
 def test_frames_with_wrong_shape_or_dtype_are_rejected_with_both_shapes_named(
     harness: Harness, rollout: Rollout
 ) -> None:
-    theirs = f"frames are {rollout.frames.dtype} {rollout.frames.shape}"
+    theirs = f"frames/observation is {plain(rollout.frames).dtype} {plain(rollout.frames).shape}"
     verdict = assert_rejected(harness, encode(rollout), "unfit", theirs)
     assert f"expected float32 {(ROWS + 1, ENVIRONMENTS, 3)}" in verdict.reason
 
@@ -160,9 +161,9 @@ def test_oversized_rollout_is_rejected_before_it_is_unpacked(harness: Harness) -
     assert_rejected(harness, encode(bomb), "malformed", "the limit is")
 
 
-@pytest.mark.parametrize("action", [-1, SPACES.actions["action"].count, 2**31 - 1])
+@pytest.mark.parametrize("action", [-1, choices(SPACES), 2**31 - 1])
 def test_action_out_of_range_is_rejected_as_unfit(harness: Harness, action: int) -> None:
-    actions = good().actions.astype(np.int32)
+    actions = plain(good().actions)[..., 0].astype(np.int32)
     actions[-1, -1] = action
     assert_rejected(harness, encode(good(actions=actions)), "unfit", "action")
 
@@ -217,7 +218,7 @@ STACKED = ArraySpace(shape=(60, 80, 3), dtype="uint8", frames=4)
 
 def stacked_harness(state_size: int = 0) -> Harness:
     harness = Harness()
-    harness.fleet = joined_fleet("a", spaces=SPACES.model_copy(update={"observation": STACKED}))
+    harness.fleet = joined_fleet("a", spaces=plain_spaces(STACKED, 4))
     harness.intake = Intake(run_spec(max_policy_lag=MAX_LAG), EPOCH, harness.fleet)
     harness.intake.state_size = state_size
     return harness
@@ -232,14 +233,14 @@ def test_stacked_observations_are_sent_as_single_frames() -> None:
     rollout = good(frames=pixels())
     verdict = stacked_harness().receive(encode(rollout))
     assert isinstance(verdict, Rollout)
-    np.testing.assert_array_equal(verdict.frames, rollout.frames)
+    np.testing.assert_array_equal(plain(verdict.frames), plain(rollout.frames))
 
 
 def test_frames_with_environment_first_memory_layout_are_decoded_equally() -> None:
     swapped = np.ascontiguousarray(pixels().swapaxes(0, 1)).swapaxes(0, 1)
     verdict = stacked_harness().receive(encode(good(frames=swapped)))
     assert isinstance(verdict, Rollout)
-    np.testing.assert_array_equal(verdict.frames, pixels())
+    np.testing.assert_array_equal(plain(verdict.frames), pixels())
 
 
 @pytest.mark.parametrize(
@@ -267,7 +268,7 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
     most = int(every_second.sum())  # episodes of one row, each followed by a reset row
     largest = dataclasses.replace(
         largest,
-        actions=largest.actions.astype(np.int64),
+        actions={ACTION: plain(largest.actions).astype(np.int64)},
         terminated=every_second,
         truncated=np.zeros_like(every_second),
         valid=every_second,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from building import POLICY, RECURRENT, SPACES, join, make_rollout, make_rollouts, run_spec
+from plain import ACTION, plain, plain_spaces
 from plain_learner import PlainLearner
 from torch import Tensor
 from torch.testing import assert_close
@@ -129,7 +130,7 @@ def on_policy(policy: PolicySpec, start: dict[str, np.ndarray], rollouts: list[R
         batch = join([rollout])
         with torch.no_grad():
             logits, _ = network(batch.observations, batch.initial_state, batch.starts)
-        log_probs = torch.distributions.Categorical(logits=logits[:-1]).log_prob(batch.actions)
+        log_probs = torch.distributions.Categorical(logits=logits[:-1]).log_prob(plain(batch.actions).squeeze(-1))
         chosen.append(replace(rollout, behaviour_log_probs=log_probs.numpy()))
     return chosen
 
@@ -235,7 +236,7 @@ def test_content_of_reset_rows_does_not_change_the_weights(algorithm: str, norma
     garbage = [
         replace(
             rollout,
-            actions=np.where(rollout.valid, rollout.actions, 3 - rollout.actions),
+            actions={ACTION: np.where(rollout.valid[..., None], plain(rollout.actions), 3 - plain(rollout.actions))},
             rewards=np.where(rollout.valid, rollout.rewards, np.float32(1e4)),
             behaviour_log_probs=np.where(rollout.valid, rollout.behaviour_log_probs, np.float32(-20.0)),
         )
@@ -284,8 +285,10 @@ def test_action_counts_are_over_batches_since_the_last_call() -> None:
     rollouts = make_rollouts(1) + make_rollouts(2)
     learner.step(rollouts[:2], 0.0)
     learner.step(rollouts[2:], 0.0)
-    actions = np.concatenate([rollout.actions[rollout.valid] for rollout in rollouts])  # reset rows have no action
-    assert learner.metrics.take_action_counts() == np.bincount(actions, minlength=4).tolist()
+    actions = np.concatenate(
+        [plain(rollout.actions)[rollout.valid, 0] for rollout in rollouts]
+    )  # reset rows have no action
+    assert learner.metrics.take_action_counts() == {ACTION: np.bincount(actions, minlength=4).tolist()}
     assert learner.metrics.take_action_counts() == [0] * 4
 
 
@@ -296,7 +299,7 @@ def test_observation_image_shows_the_stacked_frames_side_by_side(
     shape: tuple[int, ...], size: tuple[int, ...] | None
 ) -> None:
     space = ArraySpace(shape=shape, dtype="uint8", frames=3)
-    learner = Learner(learner_spec(), POLICY, SPACES.model_copy(update={"observation": space}))
+    learner = Learner(learner_spec(), POLICY, plain_spaces(space, 4))
     assert learner.metrics.take_observation_image() is None
     frames = np.random.default_rng(0).integers(0, 256, (6 + 3, 3, *shape), np.uint8)
     learner.step([make_rollout(frames=frames)], 0.0)

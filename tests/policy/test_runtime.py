@@ -67,7 +67,7 @@ def generator() -> np.random.Generator:
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
 @pytest.mark.parametrize("rows", [1, 17])
 def test_both_runtimes_choose_the_same_actions(
-    policy: Policy, rows: int, random: Callable[[], RandomSource | None]
+    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
 ) -> None:
     both = policy.runtimes()
     for seed in (0, 1):  # also after weights are replaced
