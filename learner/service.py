@@ -187,6 +187,7 @@ class LearnerService:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
         rollouts = self._server.rollouts.take_batch(learner.policy_version)
+        self._health.left_out = self._server.rollouts.left_out
         if not rollouts:
             return
         skipped = learner.updates_skipped

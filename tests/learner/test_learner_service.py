@@ -14,6 +14,7 @@ from building import identity, make_rollout
 from log_lines import LINES
 from processes import LIMIT, until
 
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -24,9 +25,10 @@ from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, StatusReport
+from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, StatusReport
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
@@ -79,10 +81,14 @@ class TrainingRun:
         finally:
             transport.close()
 
-    def _play(self, role: Any, name: str) -> None:
+    def play(self, role: Any, name: str, *arguments: Any) -> None:
+        """Start another actor or evaluator."""
+        self._threads.append(self._start(self._play, role, name, *arguments))
+
+    def _play(self, role: Any, name: str, *arguments: Any) -> None:
         transport = MemoryTransport(self.network)
         try:
-            role(ActorConfig(name=name, incarnation=1), transport, self.stop).run()
+            role(ActorConfig(name=name, incarnation=1), transport, self.stop, *arguments).run()
         finally:
             transport.close()
 
@@ -198,3 +204,55 @@ def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_trainin
     assert summary["updates_skipped"] == summary["rollouts_rejected"]["non_finite"] >= 3
     weights = read_policy(checkpoints(training_run.directory)[0]).weights
     assert all(np.isfinite(array).all() for array in weights.values())
+
+
+class HangingCollector(EnvironmentCollector):
+    """Collector whose environment can be made to hang, as a broken simulator does."""
+
+    def __init__(self, responds: threading.Event) -> None:
+        super().__init__()
+        self._responds = responds
+
+    def collect(self, identity: RolloutIdentity) -> Rollout:
+        assert self._responds.wait(LIMIT)
+        return super().collect(identity)
+
+
+def test_actor_whose_environment_hangs_does_not_hold_the_updates_of_a2c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daedalus.learner.serving.stragglers._PATIENCE_SECONDS", 0.5)
+    training_run = TrainingRun(
+        tmp_path,
+        environment={"id": "CartPole-v1"},
+        collection={"actors": 2, "envs_per_actor": 1, "rollout_length": 8},
+        training={"env_steps": 10**9, "stop_when_solved": False, "algorithm": "a2c"},
+    )
+    responds = threading.Event()
+    responds.set()
+    training_run.play(ActorService, "b", HangingCollector(responds))
+    observer = MemoryTransport(training_run.network)
+
+    def env_steps(name: str) -> int:
+        return {actor.actor: actor.env_steps for actor in status().actors}.get(name, 0)
+
+    def status() -> RunStatus:
+        report = decode(observer.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+        assert isinstance(report, StatusReport)
+        return report.status
+
+    try:
+        until(training_run.rows)
+        until(lambda: env_steps("b"))
+        responds.clear()
+        until(lambda: status().problems == ("batches do not wait for b: connected, but without rollouts",))
+        before = env_steps("a")
+        until(lambda: env_steps("a") > before)
+        before = env_steps("b")
+        responds.set()
+        until(lambda: env_steps("b") > before)
+        until(lambda: not status().problems)
+    finally:
+        responds.set()
+        training_run.end()
+    assert any(line.startswith("batches no longer wait for actor 'b'") for line in LINES)
