@@ -58,6 +58,28 @@ class Intake:
         self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
         self.state_size = 0  # size of the recurrent state; set before any actor has the program
 
+    def refuse_size(self, sender: str, size: int) -> Rejected | None:
+        """Return the verdict on a message of `size` bytes that no rollout of `sender` has, or None. Reads no message.
+
+        Call this method without the lock.
+        """
+        spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
+        if size <= _SLACK_BYTES:
+            return None
+        if spaces is None or actor is None or not actor.environments:
+            return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
+        plain, queue = self._limits(spaces, actor).message_bytes, self._spec.service.queue_bytes
+        if size > plain:
+            reason = f"the message has {size:,} bytes, and a rollout of this actor at most {plain:,}"
+            return Rejected(verdict="rejected", cause="malformed", reason=reason)
+        if size > queue:
+            reason = (
+                f"the rollout has {size:,} bytes, and service.queue_megabytes allows {queue:,}: raise that setting, or "
+                "use fewer environments per actor (--envs)"
+            )
+            return Rejected(verdict="rejected", cause="unfit", reason=reason)
+        return None
+
     def read(self, sender: str, data: bytes) -> Rollout | Rejected:
         """Decode a message of `sender`, and check its content against the specification.
 

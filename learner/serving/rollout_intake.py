@@ -22,6 +22,7 @@ from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
+from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
 from daedalus.protocol.messages import Acknowledgement, Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request
@@ -99,12 +100,27 @@ class RolloutIntake:
         """Queue a rollout, or answer busy. Does not block."""
         if self._closed:
             request.reply(encode(Acknowledgement(verdict="finished")))
+        elif self._refuses_size(request):
+            pass
         elif not self._requests.offer(request):
             request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
             with self._lock:
                 actor = self._fleet.actors.get(keys.last_chunk(request.key))
                 if actor is not None:
                     actor.busy += 1
+
+    def _refuses_size(self, request: Request) -> bool:
+        """Refuse a request that cannot be a rollout of its sender, without a copy of its payload."""
+        sender = keys.last_chunk(request.key)
+        refused = self._intake.refuse_size(sender, request.size)
+        if refused is None:
+            return False
+        with self._lock:
+            refused = self._intake.judge(sender, refused, self._version, time.monotonic())
+            assert isinstance(refused, Rejected)
+            self._counters.rollouts_rejected[refused.cause] += 1
+        request.reply(encode(acknowledgement(refused, self._published_version())))
+        return True
 
     # ------------------------------------------------------------------------------------ the learner's thread
 
@@ -214,6 +230,11 @@ class RolloutIntake:
         self._buffer.add(rollout)
         self._counters.accepted(rollout, size)
         self._lock.notify_all()
+
+
+def largest_request(spec: RunSpec) -> int:
+    """Return the size of the largest query that a learner answers, in bytes: the learner receives none above it."""
+    return max(Limits(max_bytes=spec.service.queue_bytes).message_bytes, EVALUATION_LIMITS.message_bytes)
 
 
 def _queue(spec: RunSpec) -> RequestQueue:
