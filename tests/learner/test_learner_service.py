@@ -256,6 +256,4 @@ def test_actor_whose_environment_hangs_does_not_hold_the_updates_of_a2c(
     finally:
         responds.set()
         training_run.end()
-    assert (
-        "batches no longer wait for actor 'b', which is connected but sends nothing: examine its environment" in LINES
-    )
+    assert any(line.startswith("batches no longer wait for actor 'b'") for line in LINES)
