@@ -138,7 +138,7 @@ class ActorService:
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
             return TorchRuntime(welcome.spec.policy, spaces)
-        return OnnxRuntime(self._await_program(welcome))
+        return OnnxRuntime(self._await_program(welcome), self._stop)
 
     def _await_program(self, welcome: Welcome) -> bytes:
         """Return the program once the learner has it; measure the link by the time that it takes."""
@@ -226,16 +226,17 @@ class ActorService:
     def _await_snapshot(self, newer_than: int) -> Snapshot:
         """Wait for a snapshot newer than a version; request it in case a push was lost.
 
-        Return early if the rollout that the version depends on was rejected: the actor must replace it.
+        Return early if the rollout that the version depends on was rejected: the actor must replace it. Not if a newer
+        version is out, whose push was late or lost: a rollout of this version would be rejected again.
         """
         first = newer_than < 0
 
         def ready() -> bool:
             self._feed.read()
-            newest = self._feed.newest
+            newest, in_flight = self._feed.newest, self._uploads.in_flight
             if newest is not None and newest.policy_version > newer_than:
                 return True
-            return self._uploads.in_flight.last_was_rejected and not first
+            return in_flight.last_was_rejected and not first and in_flight.newest_version <= newer_than
 
         pause = _FIRST_PUSH_SECONDS if first else _MISSED_PUSH_SECONDS
         while not self._monitor.wait(ready, pause):

@@ -56,7 +56,7 @@ def test_ports_are_open_on_the_loopback_address_only() -> None:
 
 def test_each_mounted_file_exists() -> None:
     mounts = [mount for service in SERVICES.values() for mount in service.get("volumes", []) if mount.startswith("./")]
-    assert len(mounts) == 4
+    assert len(mounts) == 5
     assert all((ROOT / mount.split(":")[0]).exists() for mount in mounts)
 
 
@@ -67,6 +67,26 @@ def test_host_names_in_addresses_are_services() -> None:
     hosts = set(re.findall(r"(?:tcp/|http://|targets: \[\")([a-z]+):\d+", text))
     assert hosts == {"router", "exporter", "prometheus"}
     assert hosts <= SERVICES.keys()
+
+
+def test_each_container_is_limited() -> None:
+    for name, service in SERVICES.items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["mem_limit"], name
+        assert service["pids_limit"] > 0, name
+        assert service["logging"]["options"].keys() == {"max-size", "max-file"}, name
+        assert any(mount.startswith("/tmp:") for mount in service["tmpfs"]), name
+
+
+def test_images_of_others_are_pinned() -> None:
+    for service in SERVICES.values():
+        if not service["image"].startswith("daedalus-"):
+            assert re.search(r":v?\d+\.\d+\.\d+$|@sha256:[0-9a-f]{64}$", service["image"]), service["image"]
+    (base,) = re.findall(r"^ARG BASE=(\S+)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert re.search(r":\d+\.\d+\.\d+-slim-\w+$", base)
+    assert f'_PYTHON = "{base}"' in (ROOT / "tests" / "compose" / "docker_host.py").read_text()
 
 
 def test_the_router_image_has_the_zenoh_version_of_the_constraints() -> None:
