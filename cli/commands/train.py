@@ -96,7 +96,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--listen",
         metavar="tcp/HOST:PORT",
-        help="address where more actors may join (default: a free port of this machine)",
+        help="address where more actors may join (default: none; the processes of the run use a private Unix socket)",
     )
     add_tls(options)
     add_insecure(options)

@@ -1,15 +1,13 @@
-"""Test of deploy/slurm, deploy/systemd and the commands in docs/deploy.md."""
+"""Test of deploy/systemd and the commands in docs/deploy.md."""
 
 import configparser
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 from commands import check
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "deploy" / "slurm" / "daedalus.sbatch"
 UNIT = ROOT / "deploy" / "systemd" / "daedalus@.service"
 
 
@@ -19,16 +17,6 @@ def commands(text: str) -> list[list[str]]:
         re.sub(r"\s+#.*|\s*&$", "", line) for line in re.findall(r"(?<![`\w./-])daedalus (?=[a-z])([^\n`]*)", text)
     )
     return [shlex.split(line) for line in lines]
-
-
-def test_the_commands_of_the_slurm_script_are_valid() -> None:
-    ours = [line for line in SCRIPT.read_text().splitlines() if not line.startswith("#")]
-    text = "\n".join(ours).replace("$(hostname)", "node").replace("$port", "7447")
-    assert [check(words) for words in commands(text)] == ["router", "actor", "learner"]
-
-
-def test_the_slurm_script_is_valid_bash() -> None:
-    subprocess.run(["bash", "-n", str(SCRIPT)], check=True)
 
 
 def test_the_example_arguments_of_the_systemd_unit_are_valid() -> None:
