@@ -53,13 +53,14 @@ class RunReporter:
 
     def row(self, learner: "Learner", now: float) -> dict[str, float]:
         """Return a metrics row, with rates and means since the previous row."""
+        learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         with self._lock:
             progress = self._counters.env_steps / self._spec.training.env_steps
             rates = self._meter.measure(self._counters, self._fleet, now)
             if self._fleet.live:
                 self._health.actor_seen = now
             learning = {
-                **learner.metrics.take_means(),
+                **learned,
                 **self._evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),

@@ -13,7 +13,7 @@ import numpy as np
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -129,7 +129,7 @@ class Intake:
         rows = self._spec.collection.rollout_length + spaces.observation.frames
         row_bytes = actor.environments * (frame + _ROW_BYTES)
         state_bytes = 4 * actor.environments * self.state_size
-        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16)
+        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16 + MAX_INFO_NAMES)
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
@@ -151,6 +151,9 @@ class Intake:
         for name in ("frames", "initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
             if not np.isfinite(getattr(rollout, name)).all():
                 return f"{name} has a value that is not finite"
+        for name, values in rollout.episode_info.items():
+            if not np.isfinite(values).all():
+                return f"episode_info {name!r} has a value that is not finite"
         if (rollout.behaviour_log_probs > 1e-4).any():
             return "behaviour_log_probs has a value above 0"
         environment = self._spec.environment

@@ -188,6 +188,9 @@ class Endless:
         over = np.full(2, self.over)
         return np.zeros((2, 2), np.float32), np.zeros(2), over, np.zeros(2, np.bool_)
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
+
     def close(self) -> None:
         self.closed.set()
 
