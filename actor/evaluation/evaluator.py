@@ -30,7 +30,7 @@ class Evaluator:
     def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
         """`stop` ends `run`, also in the middle of an episode."""
         self._config, self._stop = config, stop
-        self._queries = LearnerQueries(transport, config.authorization_hint)
+        self._queries = LearnerQueries(transport)
 
     def run(self) -> None:
         """Evaluate until `stop` or until the run is over.
@@ -80,7 +80,7 @@ class Evaluator:
         program = self._queries.program(welcome.run, snapshot.program)
         if program is None:
             return False
-        runtime = OnnxRuntime(program[1])
+        runtime = OnnxRuntime(program[1], self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
         evaluation = play_episodes(

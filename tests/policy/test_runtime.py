@@ -312,10 +312,10 @@ def test_only_programs_with_convolutions_use_constants(policy: Policy) -> None:
     runtime = OnnxRuntime(policy.program)
     runtime.load(policy.weights())
     weights = policy.acting_names()
-    fed = {entry.name for entry in runtime._session.get_inputs()} & weights
+    fed = {entry.name for entry in runtime._session.onnx.get_inputs()} & weights
     assert fed == (set() if policy.network.convolutional else weights)
     # onnxruntime does not arrange constants that an input could override.
-    assert not runtime._session.get_overridable_initializers()
+    assert not runtime._session.onnx.get_overridable_initializers()
 
 
 # ------------------------------------------------------------------------------------------ the weights
