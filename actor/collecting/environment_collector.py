@@ -74,7 +74,7 @@ class EnvironmentCollector:
         assert environments is not None
         while not writer.record(*environments.step(writer.act())):
             pass
-        return writer.finish(identity, self._policy_version)
+        return writer.finish(identity, self._policy_version, environments.take_episode_info())
 
     def close(self) -> None:
         """See Collector. Close the environments."""

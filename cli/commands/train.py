@@ -35,7 +35,7 @@ before the target, 1 failed or stopped, 2 bad usage"""
 
 _RESUME = """\
 Continues a run from its newest undamaged checkpoint, with the same weights, optimiser state, counters and random state.
-The environments start new episodes."""
+The environments start new episodes. With another budget, annealed settings continue from the values that they had."""
 
 _RESUME_EXAMPLES = """\
 examples:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.spec import RunSpec
@@ -115,7 +116,7 @@ def metrics_row(
     learning: dict[str, float],
     wall_seconds: float,
 ) -> dict[str, float]:
-    """Return one metrics row, with columns of learner/reporting/metrics.py.
+    """Return one metrics row, with columns of learner/reporting/metrics.py and the scalars of the environment.
 
     Args:
       counters: counters of the run.
@@ -137,6 +138,7 @@ def metrics_row(
         "rollouts_rejected": counters.rollouts_rejected.total(),
         "updates_skipped": counters.updates_skipped,
         **learning,
+        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
     }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -176,7 +176,7 @@ class Intake:
         rows = self._spec.collection.rollout_length + spaces.observation.frames
         row_bytes = environments * (frame + _ROW_BYTES)
         state_bytes = 4 * environments * self.state_size
-        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16)
+        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16 + MAX_INFO_NAMES)
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
@@ -227,6 +227,9 @@ def _number_violation(rollout: Rollout) -> str:
             return f"{name} has a value that is not finite"
         if max(-low, high) > largest:
             return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
+    for name, values in rollout.episode_info.items():
+        if not np.isfinite(values).all():
+            return f"episode_info {name!r} has a value that is not finite"
     return ""
 
 

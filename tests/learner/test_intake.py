@@ -173,6 +173,20 @@ def test_value_that_is_not_finite_is_rejected_with_its_array_named(harness: Harn
     assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_episode_info_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
+    info = {"distance": np.full(1, value, np.float32)}
+    assert_rejected(harness, encode(good(episode_info=info)), "unfit", "episode_info 'distance'")
+
+
+def test_all_the_episode_info_that_a_rollout_may_have_is_accepted(harness: Harness) -> None:
+    most = len(good().episode_returns)
+    info = {f"{number:064}": np.full(most, 1.0, np.float32) for number in range(16)}
+    accepted = harness.receive(encode(good(episode_info=info)))
+    assert isinstance(accepted, Rollout)
+    assert accepted.episode_info.keys() == info.keys()
+
+
 def test_log_probability_above_0_is_rejected_as_unfit(harness: Harness) -> None:
     assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from building import EPOCH, joined_fleet, make_rollout, run_spec
 
+from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
 from daedalus.learner.reporting.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.update_metrics import METRICS
 
+DIAGNOSTICS = (
+    *("behaviour_kl", "rho_mean", "rho_effective_share", "rho_clipped_fraction"),
+    *VALUE_ERROR_QUANTILES,
+)
 EVERYTHING = np.ones((6, 3), np.bool_)
 
 
@@ -63,7 +68,7 @@ def test_row_has_every_column_when_all_values_are_known() -> None:
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False)
     rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
-    learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
+    learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
     assert set(row) == set(COLUMNS)

@@ -140,6 +140,12 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+        episode_info={
+            name: bits(random, "<f4", (draw(st.integers(1, episodes)),))
+            for name in (
+                draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
+            )
+        },
     )
 
 
