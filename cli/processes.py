@@ -10,6 +10,9 @@ import traceback
 
 _logger = logging.getLogger(__name__)
 
+# Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
+STOPPED = 128 + signal.SIGTERM
+
 
 def stop_on_signals() -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.

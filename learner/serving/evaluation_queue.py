@@ -13,23 +13,25 @@ _MAX_WAITING = 64  # messages; further messages are answered not_ready
 
 
 class EvaluationQueue:
-    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `close`."""
+    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `end`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
-        self._ready = self._closed = False
+        self._ready = False
+        self._ending: Refusal | None = None  # of all messages after the end
 
     def open(self) -> None:
         """Accept messages from now on. Called when there is a policy to evaluate."""
         self._ready = True
 
-    def close(self, reason: str) -> None:
+    def end(self, reason: str, *, finished: bool) -> None:
         """Refuse all waiting and all later messages, with `reason`."""
+        ending = Refusal(code="finished" if finished else "not_ready", reason=reason)
         with self._lock:
-            self._closed = True
+            self._ending = ending
         for request, _ in self.take():
-            request.reply(encode(Refusal(code="finished", reason=reason)))
+            request.reply(encode(ending))
 
     def offer(self, request: Request) -> None:
         """Queue a message of an evaluator, or refuse it. Does not block."""
@@ -44,12 +46,13 @@ class EvaluationQueue:
             request.reply(encode(Refusal(code="malformed", reason=reason)))
             return
         with self._lock:
-            refused = self._closed or not self._ready or len(self._waiting) >= _MAX_WAITING
-            if not refused:
+            refusal = self._ending
+            if refusal is None and (not self._ready or len(self._waiting) >= _MAX_WAITING):
+                refusal = Refusal(code="not_ready", reason="no evaluation is possible now")
+            if refusal is None:
                 self._waiting.append((request, message))
-        if refused:
-            code = "finished" if self._closed else "not_ready"
-            request.reply(encode(Refusal(code=code, reason="no evaluation is possible now")))
+        if refusal is not None:
+            request.reply(encode(refusal))
 
     def take(self) -> list[tuple[Request, EvaluationRequest | EvaluationReport]]:
         """Return the messages since the last call. The caller replies to each request."""
