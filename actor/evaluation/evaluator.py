@@ -33,7 +33,7 @@ class Evaluator:
         """`stop` ends `run`, also in the middle of an episode."""
         self._config = config
         self._end = RunEndWatch(transport, stop)
-        self._queries = LearnerQueries(transport, config.authorization_hint)
+        self._queries = LearnerQueries(transport)
 
     def run(self) -> bool:
         """Evaluate until `stop` or until the run is over; return whether the run finished.
@@ -62,7 +62,8 @@ class Evaluator:
             "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
         )
         environment = spec.environment.as_evaluated()
-        environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
+        count = environments_for(episodes, environment)
+        environments = make_environments(environment, count, wrap=self._config.wrap, for_evaluation=True)
         try:
             due = time.monotonic() + interval
             for number in itertools.count():
@@ -84,7 +85,7 @@ class Evaluator:
         program = self._queries.program(welcome.run, snapshot.program)
         if program is None:
             return False
-        runtime = OnnxRuntime(program[1])
+        runtime = OnnxRuntime(program[1], self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
         evaluation = play_episodes(
