@@ -31,7 +31,7 @@ class Evaluator:
 
     def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
         """`stop` ends `run`, also in the middle of an episode."""
-        self._config = config
+        self._config, self._stop = config, stop
         self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
 

@@ -63,7 +63,7 @@ class ActorService:
         collector: Collector | None = None,
     ) -> None:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
-        self._config, self._transport = config, transport
+        self._config, self._transport, self._stop = config, transport, stop
         self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
@@ -110,8 +110,8 @@ class ActorService:
 
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
-        spaces, count = self._collector.prepare(welcome.spec)
         self._end.follow(welcome.run, welcome.learner_epoch)
+        spaces, count = self._collector.prepare(welcome.spec)
         self._feed.begin(welcome)
         self._declare_presence(welcome.run)
         join = replace(self._join, spaces=spaces, environments=count)
