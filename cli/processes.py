@@ -1,7 +1,9 @@
 """What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
+import contextlib
 import logging
 import os
+import resource
 import signal
 import sys
 import threading
@@ -11,6 +13,23 @@ import traceback
 _logger = logging.getLogger(__name__)
 
 _STUCK_SECONDS = 4.0  # a process ends within 5 s of a signal
+
+
+_MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
+
+
+def raise_descriptor_limit() -> None:
+    """Raise the limit of open file descriptors to the hard limit: each connection of a listener uses one.
+
+    Without this, about a thousand connections would use up the usual limit, and no checkpoint could be written.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    for limit in (hard, _MACOS_DESCRIPTORS):
+        if soft in (limit, resource.RLIM_INFINITY):
+            return
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+            return
 
 
 def stop_on_signals() -> threading.Event:

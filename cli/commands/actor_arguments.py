@@ -11,7 +11,6 @@ from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials
-from daedalus.transport.security import authorization_hint
 
 DESCRIPTION = """\
 Plays environments and sends rollouts to a learner. An actor needs one address: the environment, the network and all
@@ -105,7 +104,6 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         runtime=arguments.runtime,
         wrap=arguments.wrap,
         link=arguments.link,
-        authorization_hint=authorization_hint(credentials),
         timeout=arguments.timeout,
     )
 

@@ -109,6 +109,7 @@ def _play(
         wrap=arguments.wrap,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,
+        for_evaluation=True,
     )
     try:
         if video is not None:

@@ -14,7 +14,7 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program_check import check_program
 from daedalus.policy.acting.program_session import ProgramSession
-from daedalus.policy.acting.sampling import SAMPLERS
+from daedalus.policy.acting.sampling import SAMPLERS, RandomSource
 
 OBSERVATIONS, STATE = "observations", "state"
 NEXT_STATE = "next_state"
@@ -37,7 +37,7 @@ class PolicyRuntime(Protocol):
         ...
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Choose one action for each observation: a sample if `random` is given, otherwise the most probable.
 
@@ -117,7 +117,7 @@ class OnnxRuntime:
             self._feed = bound
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
         self._feed[OBSERVATIONS] = observations

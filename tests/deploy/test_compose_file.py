@@ -1,5 +1,6 @@
 """Test of docker-compose.yml and the files that it mounts. `make test-compose` starts the containers."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,8 @@ import pytest
 import yaml
 import zenoh
 from commands import check
+
+from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 ROOT = Path(__file__).parents[2]
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -94,4 +97,6 @@ def test_zenoh_reads_the_configuration_of_the_router() -> None:
     configuration = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
     assert configuration.get_json("mode") == '"router"'
     assert configuration.get_json("listen/endpoints") == '["tcp/0.0.0.0:7447"]'
-    assert configuration.get_json("transport/link/tx/lease") == "2000"
+    settings = session_settings("router", [], [], {}, Capacity())
+    written = {path: json.loads(configuration.get_json(path)) for path in settings if path.startswith("transport/")}
+    assert written == {path: settings[path] for path in written}

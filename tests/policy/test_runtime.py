@@ -24,7 +24,7 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     program_hash,
 )
-from daedalus.policy.acting.sampling import LOGITS
+from daedalus.policy.acting.sampling import LOGITS, RandomSource
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 
@@ -56,7 +56,7 @@ def generator() -> np.random.Generator:
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
 @pytest.mark.parametrize("rows", [1, 17])
 def test_both_runtimes_choose_the_same_actions(
-    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
+    policy: Policy, rows: int, random: Callable[[], RandomSource | None]
 ) -> None:
     both = policy.runtimes()
     for seed in (0, 1):  # also after weights are replaced
