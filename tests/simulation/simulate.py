@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
+from types import ModuleType
 from typing import Any
 
 from daedalus.actor.session import service
@@ -70,12 +71,13 @@ def simulate(seed: int) -> Result:
     )
 
 
-def _services() -> list[Any]:
+def services() -> list[ModuleType]:
+    """Return the modules of the services, whose threads and time are simulated."""
     return [module for name, module in list(sys.modules.items()) if name.startswith(_PATCHED)]
 
 
 def _fine_files() -> frozenset[str]:
-    return frozenset(str(module.__file__) for module in _services())
+    return frozenset(str(module.__file__) for module in services())
 
 
 @contextlib.contextmanager
@@ -96,7 +98,7 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     }
     if not settings.real_codec:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
-    for module in _services():
+    for module in services():
         for attribute, value in list(vars(module).items()):
             if id(value) in replacements or attribute in constants:
                 replaced.append((module, attribute, value))
