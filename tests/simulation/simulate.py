@@ -87,6 +87,7 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
         "_HEARTBEAT_SECONDS": settings.heartbeat_seconds,
         "HEARTBEAT_SECONDS": settings.heartbeat_seconds,
         "_PATIENCE_SECONDS": settings.patience_seconds,
+        "PART_BYTES": 64,  # so that a compact snapshot has several parts
     }
     replaced: list[tuple[Any, str, Any]] = []
     fakes = primitives.modules(kernel)
