@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
+# Reasons for actors.
+_FINISHED, _STOPPED = "the learner has finished", "the learner was stopped"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
@@ -41,6 +44,7 @@ class Outcome:
 
     solved: bool
     finished: bool  # solved or out of budget; False if the run was stopped before
+    saved: bool  # whether the last checkpoint was saved, or there was nothing to save
     seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
 
 
@@ -115,14 +119,15 @@ class LearnerService:
 
             spaces = self._server.await_spaces(self._stop)
             if spaces is None:
-                return Outcome(solved=False, finished=False, seconds_to_target=None)
+                _logger.info("stopped before the first actor joined")
+                return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
             learner = Learner(self._spec.training, self._spec.policy, spaces)
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
             return self._learn(learner, self._checkpointer(learner))
         finally:
-            self._close_server()
+            self._server.close(_STOPPED)  # unless it is closed
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
         """Publish the policy and return its checkpointer."""
@@ -144,22 +149,35 @@ class LearnerService:
         )
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer") -> Outcome:
-        """Run the main loop, then write the last metrics row, checkpoint and summary."""
+        """Run the main loop, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
+        finished, saved = False, None
         try:
             seconds_to_target = self._loop(learner, checkpointer, recorder)
+            finished = self._is_finished(seconds_to_target)
         finally:
             ended = time.monotonic()
-            self._close_server()
+            self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
             recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
             recorder.close()
-            checkpointer.save()
+            saved = checkpointer.save()
         solved = seconds_to_target is not None
-        out_of_budget = self._counters.env_steps >= self._spec.training.env_steps
-        finished = out_of_budget or (solved and self._spec.training.stop_when_solved)
         self._write_summary(solved, finished, seconds_to_target, ended)
-        return Outcome(solved=solved, finished=finished, seconds_to_target=seconds_to_target)
+        env_steps = f"{self._counters.env_steps:,} env_steps"
+        if finished:
+            self._server.await_departures(self._stop)
+        elif saved is not None:
+            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
+        else:
+            _logger.error("stopped; the checkpoint at %s could not be saved: %s", env_steps, self._health.save_fault)
+        return Outcome(solved=solved, finished=finished, saved=saved is not None, seconds_to_target=seconds_to_target)
+
+    def _is_finished(self, seconds_to_target: float | None) -> bool:
+        """Return whether the run is over, rather than stopped."""
+        training = self._spec.training
+        solved = seconds_to_target is not None
+        return self._counters.env_steps >= training.env_steps or (solved and training.stop_when_solved)
 
     def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
         """Train until the run ends. Return the seconds until the target was reached, or None if it was not."""
@@ -201,10 +219,6 @@ class LearnerService:
             _logger.warning("update skipped: %s; the weights are unchanged", fault)
         self._health.gradient_fault = fault
         self._counters.updates_skipped += skipped
-
-    def _close_server(self) -> None:
-        stopped = self._stop.is_set()
-        self._server.close("the learner was stopped" if stopped else "the learner has finished")
 
     def _status(self) -> RunStatus:
         return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())

@@ -43,6 +43,11 @@ def snapshots(run: str) -> str:
     return f"daedalus/{run}/snapshots"
 
 
+def run_end(run: str) -> str:
+    """Return the key where the learner publishes that it ends."""
+    return f"daedalus/{run}/end"
+
+
 def presence(run: str, actor: str, incarnation: int | str) -> str:
     """Return the liveliness token of one incarnation of an actor (`*` for all)."""
     return f"daedalus/{run}/actors/{actor}/{incarnation}"

@@ -234,9 +234,14 @@ class EvaluationReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnded:
-    """The run is over and actors end. Learner -> actors, on `snapshots`."""
+    """The learner ends. Learner -> actors and evaluators, on `end`.
+
+    finished: the run is over, and actors leave.
+    stopped: the run is not over, and actors wait for the learner to return.
+    """
 
     learner_epoch: int
+    outcome: Literal["finished", "stopped"]
     reason: str
 
 

@@ -73,15 +73,16 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 
 
 def _actors_rules() -> list[dict[str, Any]]:
-    """Return the rules of every actor: query `join`, programs, snapshots; subscribe to snapshots; watch the learner."""
+    """Return the rules of every actor: query `join`, programs, snapshots; subscribe; watch the learner."""
     queried = [keys.join(_RUN), keys.program(_RUN, "*"), keys.snapshots(_RUN)]
+    published = [keys.snapshots(_RUN), keys.run_end(_RUN)]
     served = [*queried, keys.rollouts(_RUN, "*"), keys.evaluations(_RUN, "*")]
     return [
         _rule("actors query", ["ingress"], ["query"], queried),
         _rule("actors receive replies", ["egress"], ["reply"], queried),
         _rule("actors discover queryables", ["egress"], ["declare_queryable"], served),
-        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], [keys.snapshots(_RUN)]),
-        _rule("actors receive snapshots", ["egress"], ["put"], [keys.snapshots(_RUN)]),
+        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], published),
+        _rule("actors receive publications", ["egress"], ["put"], published),
         _rule(
             "actors watch the learner",
             ["ingress"],

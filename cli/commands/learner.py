@@ -1,7 +1,8 @@
 """`daedalus learner`: construct one learner and run it.
 
-Exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped early, 2 bad usage.
+Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
+learner that a signal stopped exits with processes.STOPPED.
 """
 
 import argparse
@@ -14,7 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, raise_descriptor_limit, stop_on_signals
+from daedalus.cli.processes import (
+    STOPPED,
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    raise_descriptor_limit,
+    stop_on_signals,
+)
 from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_to_resume
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -74,11 +81,13 @@ def main() -> int:
     except (TransportError, DamagedError, CredentialsError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
+    stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
-        return FAILED
+        return stopped
     try:
         _announce(run, arguments)
-        return _train(run, transport, stop, progress, arguments.started or started, restored)
+        outcome = _train(run, transport, stop, progress, arguments.started or started, restored)
+        return _status(outcome, run.spec, stopped)
     except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -142,8 +151,8 @@ def _train(
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
-) -> int:
-    """Run the learner to its end and return the exit status."""
+) -> Outcome:
+    """Run the learner to its end."""
     directory = run.directory
     service = LearnerService(
         run.spec,
@@ -155,7 +164,7 @@ def _train(
         started=started,
         restored=restored,
     )
-    return _status(service.run(), run.spec)
+    return service.run()
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
@@ -171,10 +180,10 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
-def _status(outcome: Outcome, spec: RunSpec) -> int:
-    """Return the exit status for the end of a run."""
+def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
+    """Return the exit status for the end of a run; `stopped` is that of a run that was stopped."""
     if not outcome.finished:
-        return FAILED
+        return stopped if outcome.saved else FAILED
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED
 

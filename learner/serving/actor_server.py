@@ -8,6 +8,7 @@
 The learner's thread takes batches and publishes snapshots. Network threads never wait for an update.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -23,13 +24,15 @@ from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, JOIN_LIMITS, SNAPSHOT_REQUEST_LIMITS, Limits
-from daedalus.protocol.messages import Refusal, StatusReport
+from daedalus.protocol.messages import Refusal, RunEnded, StatusReport
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
+_LEAVE_SECONDS = 5.0  # after the end of the run, for the actors to leave
+_REPEAT_SECONDS = 0.5  # between repetitions of the message that the run is over
 _HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
 _logger = logging.getLogger(__name__)
@@ -63,8 +66,8 @@ class ActorServer:
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
-        self._run, self._transport, self._status = run, transport, status
-        self._closed = False
+        self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
+        self._ended = b""  # the encoded RunEnded, after the end
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
@@ -108,18 +111,43 @@ class ActorServer:
 
         self._transport.serve(key, handle)
 
-    def close(self, reason: str) -> None:
-        """Publish the end of the run with `reason`, and stop to serve. Idempotent."""
+    def close(self, reason: str, *, finished: bool = False) -> None:
+        """Publish that the learner ends, and stop the threads. The first call decides.
+
+        Until the transport is closed, every query is still answered: that the run is over, or that the learner stops.
+        """
         with self.lock:
-            if self._closed:
+            if self._ended:
                 return
-            self._closed = True
-            self.rollouts.end()
+            self._ended = encode(
+                RunEnded(learner_epoch=self._epoch, outcome="finished" if finished else "stopped", reason=reason)
+            )
+        self._responses.end(self._ended, finished=finished)
+        self._publish_end()
+        with self.lock:
+            self.rollouts.end(finished=finished)
             self.lock.notify_all()
-        self.publisher.close(reason)
-        self.evaluations.close(reason)
+        self.publisher.close()
+        self.evaluations.end(reason, finished=finished)
         self._watchdog.close()
         self.rollouts.close()
+
+    def _publish_end(self) -> None:
+        with contextlib.suppress(TransportError):  # the session is being replaced; actors receive a repetition
+            self._transport.publish(keys.run_end(self._run), self._ended)
+
+    def await_departures(self, stop: threading.Event) -> None:
+        """Wait until all actors have left, at most 5 s, and repeat that the run is over. Call after `close`."""
+        now = time.monotonic()
+        deadline, repeat_at = now + _LEAVE_SECONDS, now + _REPEAT_SECONDS
+        while (now := time.monotonic()) < deadline and not stop.is_set():
+            with self.lock:
+                if not self.fleet.live:
+                    return
+                self.lock.wait(HEARTBEAT_SECONDS)
+            if now >= repeat_at:
+                self._publish_end()
+                repeat_at = now + _REPEAT_SECONDS
 
     def await_spaces(self, stop: threading.Event) -> Spaces | None:
         """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first."""

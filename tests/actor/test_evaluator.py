@@ -12,9 +12,7 @@ from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol.messages import (
     Join,
-    Message,
     Refusal,
-    RunEnded,
 )
 from daedalus.transport.memory import MemoryNetwork
 
@@ -147,13 +145,8 @@ def test_evaluator_ends_after_its_timeout_without_a_learner(network: MemoryNetwo
 # ---------------------------------------------------------------------------------------------------- its end
 
 
-@pytest.mark.parametrize(
-    "answer", [RunEnded(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
-)
-def test_evaluator_ends_when_the_run_is_over(
-    learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message
-) -> None:
-    learner.give(answer)
+def test_evaluator_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+    learner.give(Refusal(code="finished", reason="solved"))
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "the run is over"

@@ -206,7 +206,7 @@ def test_full_evaluation_queue_makes_room_by_dropping_messages_of_the_owner_with
     [
         b"",
         b"\xff" * 100,
-        encode(RunEnded(learner_epoch=EPOCH, reason="")),
+        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
         encode(EvaluationRequest(evaluator="f")),
         encode(EvaluationRequest(evaluator="")),
     ],
@@ -238,14 +238,15 @@ def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer
     assert codes(evaluator) == ["malformed"]
 
 
-def test_waiting_and_later_evaluator_messages_are_refused_as_finished_after_close(
-    server: ActorServer, evaluator: FakeEvaluator
+@pytest.mark.parametrize("finished", [True, False])
+def test_waiting_and_later_evaluator_messages_are_refused_after_close(
+    server: ActorServer, evaluator: FakeEvaluator, finished: bool
 ) -> None:
     offer_policy(server)
     evaluator.send(encode(EvaluationRequest(evaluator="e")))
-    server.close("solved")
+    server.close("solved", finished=finished)
     evaluator.send(encode(REPORT))
-    assert codes(evaluator) == ["finished", "finished"]
+    assert codes(evaluator) == ["finished" if finished else "not_ready"] * 2
 
 
 def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, network: MemoryNetwork) -> None:

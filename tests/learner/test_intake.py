@@ -113,7 +113,10 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
     assert_rejected(
-        harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "the message is not a rollout"
+        harness,
+        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
+        "malformed",
+        "the message is not a rollout",
     )
 
 

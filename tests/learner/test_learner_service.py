@@ -6,6 +6,7 @@ import json
 import re
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -214,9 +215,9 @@ class HangingCollector(EnvironmentCollector):
         super().__init__()
         self._responds = responds
 
-    def collect(self, identity: RolloutIdentity) -> Rollout:
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout:
         assert self._responds.wait(LIMIT)
-        return super().collect(identity)
+        return super().collect(identity, on_row)
 
 
 def test_actor_whose_environment_hangs_does_not_hold_the_updates_of_a2c(

@@ -103,7 +103,7 @@ MESSAGES: dict[str, Message] = {
         returns=np.array([1.0, 2.5], np.float32),
         lengths=np.array([10, 20], np.int32),
     ),
-    "run_ended": RunEnded(learner_epoch=9, reason="the learner has finished"),
+    "run_ended": RunEnded(learner_epoch=9, outcome="finished", reason="the learner has finished"),
     "status_report": StatusReport(
         status=RunStatus(
             run="r",

@@ -211,7 +211,9 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
-    RunEnded: st.builds(RunEnded, learner_epoch=counters, reason=text),
+    RunEnded: st.builds(
+        RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
+    ),
     StatusReport: st.builds(StatusReport, status=statuses),
 }
 messages = st.one_of(*KINDS.values())

@@ -104,8 +104,10 @@ class LearnerProcess:
         except TransportError as error:
             self.kernel.log("failed", self.process.name, str(error))
         finally:
-            server.close("the learner was stopped" if self.stop.is_set() else "the learner has finished")
+            server.close("the learner ends", finished=self.is_finished)
             self._check(server, counters, before)
+            if self.is_finished:
+                server.await_departures(self.stop)  # type: ignore[arg-type] - a simulated Event
             self.link.close()
         self._end()
 
