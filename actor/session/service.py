@@ -63,7 +63,7 @@ class ActorService:
         collector: Collector | None = None,
     ) -> None:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
-        self._config, self._transport = config, transport
+        self._config, self._transport, self._stop = config, transport, stop
         self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()

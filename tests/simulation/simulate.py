@@ -155,7 +155,7 @@ def _end(world: World) -> None:
     kernel, learner = world.kernel, world.learner
     world.supervised = False
     if world.settings.ends_by == "finish":
-        learner.is_finished = True
+        learner.is_finished = world.ledger.is_finished = True
         end = kernel.now + _END_SECONDS
         while world.running:
             left = [actor.process.name for actor in world.running]
