@@ -155,10 +155,11 @@ def _end(world: World) -> None:
     kernel, learner = world.kernel, world.learner
     world.supervised = False
     if world.settings.ends_by == "finish":
+        fleet = {} if learner.server is None else learner.server.fleet.actors
+        joined = [actor for actor in world.running if fleet[actor.name].incarnation == actor.incarnation]
         learner.is_finished = world.ledger.is_finished = True
         end = kernel.now + _END_SECONDS
-        while world.running:
-            left = [actor.process.name for actor in world.running]
+        while left := [actor.process.name for actor in joined if not actor.outcome]:
             world.ledger.require(kernel.now < end, left, f"did not end {_END_SECONDS:g} s after the end of the run")
             kernel.sleep(0.1)
     for actor in world.running:
