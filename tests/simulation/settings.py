@@ -125,7 +125,7 @@ def _weather(random: Random) -> Weather:
 def _faults(random: Random, seconds: float) -> tuple[tuple[float, str, float], ...]:
     kinds = random.sample(FAULTS, random.randint(1, 4))
     if random.random() < 0.4:
-        kinds.append(random.choice(("kill learner", "stop learner")))
+        kinds.append(random.choice(("kill learner", "stop learner", "twin")))
     count = random.choice((0, 1, 2, 4, 8))
     drawn = [
         (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0))) for _ in range(count)
