@@ -16,6 +16,7 @@ from daedalus.cli.child_output import INHERITED, Streams
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
+from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
 
 _logger = logging.getLogger(__name__)
@@ -39,7 +40,10 @@ class RunStoppedError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalRun:
-    """Settings of one run on this machine. Its directory and config.toml exist already."""
+    """Settings of one run on this machine. Its directory and config.toml exist already.
+
+    The processes import the modules that the specification names: the caller has checked that the user allows them.
+    """
 
     directory: Path
     spec: RunSpec
@@ -48,7 +52,6 @@ class LocalRun:
     listen: str | None = None  # address for actors of other hosts, in addition to a free port of this machine
     tls: Path | None = None
     insecure: bool = False
-    wrap: str | None = None  # module:function that wraps each environment of this machine's actors
     log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
     log_json: bool = False
 
@@ -121,7 +124,7 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     """Return the options of this machine's actors and of the evaluator."""
     # The learner reports the progress of all actors: the records of each one are for debugging.
     level = "debug" if run.log_level == "debug" else "warning"
-    return *_logging_options(level, run.log_json), *(["--wrap", run.wrap] if run.wrap else [])
+    return *_logging_options(level, run.log_json), *allow_settings(run.spec.environment.user_modules)
 
 
 def _addresses(run: LocalRun) -> tuple[list[str], str]:
@@ -141,6 +144,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -
         since = run.started if first else time.monotonic()
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
         arguments += _logging_options(run.log_level, run.log_json)
+        arguments += allow_settings(run.spec.policy.user_modules)
         if run.resume or not first:
             arguments.append("--resume")
         return start("daedalus.cli.commands.learner", *arguments, streams=streams)
@@ -186,7 +190,7 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = IN
     """
     began = time.monotonic()
     options = ["--episodes", str(run.spec.evaluation.final_episodes), *_logging_options(run.log_level, run.log_json)]
-    options += ["--wrap", run.wrap] if run.wrap else []
+    options += allow_settings(run.spec.environment.user_modules)
     chosen = select_best(run.directory, run.spec, options, stopping, streams)
     (evaluation,) = play([[str(run.directory), *options]], stopping, streams)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)

@@ -74,7 +74,7 @@ def train(
     Raises SettingsError for invalid settings, TrainingError if a process failed.
     """
     started = time.monotonic()
-    chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors)
+    chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap)
     for path, value in (settings or {}).items():
         try:
             assign(chosen, path, value)
@@ -83,7 +83,7 @@ def train(
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     run_directory.create(directory, spec)
-    end = _run(LocalRun(directory=directory, spec=spec, started=started, wrap=wrap), quiet)
+    end = _run(LocalRun(directory=directory, spec=spec, started=started), quiet)
     return _result(directory, end)
 
 

@@ -21,6 +21,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.protocol.spec import RunSpec
@@ -58,6 +59,7 @@ class LearnerService:
         *,
         started: float,
         restored: "Checkpoint | None" = None,
+        modules: UserModules = NO_MODULES,
     ) -> None:
         """Construct the service.
 
@@ -70,9 +72,10 @@ class LearnerService:
           open_writers: functions that open the metrics writers.
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
+          modules: modules that may be imported for the policy.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
-        self._open_writers, self._restored = open_writers, restored
+        self._open_writers, self._restored, self._modules = open_writers, restored, modules
         self._counters = RunCounters(spec.training.target_episodes)
         if restored is not None:
             self._counters.restore(restored.counters)
@@ -115,7 +118,7 @@ class LearnerService:
             spaces = self._server.await_spaces(self._stop)
             if spaces is None:
                 return Outcome(solved=False, finished=False, seconds_to_target=None)
-            learner = Learner(self._spec.training, self._spec.policy, spaces)
+            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)

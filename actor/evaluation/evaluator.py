@@ -57,7 +57,9 @@ class Evaluator:
             "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
         )
         environment = spec.environment.as_evaluated()
-        environments = make_environments(environment, environments_for(episodes, environment), wrap=self._config.wrap)
+        environments = make_environments(
+            environment, environments_for(episodes, environment), modules=self._config.modules
+        )
         try:
             due = time.monotonic() + interval
             for number in itertools.count():

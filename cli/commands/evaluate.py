@@ -17,6 +17,7 @@ from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
+from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
@@ -24,6 +25,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
 from daedalus.protocol.spec import EnvironmentSpec
 
 _PROGRESS_SECONDS = 5.0
@@ -37,7 +39,8 @@ class _StoppedError(Exception):
 
 def main(command_line: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
     """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage."""
-    arguments = parser().parse_args(command_line)
+    words = sys.argv[1:] if command_line is None else command_line
+    arguments = parser().parse_args(words)
     configure_logging(
         arguments.log_level,
         as_json=arguments.log_json,
@@ -54,6 +57,9 @@ def main(command_line: Sequence[str] | None = None, stop: threading.Event | None
         exit_with_parent(stop)
     try:
         result = _evaluate(arguments, stop)
+    except ModuleNotAllowedError as error:
+        print(f"daedalus evaluate: {allowing(error, ['daedalus', 'evaluate', *words])}", file=sys.stderr)
+        return 2
     except (_StoppedError, DamagedError, NoPolicyError, EnvironmentSetupError, PolicyError, VideoError) as error:
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
@@ -66,16 +72,17 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
     """Return the result of the evaluation that the arguments describe."""
     directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
     policy = find_policy(directory, arguments.newest)
-    spec = _environment(policy, arguments)
+    spec, modules = _environment(policy, arguments), _modules(policy, arguments)
+    modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
     progress = _Progress(sys.stderr, arguments.episodes, stop)
     filmed: dict[str, Any] = {}
     try:
         if arguments.video is None:
-            evaluation = _play(policy, spec, arguments, seed, progress, None)
+            evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
         else:
             with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
-                evaluation = _play(policy, spec, arguments, seed, progress, video)
+                evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
             filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
     finally:
         progress.end()
@@ -85,6 +92,8 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
     """Return the environment to play: that of the training, on the backend of the evaluation."""
     trained = policy.spec.environment
+    if arguments.wrap is not None:
+        trained = trained.model_copy(update={"wrap": None if arguments.wrap == "none" else arguments.wrap})
     watched = arguments.video is not None or arguments.render
     backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
     if watched:
@@ -93,9 +102,16 @@ def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> Environm
     return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
 
 
+def _modules(policy: SavedPolicy, arguments: argparse.Namespace) -> UserModules:
+    """Return the modules that the command line allows, with that of its own --wrap."""
+    own = {module_of(arguments.wrap)} if arguments.wrap not in (None, "none") else set()
+    return UserModules(frozenset({*arguments.allow_module, *own}), f"the run of {policy.directory}")
+
+
 def _play(
     policy: SavedPolicy,
     spec: EnvironmentSpec,
+    modules: UserModules,
     arguments: argparse.Namespace,
     seed: int,
     progress: "_Progress",
@@ -106,7 +122,7 @@ def _play(
     environments = make_environments(
         spec,
         1 if watched else min(arguments.envs or environments_for(episodes, spec), episodes),
-        wrap=arguments.wrap,
+        modules=modules,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,
     )

@@ -3,6 +3,7 @@
 import os
 
 import numpy as np
+from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 
 from daedalus.actor.environments.make import make_environments
@@ -64,7 +65,7 @@ def one_by_one(episodes: int) -> list[tuple[float, int]]:
 
 def test_each_environment_plays_its_share_of_whole_episodes() -> None:
     """Episodes last 3, 2, 1, 3, ... steps in each environment; by hand: 0+1+2, 10+11, 20, 30+31+32."""
-    environments = make_environments(COUNTING, 2)
+    environments = make_environments(COUNTING, 2, modules=TEST_MODULES)
     evaluation = play_episodes(AlwaysZero(), environments, 7, 1, sampled=False)
     # the first environment plays four, the second three
     assert sorted(evaluation.returns.tolist()) == [3, 3, 20, 20, 21, 21, 93]
@@ -72,7 +73,7 @@ def test_each_environment_plays_its_share_of_whole_episodes() -> None:
 
 
 def test_stacks_and_memory_equal_those_of_episodes_played_one_by_one() -> None:
-    environments = make_environments(COUNTING.model_copy(update={"frame_stack": 4}), 3)
+    environments = make_environments(COUNTING.model_copy(update={"frame_stack": 4}), 3, modules=TEST_MODULES)
     evaluation = play_episodes(Remembering(), environments, 20, 1, sampled=False)
     expected = one_by_one(7) + one_by_one(7) + one_by_one(6)
     returns = [round(float(value), 3) for value in evaluation.returns]
@@ -93,7 +94,7 @@ def test_short_episodes_are_not_favoured() -> None:
 
 def test_progress_is_reported_after_every_step() -> None:
     reports: list[tuple[int, float]] = []
-    environments = make_environments(COUNTING, 2)
+    environments = make_environments(COUNTING, 2, modules=TEST_MODULES)
     evaluation = play_episodes(
         AlwaysZero(),
         environments,

@@ -39,7 +39,7 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]
 
     def run(*words: object) -> dict[str, Any]:
         capsys.readouterr()
-        status = main([*map(str, words), "--json"])
+        status = main([*map(str, words), "--json", "--allow-module", "counting_environment"])
         captured = capsys.readouterr()
         assert status == 0, captured.err
         return json.loads(captured.out)
@@ -123,7 +123,7 @@ def test_a_damaged_best_checkpoint_is_reported_and_the_newest_is_used(
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1, 2)
     (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
-    assert main([str(run), "--episodes", "1"]) == 0
+    assert main([str(run), "--episodes", "1", "--allow-module", "counting_environment"]) == 0
     captured = capsys.readouterr()
     assert "skipped a damaged checkpoint" in captured.err
     assert "best_3.0_0000000001" in captured.err
@@ -164,6 +164,32 @@ def test_spaces_that_differ_from_those_of_the_policy_are_reported(tmp_path: Path
 def test_the_option_wrap_imports_the_users_function(tmp_path: Path, refused: Callable[..., str]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     assert "no_such_module" in refused(1, run, "--episodes", 1, "--wrap", "no_such_module:function")
+    assert "--wrap is f: write MODULE:FUNCTION, or none" in refused(2, run, "--wrap", "f")
+
+
+def test_a_module_that_only_the_run_names_is_refused_with_the_command_that_allows_it(
+    tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    run = save(tmp_path / "run", COUNTING, 1)
+    assert refused(2, run, "--episodes", 3) == (
+        f"daedalus evaluate: the run of {run}/checkpoints/0000000001 asks for "
+        "environment.id=counting_environment:Counting-v0, but the module counting_environment may not be imported "
+        f"here; if you trust that code, type: daedalus evaluate {run} --episodes 3 --allow-module counting_environment"
+    )
+
+
+def test_the_wrapper_of_the_run_is_used_unless_the_option_names_another(
+    tmp_path: Path, evaluate: Callable[..., dict], refused: Callable[..., str]
+) -> None:
+    wrap = "picture_environment:with_doubled_rewards"
+    run = save(tmp_path / "run", CARTPOLE.model_copy(update={"wrap": wrap}), 1)
+    options = ("--episodes", 1, "--seed", 3)
+    assert "but the module picture_environment may not be imported here" in refused(2, run, *options)
+    doubled = evaluate(run, *options, "--allow-module", "picture_environment")
+    plain = evaluate(run, *options, "--wrap", "none")
+    assert doubled["return_mean"] == 2 * plain["return_mean"] > 0
+    own = evaluate(save(tmp_path / "plain", CARTPOLE, 1), *options, "--wrap", wrap)
+    assert own["return_mean"] == doubled["return_mean"]
 
 
 # ------------------------------------------------------------------------------------------------ video and window
@@ -323,7 +349,8 @@ def test_progress_is_written_to_standard_error(
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
     monkeypatch.setattr("daedalus.cli.commands.evaluate._PROGRESS_SECONDS", 0.0)
-    assert main([str(run), "--json", "--episodes", "2", "--envs", "1"]) == 0
+    options = ["--json", "--episodes", "2", "--envs", "1", "--allow-module", "counting_environment"]
+    assert main([str(run), *options]) == 0
     captured = capsys.readouterr()
     lines = captured.err.splitlines()
     assert lines[0] == "evaluation: 0 of 2 episodes"
