@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.child_output import INHERITED, Streams
+from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
@@ -64,7 +64,9 @@ class RunEnd:
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 
-def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> RunEnd:
+def run_locally(
+    run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
+) -> RunEnd:
     """Train until the target or the end of the budget, then evaluate the best checkpoint.
 
     No child process is left when this returns or raises.
@@ -72,32 +74,34 @@ def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INH
     Args:
       run: what to run.
       stopping: ends the run early when it is set.
-      streams: where the child processes write.
+      output: reads what the actors and the evaluations write.
+      learner_streams: where the learner writes its log and its progress.
 
     Raises RunFailedError or RunStoppedError.
     """
     try:
-        status = _train(run, stopping, streams)
+        status = _train(run, stopping, output, learner_streams)
         if stopping.is_set():
             raise RunStoppedError
         if status not in _FINISHED:
             raise RunFailedError(status=status)
-        return RunEnd(status=status, summary=evaluate_run(run, stopping, streams))
+        return RunEnd(status=status, summary=evaluate_run(run, stopping, output))
     except (FailedError, EvaluationFailedError) as error:
         if stopping.is_set():
             raise RunStoppedError from None
-        raise RunFailedError(str(error)) from None
+        unshown = output.unshown(error.name) if isinstance(error, FailedError) else []
+        raise RunFailedError("\n".join([*unshown, str(error)])) from None
 
 
-def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
+def _train(run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
     spec, options = run.spec, _actor_options(run)
     listening, address = _addresses(run)
-    learner = _supervised_learner(run, listening, streams)
+    learner = _supervised_learner(run, listening, learner_streams)
     actors: list[Supervised] = []
     try:
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
-        actors += [supervised_actor(name, address, options, streams) for name in names]
+        actors += [supervised_actor(name, address, options, output.pipes) for name in names]
         training = spec.training
         _logger.info(
             "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
@@ -110,7 +114,7 @@ def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
             run.directory,
         )
         if spec.evaluation.seconds is not None:
-            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), streams))
+            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
         return watch(learner, actors, spec, stopping)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
@@ -137,7 +141,7 @@ def _addresses(run: LocalRun) -> tuple[list[str], str]:
     return [*listening, *(["--insecure"] if run.insecure else [])], own
 
 
-def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -> Supervised:
+def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenStreams) -> Supervised:
     """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
@@ -147,7 +151,8 @@ def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -
         arguments += allow_settings(run.spec.policy.user_modules)
         if run.resume or not first:
             arguments.append("--resume")
-        return start("daedalus.cli.commands.learner", *arguments, streams=streams)
+        with open_streams("learner") as streams:
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 
@@ -183,7 +188,7 @@ def _warn(message: str | None) -> None:
         _logger.warning("%s", message)
 
 
-def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> dict[str, Any]:
+def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
     Raises EvaluationFailedError.
@@ -191,8 +196,8 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = IN
     began = time.monotonic()
     options = ["--episodes", str(run.spec.evaluation.final_episodes), *_logging_options(run.log_level, run.log_json)]
     options += allow_settings(run.spec.environment.user_modules)
-    chosen = select_best(run.directory, run.spec, options, stopping, streams)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, streams)
+    chosen = select_best(run.directory, run.spec, options, stopping, output)
+    (evaluation,) = play([[str(run.directory), *options]], stopping, output)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]

@@ -2,10 +2,12 @@
 
 import argparse
 import json
+import os
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from typing import Any, TextIO
 
 import gymnasium
@@ -37,8 +39,17 @@ class _StoppedError(Exception):
     """Error of an evaluation that was stopped before its last episode ended."""
 
 
-def main(command_line: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
-    """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage."""
+def main(
+    command_line: Sequence[str] | None = None, stop: threading.Event | None = None, output: TextIO | None = None
+) -> int:
+    """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage.
+
+    Args:
+      command_line: the words after `daedalus evaluate`; default: those of this process.
+      stop: ends the evaluation.
+      output: receives the result, and nothing else (default: standard output).
+    """
+    output = output or sys.stdout
     words = sys.argv[1:] if command_line is None else command_line
     arguments = parser().parse_args(words)
     configure_logging(
@@ -56,7 +67,8 @@ def main(command_line: Sequence[str] | None = None, stop: threading.Event | None
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        result = _evaluate(arguments, stop)
+        with redirect_stdout(sys.stderr):  # the environment may print
+            result = _evaluate(arguments, stop)
     except ModuleNotAllowedError as error:
         print(f"daedalus evaluate: {allowing(error, ['daedalus', 'evaluate', *words])}", file=sys.stderr)
         return 2
@@ -64,8 +76,18 @@ def main(command_line: Sequence[str] | None = None, stop: threading.Event | None
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
-    print(json.dumps(result) if arguments.json else _text(result))
+    print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
     return 0
+
+
+def _reserved_stdout() -> TextIO:
+    """Return standard output for the result alone: whatever else this process prints goes to standard error.
+
+    This includes libraries that are not Python's, and the processes of environments.
+    """
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return result
 
 
 def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
@@ -220,4 +242,4 @@ class _Progress:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main(stop=stop_on_signals()))
+    sys.exit(main(stop=stop_on_signals(), output=_reserved_stdout()))

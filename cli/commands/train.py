@@ -4,9 +4,10 @@ import argparse
 import importlib.util
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allowing, command_parser
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
@@ -133,11 +134,10 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
         log_level=parsed.log_level,
         log_json=parsed.log_json,
     )
-    # The learner rewrites a line of progress on the same terminal: a record replaces this line.
-    clear = "\r\x1b[K" if sys.stdout.isatty() else ""
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=lambda line: print(f"{clear}{line}", flush=True))
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     try:
-        end = run_locally(run, stop_on_signals())
+        with ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err) as output:
+            end = run_locally(run, stop_on_signals(), output)
     except RunStoppedError:
         options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
         print(f"stopped; continue with: daedalus resume {directory}{options}")
@@ -148,6 +148,19 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
         return error.status
     print(_report(run, end.summary))
     return end.status
+
+
+def _print_out(line: str) -> None:
+    _print_line(line, sys.stdout)
+
+
+def _print_err(line: str) -> None:
+    _print_line(line, sys.stderr)
+
+
+def _print_line(line: str, stream: TextIO) -> None:
+    """Print a line in place of the line of progress that the learner rewrites on the same terminal."""
+    print(f"\r\x1b[K{line}" if stream.isatty() else line, file=stream, flush=True)
 
 
 def _report(run: LocalRun, summary: dict[str, Any]) -> str:

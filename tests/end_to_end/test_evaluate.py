@@ -5,7 +5,7 @@ import itertools
 import json
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from processes import Running, processes_mentioning
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands import train as train_command
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.local_run import LocalRun, evaluate_run
@@ -284,8 +285,14 @@ def test_the_pretrained_car_racing_policy_drives(evaluate: Callable[..., dict]) 
 # ------------------------------------------------------------------------------------------------ after training
 
 
+@pytest.fixture
+def output(tmp_path: Path) -> Iterator[ChildOutput]:
+    with ChildOutput(tmp_path / "output.log", lambda _: None, lambda _: None) as output:
+        yield output
+
+
 def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
-    tmp_path: Path,
+    tmp_path: Path, output: ChildOutput
 ) -> None:
     settings = {"final_episodes": 3, "final_backend": "envpool"}
     run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation=settings)
@@ -294,7 +301,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event())
+    summary = evaluate_run(local_run, threading.Event(), output)
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
@@ -307,7 +314,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
 
 
 def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evaluation(
-    tmp_path: Path, evaluate: Callable[..., dict]
+    tmp_path: Path, evaluate: Callable[..., dict], output: ChildOutput
 ) -> None:
     run = tmp_path / "run"
     for version in (1, 2, 3):
@@ -317,7 +324,7 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
     newest = max(version for version in (1, 2, 3) if version != worst)
-    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event())
+    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), output)
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
@@ -331,13 +338,13 @@ def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:
     return evaluate(run / "checkpoints" / f"{version:010d}", "--episodes", 20)["return_mean"]
 
 
-def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path) -> None:
+def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path, output: ChildOutput) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
     stopping.set()
     with pytest.raises(EvaluationFailedError):
-        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping)
+        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping, output)
     assert not processes_mentioning(str(run))
 
 
