@@ -3,7 +3,7 @@
 #
 #   docker build --target actor --tag daedalus-actor .
 #   docker build --target learner --tag daedalus-learner .
-ARG BASE=python:3.11-slim
+ARG BASE=python:3.11.14-slim-bookworm
 
 # A virtual environment without pip: the images hold only what the processes need.
 FROM ${BASE} AS build

@@ -29,7 +29,7 @@ from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
-from daedalus.transport.security import authorization_hint, credentials_to_connect
+from daedalus.transport.security import credentials_to_connect
 
 
 class Client:
@@ -68,7 +68,6 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
-            authorization_hint=authorization_hint(credentials),
         )
         self._stop = threading.Event()
         self._collector = ClientCollector(observation_space, action_space)

@@ -5,6 +5,8 @@ from typing import Literal
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+_MAX_LOG_RATIO = 20.0  # a ratio of 5e8: beyond it the exponential overflows, and the gradient is not a number
+
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of `values` [T, B] where `valid` [T, B] (float, 1 or 0) is 1, or 0 without valid rows."""
@@ -47,7 +49,7 @@ def clipped_policy_loss(log_ratios: Tensor, advantages: Tensor, valid: Tensor, c
       valid: [T, B], float, 1 or 0.
       clip_range: c.
     """
-    ratios = log_ratios.exp()
+    ratios = log_ratios.clamp(max=_MAX_LOG_RATIO).exp()
     constants = advantages.detach()
     clipped = ratios.clamp(1.0 - clip_range, 1.0 + clip_range)
     return -masked_mean((ratios * constants).minimum(clipped * constants), valid)

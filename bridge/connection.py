@@ -8,83 +8,68 @@ If the connection or the transport ends, the other is closed too: the client's p
 """
 
 import contextlib
-import select
 import socket
 import threading
 from collections import deque
 from collections.abc import Callable
 
 from daedalus.bridge.budget import QueryBudget
-from daedalus.bridge.packets import (
-    GREETING,
-    HEADER_BYTES,
-    MAX_ANSWER_BYTES,
-    Kind,
-    Packet,
-    PacketError,
-    check_key,
-    encode_packet,
-    fits_packet,
-    read_header,
-)
+from daedalus.bridge.clients import MAX_CLIENTS, ClientTable
+from daedalus.bridge.packet_socket import PacketSocket
+from daedalus.bridge.packets import MAX_ANSWER_BYTES, Kind, Packet, PacketError, fits_packet
 from daedalus.transport.interface import Inbox, Transport, TransportError
 
-STALL_SECONDS = 30.0  # a client that stalls for longer, or stops within a packet, is disconnected
 _MAX_DECLARATIONS = 64  # of FOLLOW, WATCH and ANNOUNCE by one client
+_MAX_FOLLOWED = 8  # the network keeps the newest value of each followed key in memory
 _MAX_CHANGES = 1024  # presence changes that wait for a slow client
-_CHUNK_BYTES = 64 << 10  # allocate memory for bytes received, not for bytes declared
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))  # detects a host that vanished
 
 
 class ClientConnection:
     """Serves one client from `run` until the connection ends."""
 
-    def __init__(self, connection: socket.socket, open_transport: Callable[[], Transport]) -> None:
-        self._connection = connection
+    def __init__(
+        self, connection: socket.socket, open_transport: Callable[[], Transport], clients: ClientTable
+    ) -> None:
+        self._socket = PacketSocket(connection)
         self._open_transport = open_transport
+        self._clients = clients
         self._transport: Transport | None = None
         self._budget = QueryBudget()
-        self._sending = threading.Lock()
-        self._changed = threading.Condition()  # guards the next five attributes
+        self._changed = threading.Condition()  # guards the next six attributes
         self._closed = False
+        self._reason = ""  # why the bridge ended the connection
         self._declared = 0
         self._inboxes: dict[int, tuple[str, Inbox]] = {}  # by the number of the FOLLOW packet
         self._fresh: set[int] = set()  # numbers whose inbox may hold a new value
         self._changes: deque[Packet] = deque()
 
     def run(self) -> str:
-        """Serve the client until it disconnects, `close` is called, or it breaks the protocol.
+        """Serve the client until it disconnects, `close` or `drop` is called, or it breaks the protocol.
 
         Returns the reason for which the bridge ended the connection; empty if the client disconnected.
         """
         try:
-            self._connection.settimeout(STALL_SECONDS)
-            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            for name, value in _KEEP_ALIVE:
-                if hasattr(socket, name):
-                    self._connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-            self._connection.sendall(GREETING)
-            if self._read(len(GREETING), begun=True) != GREETING:
-                return "the client uses another protocol"
-            transport = self._open_transport()
-            if not self._keep(transport):
-                return ""
-            threading.Thread(target=self._send_news, name="bridge-news", daemon=True).start()
-            while (packet := self._next()) is not None:
-                self._perform(transport, packet)
-            return ""
+            if self._socket.greet():
+                self._serve()
         except (PacketError, TransportError) as error:
+            self._reason = self._reason or str(error)
             with contextlib.suppress(OSError):
-                self._send(Packet(Kind.ERROR, 0, payload=str(error).encode()))
-            return str(error)
+                self._socket.send(Packet(Kind.ERROR, 0, payload=str(error).encode()))
         except ConnectionError:
-            return ""  # the client disconnected with packets unread
+            pass  # the client disconnected with packets unread
         except OSError as error:
-            return "" if self._closed else f"{error}"
+            self._reason = self._reason or ("" if self._closed else f"{error}")
         finally:
             self.close()
-            self._connection.close()
+            self._clients.remove(self)
+            self._socket.close()
+        return self._reason
+
+    def drop(self, reason: str) -> None:
+        """See Client: the client thread then closes the rest."""
+        with self._changed:
+            self._reason = self._reason or reason
+        self._socket.shut_down()
 
     def close(self) -> None:
         """Close the connection and the transport. Safe from any thread; idempotent."""
@@ -93,8 +78,7 @@ class ClientConnection:
             transport, self._transport = self._transport, None
             self._changed.notify_all()
         self._budget.close()
-        with contextlib.suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RDWR)
+        self._socket.shut_down()
         if transport is not None:
             transport.close()
 
@@ -109,40 +93,20 @@ class ClientConnection:
 
     # ---------------------------------------------------------------------------------------- client thread
 
-    def _next(self) -> Packet | None:
-        """Return the next packet, or None if the client disconnected between two packets."""
-        head = self._read(HEADER_BYTES, begun=False)
-        if not head:
-            return None
-        header = read_header(head)
-        key = check_key(self._read(header.key_bytes, begun=True), header.kind)
-        payload = self._read(header.payload_bytes, begun=True)
-        return Packet(header.kind, header.number, key, header.timeout, payload)
-
-    def _read(self, size: int, *, begun: bool) -> bytes:
-        """Return exactly `size` bytes.
-
-        Returns b"" if the client disconnects before the first byte and the packet was not `begun`. Raises PacketError
-        if the client stalls or disconnects within a packet.
-        """
-        data = bytearray()
-        while len(data) < size:
-            try:
-                chunk = self._connection.recv(min(size - len(data), _CHUNK_BYTES))
-            except TimeoutError:
-                if data or begun:
-                    raise PacketError(f"the client sent nothing for {STALL_SECONDS:g} s within a packet") from None
-                continue  # the client is idle between packets
-            if not chunk and (data or begun):
-                raise PacketError("the client disconnected within a packet")
-            if not chunk:
-                return b""
-            data += chunk
-        return bytes(data)
+    def _serve(self) -> None:
+        if not self._clients.admit(self):
+            raise PacketError(f"{MAX_CLIENTS} clients are connected already: try again later")
+        transport = self._open_transport()
+        if not self._keep(transport):
+            return
+        threading.Thread(target=self._send_news, name="bridge-news", daemon=True).start()
+        while (packet := self._socket.next(lambda size: self._clients.hold(self, size))) is not None:
+            self._clients.heard(self)
+            self._perform(transport, packet)
 
     def _perform(self, transport: Transport, packet: Packet) -> None:
         if packet.kind == Kind.QUERY:
-            if not self._budget.take(len(packet.payload), self._has_gone):
+            if not self._budget.take(len(packet.payload), self._socket.has_gone):
                 raise ConnectionAbortedError
             threading.Thread(target=self._run_query, args=(transport, packet), name="bridge-query", daemon=True).start()
             return
@@ -154,34 +118,32 @@ class ClientConnection:
             transport.declare_presence(packet.key)
         elif packet.kind == Kind.WATCH:
             transport.watch_presence(packet.key, lambda key, present: self._on_presence(number, key, present))
+        elif len(self._inboxes) >= _MAX_FOLLOWED:
+            raise PacketError(f"the client followed more than {_MAX_FOLLOWED} keys")
         else:
             inbox = transport.subscribe(packet.key, lambda: self._on_news(number))
             with self._changed:
                 self._inboxes[number] = packet.key, inbox
             self._on_news(number)  # values that arrived before the inbox had its number
 
-    def _has_gone(self) -> bool:
-        """Return whether the client closed its end, even if bytes that it sent before are still unread."""
-        poll = select.poll()
-        poll.register(self._connection, getattr(select, "POLLRDHUP", 0))
-        return bool(poll.poll(0))
-
     # ---------------------------------------------------------------------------------------- query threads
 
     def _run_query(self, transport: Transport, packet: Packet) -> None:
+        held = len(packet.payload)
         try:
-            for answer in transport.query(packet.key, packet.payload, timeout=packet.timeout):
+            answers = transport.query(packet.key, packet.payload, timeout=packet.timeout)
+            size = sum(map(len, answers))
+            self._clients.hold(self, size)
+            held += size
+            for answer in answers:
                 if len(answer) <= MAX_ANSWER_BYTES:
-                    self._send(Packet(Kind.ANSWER, packet.number, payload=answer))
-            self._send(Packet(Kind.END, packet.number))
+                    self._socket.send(Packet(Kind.ANSWER, packet.number, payload=answer))
+            self._socket.send(Packet(Kind.END, packet.number))
         except (OSError, TransportError):
             self.close()  # the connection or the transport has failed
         finally:
+            self._clients.release(self, held)
             self._budget.give_back(len(packet.payload))
-
-    def _send(self, packet: Packet) -> None:
-        with self._sending:
-            self._connection.sendall(encode_packet(packet))
 
     # ------------------------------------------------------------------ callbacks on the transport's threads
 
@@ -198,31 +160,30 @@ class ClientConnection:
             too_slow = len(self._changes) > _MAX_CHANGES
             self._changed.notify_all()
         if too_slow:
-            with contextlib.suppress(OSError):
-                self._connection.shutdown(socket.SHUT_RDWR)  # wakes the client thread, which closes the rest
+            self.drop(f"it did not read {_MAX_CHANGES} changes of presence")
 
     # ------------------------------------------------------------------------------------------ news thread
 
     def _send_news(self) -> None:
         try:
-            while (packets := self._await_news()) is not None:
-                for packet in packets:
-                    self._send(packet)
+            while (packet := self._await_news()) is not None:
+                self._clients.hold(self, len(packet.payload))
+                self._socket.send(packet)
+                self._clients.release(self, len(packet.payload))
         except OSError:
             self.close()
 
-    def _await_news(self) -> list[Packet] | None:
-        """Wait for news and return it as packets; return None when the connection is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._fresh or self._changes)
-            if self._closed:
-                return None
-            packets = list(self._changes)
-            self._changes.clear()
-            followed = [(number, *self._inboxes[number]) for number in self._fresh if number in self._inboxes]
-            self._fresh.clear()
-        for number, key, inbox in followed:
-            value = inbox.take()
+    def _await_news(self) -> Packet | None:
+        """Wait for news and return one packet, changes of presence first; return None when the connection is closed."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._fresh or self._changes)
+                if self._closed:
+                    return None
+                if self._changes:
+                    return self._changes.popleft()
+                number = self._fresh.pop()
+                key, inbox = self._inboxes.get(number, ("", None))
+            value = None if inbox is None else inbox.take()
             if value is not None and len(value) <= MAX_ANSWER_BYTES:
-                packets.append(Packet(Kind.NEWS, number, key, payload=value))
-        return packets
+                return Packet(Kind.NEWS, number, key, payload=value)

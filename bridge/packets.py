@@ -71,8 +71,13 @@ class Header(NamedTuple):
 
 def encode_packet(packet: Packet) -> bytes:
     """Return the bytes of a packet."""
+    return encode_head(packet) + packet.payload
+
+
+def encode_head(packet: Packet) -> bytes:
+    """Return the bytes of a packet before its payload."""
     key, milliseconds = packet.key.encode("ascii"), round(packet.timeout * 1000)
-    return _HEADER.pack(len(packet.payload), packet.kind, len(key), milliseconds, packet.number) + key + packet.payload
+    return _HEADER.pack(len(packet.payload), packet.kind, len(key), milliseconds, packet.number) + key
 
 
 def fits_packet(key: str) -> bool:

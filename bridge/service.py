@@ -6,12 +6,12 @@ import socket
 import threading
 from collections.abc import Callable
 
+from daedalus.bridge.clients import ClientTable
 from daedalus.bridge.connection import ClientConnection
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
-_MAX_CLIENTS = 64  # at once
 _HEARTBEAT_SECONDS = 0.2  # between checks of the stop event
 _END_SECONDS = 4.0  # for all clients to end after a stop
 
@@ -22,6 +22,7 @@ class Bridge:
     def __init__(self, listener: socket.socket, open_transport: Callable[[], Transport]) -> None:
         self._listener = listener
         self._open_transport = open_transport
+        self._table = ClientTable()
         self._clients: dict[ClientConnection, threading.Thread] = {}
 
     def run(self, stop: threading.Event) -> None:
@@ -29,8 +30,12 @@ class Bridge:
         self._listener.settimeout(_HEARTBEAT_SECONDS)
         try:
             while not stop.is_set():
-                with contextlib.suppress(TimeoutError, ConnectionError):
-                    self._accept(*self._listener.accept())
+                try:
+                    with contextlib.suppress(TimeoutError, ConnectionError):
+                        self._accept(*self._listener.accept())
+                except OSError as error:  # such as too many open files, which end with their connections
+                    _logger.warning("cannot accept a connection: %s", error)
+                    stop.wait(_HEARTBEAT_SECONDS)
                 self._clients = {client: thread for client, thread in self._clients.items() if thread.is_alive()}
         finally:
             self._listener.close()
@@ -41,11 +46,8 @@ class Bridge:
 
     def _accept(self, connection: socket.socket, address: tuple[str, int]) -> None:
         name = f"{address[0]}:{address[1]}"
-        if len(self._clients) >= _MAX_CLIENTS:
-            connection.close()
-            _logger.warning("refused %s: %d clients are connected already", name, _MAX_CLIENTS)
-            return
-        client = ClientConnection(connection, self._open_transport)
+        client = ClientConnection(connection, self._open_transport, self._table)
+        self._table.connect(client)
         thread = threading.Thread(target=self._serve, args=(client, name), name="bridge-client", daemon=True)
         self._clients[client] = thread
         thread.start()

@@ -1,4 +1,4 @@
-"""A certificate authority in a folder: creates keys and signs certificates (X.509, P-256).
+"""Certificate authorities, each in a folder: they create keys and sign certificates (X.509, P-256).
 
 No other file imports `cryptography`.
 """
@@ -6,7 +6,7 @@ No other file imports `cryptography`.
 import datetime
 import ipaddress
 import os
-import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
@@ -16,6 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from daedalus.transport.credentials import CA, CERTIFICATE, KEY, CredentialsError
 
+_HOSTS = x509.SubjectAlternativeName
 _CLOCK_SKEW = datetime.timedelta(hours=1)  # allowed between the clocks of two hosts
 
 
@@ -36,10 +37,10 @@ class CertificateAuthority:
         self._directory, self._key = directory, key
 
     @classmethod
-    def create(cls, directory: Path, lifetime: datetime.timedelta) -> "CertificateAuthority":
-        """Create a CA in a folder that does not exist yet."""
+    def create(cls, directory: Path, common_name: str, lifetime: datetime.timedelta) -> "CertificateAuthority":
+        """Create a CA with a name in a folder that does not exist yet."""
         key = ec.generate_private_key(ec.SECP256R1())
-        name = _x509_name("Daedalus CA")
+        name = _x509_name(common_name)
         builder = _builder(name, name, key, lifetime).add_extension(x509.BasicConstraints(True, 0), critical=True)
         builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
         directory.mkdir(parents=True)
@@ -48,7 +49,10 @@ class CertificateAuthority:
         return cls(directory)
 
     def issue(self, folder: Path, common_name: str, hosts: list[str], lifetime: datetime.timedelta) -> None:
-        """Write certificate, key and ca.pem into a folder. With `hosts`, it is also for listening."""
+        """Write a key and its certificate, followed by that of this CA, into a folder.
+
+        With `hosts`, the certificate is for listening at these names and addresses too.
+        """
         key = ec.generate_private_key(ec.SECP256R1())
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
         builder = _builder(_x509_name(common_name), self._certificate.subject, key, lifetime)
@@ -59,12 +63,35 @@ class CertificateAuthority:
             x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
         )
         if hosts:
-            builder = builder.add_extension(x509.SubjectAlternativeName([_alternative_name(h) for h in hosts]), False)
+            builder = builder.add_extension(_HOSTS([_alternative_name(h) for h in hosts]), False)
         certificate = builder.sign(self._key, hashes.SHA256())
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder / KEY, _pem(key))
-        _write(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
-        shutil.copyfile(self._directory / CA, folder / CA)
+        chain = [each.public_bytes(serialization.Encoding.PEM) for each in (certificate, self._certificate)]
+        _write(folder / CERTIFICATE, b"".join(chain))
+
+
+@dataclass(frozen=True, slots=True)
+class Issued:
+    """What a certificate states."""
+
+    common_name: str
+    expires: datetime.datetime
+    hosts: list[str]  # names and addresses for which it may listen
+
+
+def read_issued(path: Path) -> Issued:
+    """Return what the certificate in a file states. Raises CredentialsError."""
+    try:
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError):
+        raise CredentialsError(f"{path} is not a certificate: issue it again") from None
+    (name,) = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    try:
+        hosts = [str(host.value) for host in certificate.extensions.get_extension_for_class(_HOSTS).value]
+    except x509.ExtensionNotFound:
+        hosts = []
+    return Issued(str(name.value), certificate.not_valid_after_utc, hosts)
 
 
 def _builder(
@@ -115,7 +142,9 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file that only its owner may read."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    """Write or replace a file that only its owner may read. Readers see the old or the new file."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with open(descriptor, "wb") as file:
         file.write(data)
+    os.replace(partial, path)

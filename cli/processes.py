@@ -1,7 +1,9 @@
 """What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
+import contextlib
 import logging
 import os
+import resource
 import signal
 import sys
 import threading
@@ -10,20 +12,65 @@ import traceback
 
 _logger = logging.getLogger(__name__)
 
+_STUCK_SECONDS = 4.0  # a process ends within 5 s of a signal
+
+
+_MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
+
+
+def raise_descriptor_limit() -> None:
+    """Raise the limit of open file descriptors to the hard limit: each connection of a listener uses one.
+
+    Without this, about a thousand connections would use up the usual limit, and no checkpoint could be written.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    for limit in (hard, _MACOS_DESCRIPTORS):
+        if soft in (limit, resource.RLIM_INFINITY):
+            return
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+            return
+
 
 def stop_on_signals() -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
-    The signal handlers only set the event, so that the process closes its resources before it ends.
+    The signal handlers only set the event, so that the process closes its resources before it ends. A thread sets it
+    too: Python calls no handler while the main thread runs native code, such as a simulator or a policy.
     """
     stop = threading.Event()
 
     def handle(_number: int, _frame: object) -> None:
         stop.set()
 
+    def watch() -> None:
+        while number := os.read(reader, 1):
+            if number[0] in (signal.SIGTERM, signal.SIGINT):
+                stop.set()
+
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
+    os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
+    threading.Thread(target=watch, name="signals", daemon=True).start()
     return stop
+
+
+def exit_if_stuck(stop: threading.Event) -> None:
+    """End the process with status 1 if it still runs `_STUCK_SECONDS` after `stop`: a native call does not return."""
+
+    def watch() -> None:
+        stop.wait()
+        time.sleep(_STUCK_SECONDS)
+        try:
+            _logger.error("the process still runs %g s after it was asked to stop: it ends now", _STUCK_SECONDS)
+            sys.stdout.flush()
+        finally:
+            os._exit(1)
+
+    threading.Thread(target=watch, name="stuck-watch", daemon=True).start()
 
 
 def exit_with_parent(stop: threading.Event) -> None:

@@ -20,13 +20,13 @@ from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
+from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
-from daedalus.transport.interface import Request, Transport
+from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
@@ -92,6 +92,7 @@ class LearnerService:
             start_version=restored.policy.policy_version if restored else 0,
             spaces=restored.policy.spaces if restored else None,
         )
+        self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
             directory.name,
             spec,
@@ -176,8 +177,7 @@ class LearnerService:
                 seconds_to_target = self._reporter.wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
-            for request, message in self._server.evaluations.take():
-                self._serve_evaluator(request, message, learner, checkpointer)
+            self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             if now >= log_at:
                 recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
@@ -190,44 +190,20 @@ class LearnerService:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
         progress = self._counters.env_steps / self._spec.training.env_steps
         rollouts = self._server.rollouts.take_batch(learner.policy_version)
+        self._health.left_out = self._server.rollouts.left_out
         if not rollouts:
             return
         skipped = learner.updates_skipped
-        learner.step(rollouts, progress)
+        at_fault = learner.step(rollouts, progress)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
+        self._server.rollouts.count_trained(rollouts, at_fault)
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
+        fault = _gradient_fault(at_fault) if skipped else ""
         if skipped and not self._health.gradient_fault:
-            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
-        self._health.gradient_fault = skipped > 0
+            _logger.warning("update skipped: %s; the weights are unchanged", fault)
+        self._health.gradient_fault = fault
         self._counters.updates_skipped += skipped
-
-    def _serve_evaluator(
-        self,
-        request: Request,
-        message: EvaluationRequest | EvaluationReport,
-        learner: "Learner",
-        checkpointer: "Checkpointer",
-    ) -> None:
-        """Record the report of an evaluator, or answer its request with the newest policy.
-
-        The evaluated policy is saved as a checkpoint first, because it may turn out to be the best.
-        """
-        if isinstance(message, EvaluationReport):
-            answer, text = self._evaluations.report(message)
-            request.reply(encode(answer))
-            if text:
-                _logger.info(text)
-            return
-        directory = checkpointer.save()
-        if directory is None:
-            request.reply(encode(Refusal(code="not_ready", reason="the checkpoint of the policy could not be saved")))
-            return
-        publisher, version = self._server.publisher, learner.policy_version
-        if version != publisher.version:
-            publisher.publish(version, learner.weights())
-        self._evaluations.begin(message.evaluator, directory, version, self._counters.env_steps)
-        request.reply(publisher.newest())
 
     def _close_server(self) -> None:
         stopped = self._stop.is_set()
@@ -242,3 +218,9 @@ class LearnerService:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
             _logger.warning("summary not written: %s", error.strerror)
+
+
+def _gradient_fault(at_fault: list[Rollout]) -> str:
+    """Return why an update was skipped, with the senders of the rollouts that are at fault."""
+    senders = sorted({rollout.identity.actor for rollout in at_fault})
+    return "the gradient is not finite" + (f" with rollouts of {', '.join(senders[:5])}" if senders else "")

@@ -1,6 +1,8 @@
 """Functions that return every key expression. All keys are under `daedalus/{run}/`."""
 
 import re
+from collections import Counter
+from collections.abc import Iterable
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -65,3 +67,18 @@ def status(run: str) -> str:
 def last_chunk(key: str) -> str:
     """Return the last chunk: the actor's name in a rollouts key, the evaluator's in an evaluations key."""
     return key.rsplit("/", 1)[-1]
+
+
+def owner(name: str) -> str:
+    """Return the part of a name before the first dot: a certificate for NAME serves NAME and NAME.anything."""
+    return name.split(".", 1)[0]
+
+
+def first_of_largest_owner(names: Iterable[str]) -> str:
+    """Return the first of the names of the owner that has the most.
+
+    Where room is limited, this name makes room for another: no owner can then push out the others.
+    """
+    names = list(names)
+    largest = Counter(map(owner, names)).most_common(1)[0][0]
+    return next(name for name in names if owner(name) == largest)

@@ -6,6 +6,8 @@ spec and are computed by the learner (learner/serving/intake.py).
 
 from dataclasses import dataclass
 
+_PREFIX_BYTES = 32  # of every message, with the padding of the header, rounded up
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
@@ -20,6 +22,11 @@ class Limits:
     max_bytes: int = 64 << 20
     max_header_bytes: int = 256 << 10
     max_arrays: int = 4096
+
+    @property
+    def message_bytes(self) -> int:
+        """Largest size of an encoded message, in bytes."""
+        return self.max_bytes + self.max_header_bytes + _PREFIX_BYTES
 
 
 # Read by the learner; a larger message is malformed.

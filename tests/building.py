@@ -60,7 +60,7 @@ def make_rollout(
     ends = int(np.count_nonzero(terminated | truncated))
     content: dict[str, Any] = {
         "frames": random.standard_normal((stack + rows, environments, *shape), np.float32),
-        "initial_state": random.standard_normal((environments, state_size), np.float32),
+        "initial_state": np.tanh(random.standard_normal((environments, state_size), np.float32)),
         "actions": random.integers(0, SPACES.action.count, cells, np.uint8),
         "behaviour_log_probs": -random.uniform(0.5, 2.5, cells).astype(np.float32),
         "rewards": random.standard_normal(cells, np.float32),

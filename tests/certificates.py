@@ -1,6 +1,7 @@
 """Certificates for tests: a CA, and certificates for each role."""
 
 import datetime
+import shutil
 from pathlib import Path
 
 from daedalus.cli.certificate_authority import CertificateAuthority
@@ -20,9 +21,10 @@ def issue_expired(directory: Path, role: str, name: str = "") -> Path:
     """Create a folder whose certificate expired yesterday, and return it."""
     folder = directory / f"expired-{role}"
     hosts = [] if name else ["localhost", "127.0.0.1"]
-    authority = CertificateAuthority(directory / "ca")
+    authority = CertificateAuthority(directory / "ca" / f"{role}-{name}" if name else directory / "ca")
     authority.issue(folder, common_name(role, name), hosts, -datetime.timedelta(days=1))
-    (folder / "names.json").write_text('{"actors": ["arm", "box"], "operators": ["operator"]}')
+    shutil.copyfile(directory / "ca" / "ca.pem", folder / "ca.pem")
+    shutil.copyfile(directory / "router" / "clients.pem", folder / "clients.pem")
     return folder
 
 

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect, listen
@@ -20,6 +21,8 @@ def connect_with_retry(
     stop: threading.Event,
     timeout: float | None = None,
     credentials: Credentials | None = None,
+    *,
+    max_message_bytes: int = LEARNER_LIMITS.message_bytes,
 ) -> Transport | None:
     """Retry `connect` until it succeeds, and log once that it waits; return None if `stop` is set first.
 
@@ -29,7 +32,7 @@ def connect_with_retry(
     pause, logged = _FIRST_PAUSE_SECONDS, False
     while True:
         try:
-            return connect(endpoints, credentials)
+            return connect(endpoints, credentials, max_message_bytes=max_message_bytes)
         except RefusedError:
             raise
         except TransportError as error:

@@ -1,24 +1,33 @@
-"""The folder given by `--tls`: a certificate, its key and the CA that both ends trust; and diagnoses of failures.
+"""The folder given by `--tls`: a certificate, its key, and the CA of those that listen.
 
     ca.pem  certificate.pem  key.pem      created by `daedalus certs`
-    names.json                            for a router or learner: the authorised actors and operators
+    clients.pem                           for a router or learner: the certificates of those that may connect
 
-Zenoh reports only that a link failed. So this file checks certificates before they are used, and explains a refused
-connection afterwards, by TLS handshakes of its own.
+clients.pem holds ca.pem and one issuer for each authorised actor and operator. The issuer's common name is its
+identity, and the only certificate that it signs is that of this identity: without the issuer in clients.pem, the
+certificate is worth nothing. Zenoh reports only that a link failed, so this file checks certificates before they are
+used.
 """
 
 import contextlib
-import json
-import socket
+import functools
+import logging
 import ssl
+import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from daedalus.transport.access_control import access_control
 
-CA, CERTIFICATE, KEY, NAMES = "ca.pem", "certificate.pem", "key.pem", "names.json"
-_PROBE_SECONDS = 3.0
+CA, CERTIFICATE, KEY, CLIENTS = "ca.pem", "certificate.pem", "key.pem", "clients.pem"
+WARNING_DAYS = 30  # before a certificate expires
+
+_NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which the module ssl does not name
+_DAY = 86_400.0
+
+
+_logger = logging.getLogger(__name__)
 
 
 class CredentialsError(Exception):
@@ -36,12 +45,12 @@ class Credentials:
     def settings(self, *, listens: bool) -> dict[str, Any]:
         """Return Zenoh's settings for mutual TLS and, if the session listens, for access control.
 
-        Raises CredentialsError if the session listens and names.json is not readable.
+        Raises CredentialsError if the session listens and clients.pem is not readable.
         """
         tls = "transport/link/tls"
         certificate, key = str(self.directory / CERTIFICATE), str(self.directory / KEY)
         settings: dict[str, Any] = {
-            f"{tls}/root_ca_certificate": str(self.directory / CA),
+            f"{tls}/root_ca_certificate": str(self.directory / (CLIENTS if listens else CA)),
             f"{tls}/enable_mtls": True,
             f"{tls}/connect_certificate": certificate,
             f"{tls}/connect_private_key": key,
@@ -49,8 +58,32 @@ class Credentials:
         }
         if listens:
             settings[f"{tls}/listen_certificate"], settings[f"{tls}/listen_private_key"] = certificate, key
-            settings["access_control"] = access_control(**read_names(self.directory))
+            settings["access_control"] = access_control(**authorised_names(self.directory))
         return settings
+
+    def days_left(self) -> float:
+        """Return the days until the certificate that is in the folder now expires; negative if it has expired.
+
+        Raises CredentialsError if the certificate is not readable.
+        """
+        try:
+            modified = (self.directory / CERTIFICATE).stat().st_mtime_ns
+        except OSError:
+            raise CredentialsError(f"{self.directory} has no {CERTIFICATE}") from None
+        return (_expiry(self.directory, modified) - time.time()) / _DAY
+
+    def warn_of_expiry(self) -> None:
+        """Log a warning if the certificate expires soon. Raises CredentialsError if it is not readable."""
+        days = self.days_left()
+        if 0 <= days < WARNING_DAYS:
+            _logger.warning(
+                "the certificate in %s expires in %d days: renew it (daedalus certs renew)", self.directory, days
+            )
+
+    def check_expiry(self) -> None:
+        """Raise CredentialsError if the certificate that is in the folder now has expired."""
+        if self.days_left() < 0:
+            raise CredentialsError(f"{self.directory}: {_expired(self.directory)}")
 
 
 def load(directory: Path, *roles: str) -> Credentials:
@@ -62,7 +95,7 @@ def load(directory: Path, *roles: str) -> Credentials:
     for name in (CA, CERTIFICATE, KEY):
         if not (directory / name).is_file():
             raise CredentialsError(f"{directory} has no {name}: create such a folder with `daedalus certs`")
-    subject = _verified_subject(directory)
+    subject = common_name_of(_verified(directory))
     role, _, name = subject.partition(":")
     if role not in roles:
         raise CredentialsError(
@@ -72,68 +105,27 @@ def load(directory: Path, *roles: str) -> Credentials:
     return Credentials(directory, role, name)
 
 
-def read_names(directory: Path) -> dict[str, list[str]]:
-    """Return the authorised names, `actors` and `operators`. Raises CredentialsError if names.json is not readable."""
+def authorised_names(directory: Path) -> dict[str, list[str]]:
+    """Return the `actors` and `operators` in clients.pem. Raises CredentialsError if it is not readable."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        names = json.loads((directory / NAMES).read_text("utf-8"))
-    except (OSError, ValueError):
-        raise CredentialsError(f"{directory} has no readable {NAMES}: create it with `daedalus certs`") from None
-    if not isinstance(names, dict) or set(names) != {"actors", "operators"}:
-        raise CredentialsError(f"{directory / NAMES} must have exactly the entries actors and operators")
-    return names
+        context.load_verify_locations(directory / CLIENTS)
+    except (OSError, ssl.SSLError):
+        raise CredentialsError(f"{directory} has no readable {CLIENTS}: create it with `daedalus certs`") from None
+    identities = [common_name_of(issuer).partition(":") for issuer in context.get_ca_certs()]
+    return {f"{role}s": sorted(name for kind, _, name in identities if kind == role) for role in ("actor", "operator")}
 
 
-class Diagnosis(NamedTuple):
-    """Why a connection failed."""
-
-    reason: str
-    is_final: bool  # retrying will not help
-
-
-def diagnose_connection(endpoint: str, credentials: Credentials | None) -> Diagnosis:
-    """Return why no connection to `endpoint` (PROTOCOL/HOST:PORT) can be made, from a connection attempt."""
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    try:
-        link = socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_SECONDS)
-    except socket.gaierror:
-        return Diagnosis(f"{host!r} cannot be resolved to an address: check the name", False)
-    except (OSError, ValueError):
-        return Diagnosis(f"nothing answers at {endpoint}", False)
-    with link:
-        if credentials is None or not endpoint.startswith("tls/"):
-            return Diagnosis(f"the service at {endpoint} uses another protocol, or requires --tls", False)
-        return _diagnose_refusal(link, host, endpoint, credentials)
+def common_name_of(certificate: dict[str, Any]) -> str:
+    """Return the common name of a certificate as the module ssl describes it."""
+    subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
+    return str(subject.get("commonName", ""))
 
 
-def _diagnose_refusal(link: socket.socket, host: str, endpoint: str, credentials: Credentials) -> Diagnosis:
-    context = ssl.create_default_context(cafile=str(credentials.directory / CA))
-    context.load_cert_chain(credentials.directory / CERTIFICATE, credentials.directory / KEY)
-    try:
-        with context.wrap_socket(link, server_hostname=host.strip("[]")) as secured:
-            secured.recv(1)  # with TLS 1.3 a server refuses a certificate only after the client's handshake is done
-    except ssl.SSLCertVerificationError as error:
-        reason = _with_remedy(error.verify_message)
-        return Diagnosis(f"the certificate of the service at {endpoint} cannot be verified: {reason}", True)
-    except ssl.SSLError as error:
-        if "alert" in str(error).lower():
-            return Diagnosis(
-                f"the service at {endpoint} refuses the certificate in {credentials.directory}: {_alert(error)}", True
-            )
-        return Diagnosis(f"the service at {endpoint} does not use TLS", False)
-    except OSError:
-        pass
-    return Diagnosis(f"the service at {endpoint} closed the connection", False)
-
-
-def _alert(error: ssl.SSLError) -> str:
-    reason = (error.reason or str(error)).lower().replace("_", " ")
-    return _with_remedy(reason.partition("alert ")[2] or reason)
-
-
-def _with_remedy(reason: str) -> str:
+def with_remedy(reason: str) -> str:
     """Return a reason given by OpenSSL, with what to do about it."""
     if "expired" in reason:
-        return f"{reason}: issue a new one (daedalus certs issue)"
+        return f"{reason}: renew it (daedalus certs renew)"
     if "issuer" in reason or "unknown ca" in reason or "self-signed" in reason or "decrypt error" in reason:
         return f"{reason}: the two ends use different CAs (ca.pem must be the same on both sides)"
     if "mismatch" in reason:
@@ -145,8 +137,19 @@ def _described(role: str, name: str) -> str:
     return f"{role} {name!r}" if name else role
 
 
-def _verified_subject(directory: Path) -> str:
-    """Return the common name of a certificate that fits its key, is valid now and is signed by its CA.
+def _expired(directory: Path) -> str:
+    ended = time.gmtime(_expiry(directory, (directory / CERTIFICATE).stat().st_mtime_ns))
+    return f"the certificate expired on {time.strftime('%Y-%m-%d', ended)}: renew it (daedalus certs renew)"
+
+
+@functools.lru_cache(maxsize=16)
+def _expiry(directory: Path, _modified: int) -> float:
+    """Return when a certificate expires, in seconds since 1970. The cache is for a file that does not change."""
+    return ssl.cert_time_to_seconds(str(_verified(directory, ignore_time=True)["notAfter"]))
+
+
+def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
+    """Return the description of a certificate that fits its key, is valid now and is signed by its CA.
 
     Verifies by a TLS handshake with itself in memory: on the network the same failure would have no explanation.
     Raises CredentialsError.
@@ -159,18 +162,21 @@ def _verified_subject(directory: Path) -> str:
             raise CredentialsError(f"{directory}: {KEY} is not the key of {CERTIFICATE}: copy both again") from None
         raise CredentialsError(f"{directory}: {CERTIFICATE} or {KEY} is damaged: copy both again") from None
     server.verify_mode = ssl.CERT_REQUIRED
+    if ignore_time:
+        server.verify_flags |= _NO_CHECK_TIME
     client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE  # only the client's certificate is verified
     client.load_cert_chain(directory / CERTIFICATE, directory / KEY)
     try:
         server.load_verify_locations(directory / CA)
-        certificate = _handshake(client, server)
+        server.load_verify_locations(directory / CERTIFICATE)  # with the issuer of an actor or operator
+        return _handshake(client, server)
     except ssl.SSLCertVerificationError as error:
-        raise CredentialsError(f"{directory}: {CERTIFICATE}: {_with_remedy(error.verify_message)}") from None
+        if "expired" in error.verify_message and not ignore_time:
+            raise CredentialsError(f"{directory}: {_expired(directory)}") from None
+        raise CredentialsError(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
     except ssl.SSLError:
         raise CredentialsError(f"{directory}: {CA} is damaged: copy it again") from None
-    subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
-    return str(subject.get("commonName", ""))
 
 
 def _handshake(client: ssl.SSLContext, server: ssl.SSLContext) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class MemoryNetwork:
         self.ends: list[MemoryTransport] = []
 
 
-def _matches(pattern: str, key: str) -> bool:
+def matches(pattern: str, key: str) -> bool:
     """Return whether two keys match; `*` on either side stands for one chunk."""
     left, right = pattern.split("/"), key.split("/")
     return len(left) == len(right) and all(a == b or "*" in (a, b) for a, b in zip(left, right, strict=True))
@@ -109,14 +109,14 @@ class MemoryTransport:
             (key if "*" in served else served, handler)
             for end in self._ends()
             for served, handler in end._served.items()
-            if _matches(served, key)
+            if matches(served, key)
         ]
 
     def publish(self, key: str, payload: bytes) -> None:
         """See Transport."""
         for end in self._ends():
             for inbox in end._inboxes:
-                if _matches(inbox.key, key):
+                if matches(inbox.key, key):
                     inbox.put(payload)
 
     def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
@@ -135,13 +135,13 @@ class MemoryTransport:
         self._watches.append((key, on_change))
         for end in self._ends():
             for declared in list(end._present_keys):
-                if _matches(key, declared):
+                if matches(key, declared):
                     on_change(declared, True)
 
     def _report(self, key: str, present: bool) -> None:
         for end in self._ends():
             for pattern, on_change in end._watches:
-                if _matches(pattern, key):
+                if matches(pattern, key):
                     on_change(key, present)
 
     def reopen(self, unless_served: str | None = None) -> bool:

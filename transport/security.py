@@ -18,13 +18,3 @@ def credentials_to_connect(endpoints: list[str], tls: Path | None, *roles: str) 
     """Return the certificate to connect with, or None without `tls`. Raises one of SECURITY_ERRORS."""
     check_connecting(endpoints, tls=tls is not None)
     return None if tls is None else load(tls, *roles)
-
-
-def authorization_hint(credentials: Credentials | None) -> str:
-    """Return a hint for an actor that finds no learner: a router drops unauthorised actors silently."""
-    if credentials is None:
-        return ""
-    return (
-        f"; is it running, and is the actor {credentials.name!r} authorised by it (or by its router)? "
-        "The list of authorised actors is read at start (daedalus certs issue)"
-    )

@@ -4,14 +4,16 @@ A session either embeds a full router that listens (the learner, by default) or 
 """
 
 import json
+import resource
 from collections.abc import Callable
 from typing import Literal
 
 import zenoh
 
-from daedalus.transport.credentials import Credentials, diagnose_connection
+from daedalus.transport.credentials import Credentials, CredentialsError
+from daedalus.transport.diagnosis import diagnose_connection
 from daedalus.transport.interface import AddressInUseError, RefusedError, TransportError
-from daedalus.transport.zenoh_settings import session_settings
+from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 OpenSession = Callable[[], zenoh.Session]
 
@@ -21,17 +23,23 @@ def session_opener(
     listen_on: list[str],
     connect_to: list[str],
     credentials: Credentials | None,
+    max_message_bytes: int,
 ) -> OpenSession:
     """Return a function that opens a session with these settings, each time a new one.
 
-    The function raises AddressInUseError, RefusedError or TransportError. Raises CredentialsError if the folder of
-    `credentials` does not list the authorised names and the session listens.
+    The session receives messages of at most `max_message_bytes`, and drops larger ones while they arrive.
+
+    The function raises AddressInUseError, RefusedError or TransportError, and CredentialsError if the folder of
+    `credentials` does not list the authorised names and the session listens. It reads the folder each time.
     """
-    config = zenoh.Config()
-    security = credentials.settings(listens=bool(listen_on)) if credentials else {}
-    settings = session_settings(mode, listen_on, connect_to, security)
+    capacity = Capacity(message_bytes=max_message_bytes, descriptors=_descriptors())
+    if credentials is not None:
+        credentials.warn_of_expiry()
 
     def open_session() -> zenoh.Session:
+        security = credentials.settings(listens=bool(listen_on)) if credentials else {}
+        settings = session_settings(mode, listen_on, connect_to, security, capacity)
+        config = zenoh.Config()
         try:
             for name, value in settings.items():
                 config.insert_json5(name, json.dumps(value))
@@ -40,6 +48,12 @@ def session_opener(
             raise _opening_error(str(error), listen_on, connect_to, credentials) from None
 
     return open_session
+
+
+def _descriptors() -> int:
+    """Return the number of file descriptors that this process may have open."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return Capacity.descriptors if soft == resource.RLIM_INFINITY else soft
 
 
 def _opening_error(
@@ -51,6 +65,11 @@ def _opening_error(
             "stop the process that listens there, or choose another address with --listen"
         )
     if connect_to:
+        if credentials is not None:
+            try:
+                credentials.check_expiry()
+            except CredentialsError as error:
+                return RefusedError(str(error))
         diagnoses = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]
         is_final = all(diagnosis.is_final for diagnosis in diagnoses)
         return (RefusedError if is_final else TransportError)("; ".join(diagnosis.reason for diagnosis in diagnoses))

@@ -7,35 +7,61 @@ Only the files named `zenoh_*.py` import Zenoh. What Zenoh needs of its user (me
 """
 
 import contextlib
+import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import zenoh
 
-from daedalus.transport.credentials import Credentials
+from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.transport.credentials import Credentials, CredentialsError
+from daedalus.transport.credentials_watch import CredentialsWatch
 from daedalus.transport.interface import Inbox, OnAnswer, Request, Transport, TransportError
 from daedalus.transport.zenoh_callbacks import Callbacks
+from daedalus.transport.zenoh_messages import ZenohInbox, ZenohRequest
 from daedalus.transport.zenoh_session import OpenSession, session_opener
+from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
+
+_logger = logging.getLogger(__name__)
 
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
+_RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
 
-def listen(endpoints: list[str], connect: list[str] | None = None, credentials: Credentials | None = None) -> Transport:
+def listen(
+    endpoints: list[str],
+    connect: list[str] | None = None,
+    credentials: Credentials | None = None,
+    *,
+    max_message_bytes: int = MAX_MESSAGE_BYTES,
+) -> Transport:
     """Open a router that listens on `endpoints` and connects to the routers at `connect`.
 
     Endpoints are `tcp/HOST:PORT` or `tls/HOST:PORT`. With `credentials` the router admits the names that their folder
-    lists, and connections over plain TCP.
+    lists, and connections over plain TCP; when a file of the folder changes, the session is renewed. The router drops
+    messages above `max_message_bytes`.
     Raises AddressInUseError, TransportError or CredentialsError.
     """
-    return ZenohTransport(session_opener("router", endpoints, connect or [], credentials), is_client=False)
+    opener = session_opener("router", endpoints, connect or [], credentials, max_message_bytes)
+    transport = ZenohTransport(opener, is_client=False)
+    if credentials is not None:
+        transport.watch(credentials)
+    return transport
 
 
-def connect(endpoints: list[str], credentials: Credentials | None = None) -> Transport:
-    """Open a client of the router at one of `endpoints`.
+def connect(
+    endpoints: list[str],
+    credentials: Credentials | None = None,
+    *,
+    max_message_bytes: int = LEARNER_LIMITS.message_bytes,
+) -> Transport:
+    """Open a client of the router at one of `endpoints`; it does not receive messages above `max_message_bytes`.
 
     Raises TransportError at once if none of them can be reached, RefusedError if retrying will not help.
     """
-    return ZenohTransport(session_opener("client", [], endpoints, credentials), is_client=True)
+    opener = session_opener("client", [], endpoints, credentials, max_message_bytes)
+    return ZenohTransport(opener, is_client=True)
 
 
 @contextlib.contextmanager
@@ -58,53 +84,6 @@ def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
 
-class _ZenohRequest:
-    """A query that Zenoh delivered; finalised as soon as it is answered or garbage-collected."""
-
-    __slots__ = ("_buffers", "_query", "key", "size")
-
-    def __init__(self, query: zenoh.Query, served: str) -> None:
-        self._query: zenoh.Query | None = query
-        self._buffers = query.payload
-        self.key = served if "*" in str(query.key_expr) else str(query.key_expr)
-        self.size = 0 if self._buffers is None else len(self._buffers)
-
-    @property
-    def payload(self) -> bytes:
-        return b"" if self._buffers is None else self._buffers.to_bytes()
-
-    def reply(self, payload: bytes) -> None:
-        query, self._query = self._query, None
-        if query is None:
-            return
-        try:
-            query.reply(self.key, payload)
-            query.drop()
-        except zenoh.ZError:
-            pass  # the sender of the query is gone, or our session is closing: nobody waits for this answer
-
-
-class _ZenohInbox:
-    """The newest unread value of one subscription, still in Zenoh's buffers."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._newest: zenoh.ZBytes | None = None
-        self.undeclare: Callable[[], None] = lambda: None
-
-    def put(self, payload: zenoh.ZBytes) -> None:
-        with self._lock:
-            self._newest = payload
-
-    def take(self) -> bytes | None:
-        with self._lock:
-            newest, self._newest = self._newest, None
-        return None if newest is None else newest.to_bytes()
-
-    def close(self) -> None:
-        self.undeclare()
-
-
 class ZenohTransport:
     """A Transport over one Zenoh session; `reopen` replaces the session and repeats the declarations."""
 
@@ -113,7 +92,7 @@ class ZenohTransport:
         self._open_session = open_session
         self._is_client = is_client
         self._session = open_session()
-        self._closed = False
+        self._closed = self._warned_of_size = False
         # Each declaration, to be repeated in a new session, and the object that it returned in the present session:
         # Zenoh undeclares that object when it is garbage-collected.
         self._declared: dict[Callable[[zenoh.Session], object], object] = {}
@@ -121,12 +100,13 @@ class ZenohTransport:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
         self._callbacks = Callbacks()
+        self._watch: CredentialsWatch | None = None
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
 
         def on_query(query: zenoh.Query) -> None:
-            handler(_ZenohRequest(query, key))
+            handler(ZenohRequest(query, key))
 
         with _as_transport_error(f"serve {key}"):
             self._declare(lambda session: session.declare_queryable(key, self._callbacks.hold(on_query), complete=True))
@@ -163,6 +143,14 @@ class ZenohTransport:
 
     def publish(self, key: str, payload: bytes) -> None:
         """See Transport."""
+        if self._is_client and len(payload) > MAX_MESSAGE_BYTES and not self._warned_of_size:
+            self._warned_of_size = True
+            _logger.warning(
+                "a snapshot has %.0f MiB: start the routers with a --max-message-megabytes above this size; "
+                "by default they drop messages above %d MiB",
+                len(payload) / 2**20,
+                MAX_MESSAGE_BYTES >> 20,
+            )
         with _as_transport_error(f"publish {key}"):
             self._publisher(key).put(payload)
 
@@ -181,7 +169,7 @@ class ZenohTransport:
 
     def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """See Transport."""
-        inbox = _ZenohInbox()
+        inbox = ZenohInbox()
 
         def on_sample(sample: zenoh.Sample) -> None:
             inbox.put(sample.payload)
@@ -235,8 +223,42 @@ class ZenohTransport:
         except TransportError:
             session.close()
             raise
+        if is_served:
+            session.close()
+            return False
+        return self._replace(session)
+
+    def watch(self, credentials: Credentials) -> None:
+        """Renew the session of a router whenever a file of its credentials changes.
+
+        Zenoh reads certificates and access control only when a session is opened. All peers lose their connection and
+        connect again, if they are still authorised.
+        """
+        self._watch = CredentialsWatch(credentials, self._renew)
+        self._watch.open()
+
+    def _renew(self) -> None:
+        """Close the session of a router, so that its address is free, and open another.
+
+        Raises TransportError or CredentialsError if that fails repeatedly.
+        """
+        self._session.close()
+        deadline = time.monotonic() + _RENEW_SECONDS
+        while not self._closed:
+            try:
+                session = self._open_session()
+            except (TransportError, CredentialsError):  # the address is in use, or a file is being copied
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_RENEW_PAUSE_SECONDS)
+            else:
+                self._replace(session)
+                return
+
+    def _replace(self, session: zenoh.Session) -> bool:
+        """Use another session and repeat the declarations in it; return False if the transport was closed."""
         with self._lock:
-            if is_served or self._closed:
+            if self._closed:
                 session.close()
                 return False
             previous, self._session = self._session, session
@@ -252,6 +274,8 @@ class ZenohTransport:
         with self._lock:
             self._closed = True
             session = self._session
+        if self._watch is not None:
+            self._watch.close()
         if not session.is_closed():
             session.close()
             self._callbacks.await_release()

@@ -96,6 +96,32 @@ class RepeatedSteps(gymnasium.Wrapper):
         self._camera(picture)
 
 
+class OneEpisode(gymnasium.Wrapper):
+    """A wrapper that plays one episode for each reset with a seed, and then stands still.
+
+    A reset without a seed, by which a vector environment begins the next episode, costs nothing here, and the steps
+    after it neither.
+    """
+
+    _over = False
+    _last: Any = None  # the last observation of the episode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode if a seed is given, else return the last observation."""
+        if seed is None:
+            return self._last, {}
+        self._over = False
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env. After the episode, return the last observation and no reward."""
+        if self._over:
+            return self._last, 0.0, False, False, {}
+        self._last, reward, terminated, truncated, info = self.env.step(action)
+        self._over = terminated or truncated
+        return self._last, reward, terminated, truncated, info
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvironmentFactory:
     """A picklable function that creates one environment, here or in a process of its own."""
@@ -104,6 +130,7 @@ class EnvironmentFactory:
     modules: UserModules = NO_MODULES
     render_mode: str | None = None
     camera: Camera | None = None
+    one_episode: bool = False
 
     def __call__(self) -> gymnasium.Env:
         """Return a new environment. Raises whatever the environment raises."""
@@ -127,7 +154,7 @@ class EnvironmentFactory:
             from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
 
             environment = RenderObservation(environment)
-        return environment
+        return OneEpisode(environment) if self.one_episode else environment
 
     @property
     def is_plain(self) -> bool:
@@ -144,10 +171,11 @@ def make_gymnasium(
     modules: UserModules = NO_MODULES,
     render_mode: str | None = None,
     camera: Camera | None = None,
+    one_episode: bool = False,
 ) -> GymnasiumEnvironments:
     """Return `count` environments: by their own vector entry point if possible, else stepped in turn or in processes.
 
-    See make_environments for the arguments. Raises EnvironmentSetupError.
+    See make_environments for the arguments; `one_episode` is its `for_evaluation`. Raises EnvironmentSetupError.
     """
     if spec.backend == "fast" and registration(spec.id, modules).entry_point != _CAR_RACING:
         raise EnvironmentSetupError(
@@ -158,7 +186,10 @@ def make_gymnasium(
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     try:
         environment = _make_vector(
-            EnvironmentFactory(spec=spec, modules=modules, render_mode=render_mode, camera=camera), count
+            EnvironmentFactory(
+                spec=spec, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
+            ),
+            count,
         )
     except EnvironmentSetupError:
         raise
@@ -223,7 +254,10 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
     spec, registered = factory.spec, registration(factory.spec.id, factory.modules)
     # ALE's vector entry point is another environment: it stacks, resizes and clips by itself (see backend=ale).
     if registered.vector_entry_point is not None and registered.namespace != "ALE" and factory.is_plain:
-        return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))
+        if not factory.one_episode:
+            return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))
+        if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
+            return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
         return EnvironmentProcesses([factory] * count)
     return SyncVectorEnv([factory] * count, autoreset_mode=AutoresetMode.NEXT_STEP)

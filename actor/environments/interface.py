@@ -28,7 +28,11 @@ class VectorEnvironment(Protocol):
         ...
 
     def reset(self, seed: int) -> np.ndarray:
-        """Start an episode in each environment; return frames [E, *frame_shape]."""
+        """Start an episode in each environment, with seed + e in environment e; return frames [E, *frame_shape].
+
+        The environments of some backends share one random generator, with the seed `seed`, unless they are made for
+        evaluation (see make_environments).
+        """
         ...
 
     def step(self, actions: np.ndarray) -> Step:

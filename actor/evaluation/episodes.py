@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.actor.collecting.episode_counter import EpisodeCounter, FinishedEpisodes
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import FrameStack
 from daedalus.protocol.spec import EnvironmentSpec
 
 _MAX_ENVIRONMENTS = 100
+_SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
 _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
-    """The results of an evaluation's episodes, in no particular order."""
+    """The results of an evaluation's episodes, in the order of their seeds."""
 
     returns: np.ndarray  # [episodes] float32, undiscounted and unscaled
     lengths: np.ndarray  # [episodes] int32, env_steps
@@ -45,60 +45,102 @@ def play_episodes(
     sampled: bool,
     progress: Callable[[int, float], None] = _no_progress,
 ) -> Evaluation:
-    """Play `episodes` episodes and return their results.
+    """Play `episodes` episodes and return their results, in the order of their numbers.
 
-    Each environment plays its share of the episodes, and any further ones are not counted: counting whichever episodes
-    end first would favour short ones.
+    Episode i has seeds of its own, made of `seed` and i, for its environment and its sampled actions. So its result
+    does not depend on how many environments there are, if a reset with a seed determines the whole episode.
+
+    The episodes are played in rounds, one episode in each environment. All episodes that begin are counted: counting
+    whichever end first would favour short ones.
 
     Args:
       runtime: the policy, with its weights loaded.
-      environments: E environments; they are reset first, and not closed.
-      episodes: how many to count.
+      environments: E environments, made for evaluation; they are reset first, and not closed.
+      episodes: how many to play.
       seed: of the environments and of sampled actions.
       sampled: sample the actions instead of choosing the most probable ones.
-      progress: called after every step with the number of episodes counted and their mean return (NaN at first).
+      progress: called after every step with the number of episodes that ended and their mean return (NaN at first).
     """
-    count = environments.count
-    environment_seed, action_seed = np.random.SeedSequence(seed).generate_state(2)
-    random = np.random.default_rng(action_seed) if sampled else None
-    counter, counted = EpisodeCounter(count), _CountedEpisodes(episodes, count)
-    stack = FrameStack(environments.spaces.observation, count)
-    state = np.zeros((count, runtime.state_size), np.float32)
-    stack.push(environments.reset(int(environment_seed)), np.ones(count, np.bool_))
-    while not counted.complete:
-        valid = counter.valid
-        actions, _, next_state = runtime.act(stack.observations, state, random)
-        frames, rewards, terminated, truncated = environments.step(actions)
-        # As in RolloutWriter: the frame stack and the memory begin anew with each episode.
-        stack.push(frames, ~valid)
-        state = next_state * valid[:, None]
-        counter.step(rewards, terminated, truncated)
-        ended = terminated | truncated
-        if ended.any():
-            counted.add(ended, counter.take_finished())
-        progress(len(counted.returns), counted.mean_return)
-    return Evaluation(returns=counted.returns, lengths=counted.lengths)
+    environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
+    results = _Results(episodes)
+    for first in range(0, episodes, environments.count):
+        random = _EpisodeRandom(action_seed, first, _rows(environments.count)) if sampled else None
+        frames = environments.reset(environment_seed % _SEEDS + first)  # environment e gets this seed + e
+        _play_round(runtime, environments, frames, random, first, results, progress)
+    return Evaluation(returns=results.returns.astype(np.float32), lengths=results.lengths)
 
 
-class _CountedEpisodes:
-    """The results of the episodes that count: of each environment, its share from its first episode on."""
+class _EpisodeRandom:
+    """A RandomSource whose row e draws from the generator of episode `first` + e."""
 
-    def __init__(self, episodes: int, count: int) -> None:
-        self._missing = np.full(count, episodes // count)  # [E] episodes of each environment's share
-        self._missing[: episodes % count] += 1
-        self.returns, self.lengths = np.zeros(0, np.float32), np.zeros(0, np.int32)
-        self.mean_return = float("nan")
+    def __init__(self, seed: int, first: int, rows: int) -> None:
+        self._generators = [np.random.default_rng([seed, first + row]) for row in range(rows)]
+
+    def random(self, size: int, dtype: type[np.float32]) -> np.ndarray:
+        """See RandomSource; `size` is the number of rows."""
+        return np.array([generator.random(dtype=dtype) for generator in self._generators])
+
+
+class _Results:
+    """Running returns and lengths of all episodes, by number."""
+
+    def __init__(self, episodes: int) -> None:
+        self.returns = np.zeros(episodes, np.float64)
+        self.lengths = np.zeros(episodes, np.int32)
+        self.ended = np.zeros(episodes, np.bool_)
 
     @property
-    def complete(self) -> bool:
-        """Whether every environment has played its share."""
-        return not self._missing.any()
+    def mean_return(self) -> float:
+        """Mean return of the episodes that ended; NaN without one."""
+        return float(self.returns[self.ended].mean()) if self.ended.any() else float("nan")
 
-    def add(self, ended: np.ndarray, finished: FinishedEpisodes) -> None:
-        """Add the episodes that finished in the environments `ended` [E] bool, those beyond a share excepted."""
-        counted = self._missing[ended] > 0
-        self.returns = np.concatenate([self.returns, finished.returns[counted]])
-        self.lengths = np.concatenate([self.lengths, finished.lengths[counted]])
-        self._missing[ended] = np.maximum(self._missing[ended] - 1, 0)
-        if len(self.returns):
-            self.mean_return = float(self.returns.mean(dtype=np.float64))
+
+def _play_round(
+    runtime: PolicyRuntime,
+    environments: VectorEnvironment,
+    frames: np.ndarray,
+    random: _EpisodeRandom | None,
+    first: int,
+    results: _Results,
+    progress: Callable[[int, float], None],
+) -> None:
+    """Play episode `first` + e in each environment e, from the first `frames` on. See play_episodes.
+
+    What an environment does after the end of its episode is ignored.
+    """
+    count = environments.count
+    numbers = first + np.arange(count)  # of the episodes
+    stack = FrameStack(environments.spaces.observation, count)
+    state = np.zeros((count, runtime.state_size), np.float32)
+    stack.push(frames, np.ones(count, np.bool_))
+    playing = numbers < len(results.returns)
+    while playing.any():
+        actions, state = _act(runtime, stack.observations, state, random)
+        frames, rewards, terminated, truncated = environments.step(actions)
+        stack.push(frames, np.zeros(count, np.bool_))
+        results.returns[numbers[playing]] += rewards[playing]
+        results.lengths[numbers[playing]] += 1
+        ended = playing & (terminated | truncated)
+        results.ended[numbers[ended]] = True
+        playing &= ~ended
+        progress(int(results.ended.sum()), results.mean_return)
+
+
+def _act(
+    runtime: PolicyRuntime, observations: np.ndarray, state: np.ndarray, random: _EpisodeRandom | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return actions [E] and the next state [E, S].
+
+    A single row is computed twice, as a batch of two: for a batch of one, matrix products use another kernel, which
+    rounds differently.
+    """
+    count, repeats = len(observations), _rows(len(observations)) // len(observations)
+    if repeats > 1:
+        observations, state = observations.repeat(repeats, axis=0), state.repeat(repeats, axis=0)
+    actions, _, next_state = runtime.act(observations, state, random)
+    return actions[:count], next_state[:count]
+
+
+def _rows(count: int) -> int:
+    """Return the number of rows of the policy's batches for `count` environments."""
+    return max(count, 2)

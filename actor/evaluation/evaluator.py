@@ -30,7 +30,7 @@ class Evaluator:
     def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
         """`stop` ends `run`, also in the middle of an episode."""
         self._config, self._stop = config, stop
-        self._queries = LearnerQueries(transport, config.authorization_hint)
+        self._queries = LearnerQueries(transport)
 
     def run(self) -> None:
         """Evaluate until `stop` or until the run is over.
@@ -57,9 +57,8 @@ class Evaluator:
             "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
         )
         environment = spec.environment.as_evaluated()
-        environments = make_environments(
-            environment, environments_for(episodes, environment), modules=self._config.modules
-        )
+        count = environments_for(episodes, environment)
+        environments = make_environments(environment, count, modules=self._config.modules, for_evaluation=True)
         try:
             due = time.monotonic() + interval
             for number in itertools.count():
@@ -81,7 +80,7 @@ class Evaluator:
         program = self._queries.program(welcome.run, snapshot.program)
         if program is None:
             return False
-        runtime = OnnxRuntime(program[1])
+        runtime = OnnxRuntime(program[1], self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
         evaluation = play_episodes(

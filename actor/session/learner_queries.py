@@ -22,7 +22,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import RefusedError, Transport, TransportError
 
 _logger = logging.getLogger(__name__)
 
@@ -53,10 +53,8 @@ class RunOverError(Exception):
 class LearnerQueries:
     """Queries over a transport, with decoded answers."""
 
-    def __init__(self, transport: Transport, authorization_hint: str = "") -> None:
-        """`authorization_hint` is added to messages that no learner responds: see transport/security.py."""
+    def __init__(self, transport: Transport) -> None:
         self._transport = transport
-        self._authorization_hint = authorization_hint
 
     def join_learner(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
         """Send requests to join until a learner of `run` (`*`: of any run) answers.
@@ -69,7 +67,7 @@ class LearnerQueries:
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
         while True:
-            awaited = f"a learner{self._authorization_hint}"
+            awaited = "a learner"
             try:
                 welcome = self.request_join(run, join)
             except NameInUseError:
@@ -82,7 +80,7 @@ class LearnerQueries:
             if deadline is not None and time.monotonic() > deadline:
                 raise ActorError(
                     f"no learner answered within {timeout:g} s: check that the learner runs and that the address is "
-                    f"correct{self._authorization_hint}"
+                    "correct"
                 )
             if not logged and pause >= _MAX_RETRY_SECONDS:
                 _logger.info("waiting for %s", awaited)
@@ -91,9 +89,17 @@ class LearnerQueries:
                 raise RunOverError("stopped")
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
-                with contextlib.suppress(TransportError):  # no router now: the present session keeps trying
-                    self._transport.reopen()
+                self._reopen()
                 reopen_at = time.monotonic() + _REOPEN_SECONDS
+
+    def _reopen(self) -> None:
+        """Open another session in place of one that may be dead. Raises ActorError if the certificate is refused."""
+        try:
+            self._transport.reopen()
+        except RefusedError as error:  # it was revoked or has expired since the start
+            raise ActorError(str(error)) from None
+        except TransportError:
+            pass  # no router now: the present session keeps trying
 
     def request_join(self, run: str, join: Join) -> Welcome | None:
         """Send one request to join; return None if nobody answers. Raises ActorError or RunOverError if refused."""

@@ -12,7 +12,7 @@ from typing import Literal
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries, RunOverError
+from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock
@@ -23,6 +23,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
@@ -47,7 +48,6 @@ class ActorConfig:
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
     modules: UserModules = NO_MODULES  # that may be imported for environments
-    authorization_hint: str = ""  # added to messages that no learner responds
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
 
@@ -67,7 +67,7 @@ class ActorService:
         self._collector = collector or EnvironmentCollector(config.environments, config.modules)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
-        self._queries = LearnerQueries(transport, config.authorization_hint)
+        self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
         self._uploads = UploadSession(transport, config.name, self._presence, self._lock)
         self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, stop)
@@ -139,7 +139,7 @@ class ActorService:
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
             return TorchRuntime(welcome.spec.policy, spaces)
-        return OnnxRuntime(self._await_program(welcome))
+        return OnnxRuntime(self._await_program(welcome), self._stop)
 
     def _await_program(self, welcome: Welcome) -> bytes:
         """Return the program once the learner has it; measure the link by the time that it takes."""
@@ -188,6 +188,7 @@ class ActorService:
             payload = encode(self._collect(welcome.learner_epoch))
             if self._feed.uses_compact_snapshots:
                 self._uploads.size_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
+            _check_size(payload, welcome.spec)
             self._uploads.send(self._sequence, payload)
             self._sequence += 1
             if synchronous:
@@ -226,16 +227,17 @@ class ActorService:
     def _await_snapshot(self, newer_than: int) -> Snapshot:
         """Wait for a snapshot newer than a version; request it in case a push was lost.
 
-        Return early if the rollout that the version depends on was rejected: the actor must replace it.
+        Return early if the rollout that the version depends on was rejected: the actor must replace it. Not if a newer
+        version is out, whose push was late or lost: a rollout of this version would be rejected again.
         """
         first = newer_than < 0
 
         def ready() -> bool:
             self._feed.read()
-            newest = self._feed.newest
+            newest, in_flight = self._feed.newest, self._uploads.in_flight
             if newest is not None and newest.policy_version > newer_than:
                 return True
-            return self._uploads.in_flight.last_was_rejected and not first
+            return in_flight.last_was_rejected and not first and in_flight.newest_version <= newer_than
 
         pause = _FIRST_PUSH_SECONDS if first else _MISSED_PUSH_SECONDS
         while not self._monitor.wait(ready, pause):
@@ -252,3 +254,13 @@ class ActorService:
         self._feed.request_if_behind(self._uploads.in_flight.newest_version)
         assert self._feed.newest is not None
         return self._feed.newest
+
+
+def _check_size(payload: bytes, spec: RunSpec) -> None:
+    """Raise ActorError if the learner does not receive messages of this size: they would be lost in silence."""
+    if len(payload) > spec.service.queue_bytes:
+        raise ActorError(
+            f"a rollout of this actor has {len(payload) / 2**20:.1f} MiB, and the learner takes at most "
+            f"{spec.service.queue_megabytes:g} MiB: use fewer environments (--envs), or raise service.queue_megabytes "
+            "of the run"
+        )

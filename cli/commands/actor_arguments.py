@@ -12,7 +12,6 @@ from daedalus.cli.logs import add_logging
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials
-from daedalus.transport.security import authorization_hint
 
 DESCRIPTION = """\
 Plays environments and sends rollouts to a learner. An actor needs one address: the environment, the network and all
@@ -103,7 +102,6 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         runtime=arguments.runtime,
         modules=UserModules(frozenset(arguments.allow_module), "the learner"),
         link=arguments.link,
-        authorization_hint=authorization_hint(credentials),
         timeout=arguments.timeout,
     )
 

@@ -11,7 +11,7 @@ import sys
 from daedalus.bridge.service import Bridge
 from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, raise_descriptor_limit, stop_on_signals
 from daedalus.transport.addresses import AddressError, check_listening
 from daedalus.transport.connecting import connect
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -58,6 +58,7 @@ def main() -> int:
     except SECURITY_ERRORS as error:
         print(f"daedalus bridge: {error}", file=sys.stderr)
         return 2
+    raise_descriptor_limit()
     stop = stop_on_signals()
     host, _, port = arguments.listen.partition("/")[2].rpartition(":")
     try:

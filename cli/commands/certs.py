@@ -2,41 +2,38 @@
 
 import argparse
 import datetime
-import json
-import os
-import shutil
-import socket
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import command_parser
-from daedalus.protocol import keys
-from daedalus.transport.access_control import common_name
-from daedalus.transport.credentials import NAMES, Credentials, CredentialsError, read_names
-from daedalus.transport.zenoh_settings import as_config_file, session_settings
+from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
 
-_CA_DAYS, _DAYS = 3650, 825
-_LISTENERS = ("learner", "router")
-_NAMED = ("actor", "operator")
-_ZENOHD = "zenoh.json5"
-_RESTART = "restart learners and routers with their updated folders, so that they read the new list of names"
+if TYPE_CHECKING:
+    from daedalus.cli.certificate_folder import CertificateFolder, Identity
+
+_DAYS = 825
+_LISTENERS, _NAMED = ("learner", "router"), ("actor", "operator")
 
 _DESCRIPTION = """\
 Creates certificates, so that only authorised actors can join a run, over encrypted connections. The folder ca/ holds
-the key of the certificate authority (CA): keep it secret. Each other folder is one identity: copy it to the host that
+the keys of the certificate authority (CA): keep it secret. Each other folder is one identity: copy it to the host that
 uses it, and name it there with --tls."""
 
-_EXAMPLES = """\
+_EXAMPLES = f"""\
 examples:
   daedalus certs init certs --host gpu-box.lan --host 192.168.1.7
-  daedalus certs issue actor arm-1 arm-2 --directory certs
+  daedalus certs issue actor arm-1 arm-2
   daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner
   daedalus actor --connect tls/gpu-box.lan:7447 --tls certs/actor-arm-1
-  daedalus certs revoke actor arm-1 --directory certs
+  daedalus certs list
+  daedalus certs renew                    (all that expire within {WARNING_DAYS} days)
+  daedalus certs revoke actor arm-1
 
 The certificate of an actor allows it to play under its name NAME or NAME.ANYTHING. The certificate of an operator
-allows `daedalus status` and `daedalus exporter`. Learners and routers read the list of authorised names when they
-start: after `issue` and `revoke`, restart them with the updated folders.
+allows `daedalus status` and `daedalus exporter`. Learners and routers notice within seconds that a file in their folder
+has changed: after `issue` and `revoke`, copy {CLIENTS} to their folders if they run elsewhere. Nothing has to be
+restarted. A renewed certificate is used from the next connection on.
 
 exit status: 0 done, 1 failed, 2 bad usage"""
 
@@ -44,21 +41,32 @@ exit status: 0 done, 1 failed, 2 bad usage"""
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus certs`."""
     options = command_parser("certs", _DESCRIPTION, _EXAMPLES)
-    host = "name or address that actors use for the learner or router. May be given several times"
     verbs = options.add_subparsers(dest="verb", required=True, metavar="VERB")
     init = verbs.add_parser("init", help="create a CA, and certificates for the learner, a router and one operator")
     init.add_argument("directory", type=Path, metavar="DIR", help="a new or empty folder")
-    init.add_argument("--host", action="append", default=[], help=host)
-    issue = verbs.add_parser(
-        "issue", help="create certificates for actors and operators, or renew that of the learner or router"
-    )
+    _add_host(init)
+    issue = verbs.add_parser("issue", help="create certificates for actors and operators, or new ones in their place")
     issue.add_argument("role", choices=(*_NAMED, *_LISTENERS), help="kind of process that uses the certificate")
     issue.add_argument("names", nargs="*", metavar="NAME", help="name of an actor or operator")
-    issue.add_argument("--host", action="append", default=[], help=host)
-    revoke = verbs.add_parser("revoke", help="remove names from the list of authorised names")
+    _add_host(issue)
+    renew = verbs.add_parser("renew", help="create new certificates in place of those that expire soon")
+    renew.add_argument(
+        "role", nargs="?", choices=(*_NAMED, *_LISTENERS), help="kind of process whose certificate is renewed now"
+    )
+    renew.add_argument("names", nargs="*", metavar="NAME", help="name of an actor or operator (default: all)")
+    revoke = verbs.add_parser("revoke", help="withdraw the authorisation of actors and operators")
     revoke.add_argument("role", choices=_NAMED, help="kind of process that used the certificate")
     revoke.add_argument("names", nargs="+", metavar="NAME", help="name of an actor or operator")
-    for verb in (issue, revoke):
+    listed = verbs.add_parser("list", help="show all certificates and when they expire")
+    for verb in (init, issue, renew):
+        verb.add_argument(
+            "--days",
+            type=_days,
+            default=_DAYS,
+            metavar="N",
+            help="days until the certificates expire (default: %(default)s)",
+        )
+    for verb in (issue, renew, revoke, listed):
         verb.add_argument(
             "--directory",
             type=Path,
@@ -69,16 +77,32 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def _add_host(options: argparse.ArgumentParser) -> None:
+    options.add_argument(
+        "--host",
+        action="append",
+        default=[],
+        help="name or address that actors use for the learner or router. May be given several times",
+    )
+
+
+def _days(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 3650:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to 3650")
+    return int(text)
+
+
 def certs(arguments: list[str]) -> int:
     """Run `daedalus certs` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
+        from daedalus.cli.certificate_folder import CertificateFolder
+
         if parsed.verb == "init":
-            lines = _init(parsed.directory, parsed.host)
-        elif parsed.verb == "issue":
-            lines = _issue(parsed.directory, parsed.role, parsed.names, parsed.host)
+            lines = _init(parsed)
         else:
-            lines = _revoke(parsed.directory, parsed.role, parsed.names)
+            verbs = {"issue": _issue, "renew": _renew, "revoke": _revoke, "list": _list}
+            lines = verbs[parsed.verb](CertificateFolder(parsed.directory), parsed)
     except ImportError:
         print('daedalus certs: cryptography is not installed: pip install "daedalus-rl[certs]"', file=sys.stderr)
         return 1
@@ -89,101 +113,85 @@ def certs(arguments: list[str]) -> int:
     return 0
 
 
-def _init(directory: Path, hosts: list[str]) -> list[str]:
-    if directory.exists() and any(directory.iterdir()):
-        raise CredentialsError(
-            f"{directory} is not empty: add certificates with `daedalus certs issue`, or name a new folder"
-        )
-    from daedalus.cli.certificate_authority import CertificateAuthority
+def _init(parsed: argparse.Namespace) -> list[str]:
+    from daedalus.cli.certificate_folder import CertificateFolder, Identity
 
-    CertificateAuthority.create(directory / "ca", datetime.timedelta(days=_CA_DAYS))
-    for role in _LISTENERS:
-        _make(directory, role, "", hosts)
-    _make(directory, "operator", "operator", [])
-    _write_names(directory, {"actors": [], "operators": ["operator"]})
+    directory = parsed.directory
+    folder = CertificateFolder.create(directory, parsed.host, _lifetime(parsed))
     return [
-        f"{directory}/ca          the key of the CA, which signs all certificates: keep it secret",
+        f"{directory}/ca          the keys of the CA: keep them secret",
         f"{directory}/learner     for the option --tls of daedalus learner",
         f"{directory}/router      for the option --tls of daedalus router",
         f"{directory}/operator    for the option --tls of daedalus status and exporter",
-        f"valid for {', '.join(_hosts(hosts))}; next: daedalus certs issue actor NAME --directory {directory}",
+        f"valid for {', '.join(folder.hosts(Identity('learner')))}; "
+        f"next: daedalus certs issue actor NAME --directory {directory}",
     ]
 
 
-def _issue(directory: Path, role: str, names: list[str], hosts: list[str]) -> list[str]:
-    if (role in _NAMED) != bool(names):
+def _issue(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    identities = _named(parsed)
+    folder.issue(identities, _lifetime(parsed), parsed.host)
+    return _issued(folder, identities)
+
+
+def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    known = folder.identities()
+    if parsed.role is None:
+        soon = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=WARNING_DAYS)
+        identities = [identity for identity, issued in known.items() if issued.expires < soon]
+        if not identities:
+            return [f"no certificate expires within {WARNING_DAYS} days"]
+    elif parsed.role in _NAMED and not parsed.names:
+        identities = [identity for identity in known if identity.role == parsed.role]
+    else:
+        identities = _named(parsed)
+        unknown = [identity.folder for identity in identities if identity not in known]
+        if unknown:
+            raise CredentialsError(f"no certificate was issued for {', '.join(unknown)}: see `daedalus certs list`")
+    folder.issue(identities, _lifetime(parsed))
+    return _issued(folder, identities)
+
+
+def _revoke(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    folder.revoke(_named(parsed))
+    return [_copy_clients(folder)]
+
+
+def _list(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    now = datetime.datetime.now(datetime.UTC)
+    lines = [f"{'certificate':<24} {'expires':<10} {'days':>5}"]
+    for identity, issued in sorted(folder.identities().items(), key=lambda each: each[1].expires):
+        days = (issued.expires - now).days
+        state = "  EXPIRED" if issued.expires < now else "  renew it soon" if days < WARNING_DAYS else ""
+        lines.append(f"{identity.folder:<24} {issued.expires:%Y-%m-%d} {days:>5}{state}")
+    return lines
+
+
+def _named(parsed: argparse.Namespace) -> "list[Identity]":
+    from daedalus.cli.certificate_folder import Identity
+
+    if (parsed.role in _NAMED) != bool(parsed.names):
         raise CredentialsError("wrong number of names: name actors and operators, but not a learner or router")
-    for name in names:
-        keys.check_name(name, f"{role} name")
-        if "." in name:
-            raise CredentialsError(
-                f"{name!r} has a '.': name it {name.split('.')[0]!r}, which may also act as {name!r}"
-            )
-    for name in names or [""]:
-        _make(directory, role, name, hosts)
-    if role not in _NAMED:
-        authorised = _read_authorised(directory)
-        _write_names(directory, authorised)
-        return [f"{directory / role}    valid for {', '.join(_hosts(hosts))}"]
-    authorised = _read_authorised(directory)
-    authorised[f"{role}s"] = sorted({*authorised[f"{role}s"], *names})
-    _write_names(directory, authorised)
-    return [
-        *(
-            f"{directory / _folder(role, name)}    copy this folder to the host of the {role} and use "
-            f"--tls {_folder(role, name)}"
-            for name in names
-        ),
-        _RESTART,
-    ]
+    return [Identity(parsed.role, name) for name in parsed.names or [""]]
 
 
-def _revoke(directory: Path, role: str, names: list[str]) -> list[str]:
-    authorised = _read_authorised(directory)
-    unknown = set(names) - set(authorised[f"{role}s"])
-    if unknown:
-        raise CredentialsError(
-            f"no {role} is named {', '.join(sorted(unknown))}: see names.json in {directory / 'learner'}"
-        )
-    authorised[f"{role}s"] = sorted(set(authorised[f"{role}s"]) - set(names))
-    _write_names(directory, authorised)
-    for name in names:
-        shutil.rmtree(directory / _folder(role, name), ignore_errors=True)
-    return [_RESTART]
+def _issued(folder: "CertificateFolder", identities: "list[Identity]") -> list[str]:
+    lines = []
+    for identity in identities:
+        path = folder.directory / identity.folder
+        if identity.role in _NAMED:
+            lines.append(f"{path}    copy this folder to the host of the {identity.role}, for its option --tls")
+        else:
+            lines.append(f"{path}    valid for {', '.join(folder.hosts(identity))}")
+    return [*lines, _copy_clients(folder)]
 
 
-def _folder(role: str, name: str) -> str:
-    return role if role in _LISTENERS or name == role else f"{role}-{name}"
+def _copy_clients(folder: "CertificateFolder") -> str:
+    return (
+        f"learners and routers on other hosts: copy {folder.directory}/learner/{CLIENTS} to their folders; they read "
+        "it within seconds"
+    )
 
 
-def _hosts(hosts: list[str]) -> list[str]:
-    """Return the host names of a listener's certificate: the given ones, and those of this machine."""
-    return list(dict.fromkeys([*hosts, socket.gethostname(), "localhost", "127.0.0.1", "::1"]))
-
-
-def _read_authorised(directory: Path) -> dict[str, list[str]]:
-    return read_names(directory / "learner")
-
-
-def _write_names(directory: Path, names: dict[str, list[str]]) -> None:
-    """Write the authorised names for learner and router, and the configuration of a standard zenohd."""
-    for role in _LISTENERS:
-        _replace(directory / role / NAMES, json.dumps(names, indent=2) + "\n")
-    folder = (directory / "router").resolve()
-    security = Credentials(folder, "router", "").settings(listens=True)
-    zenohd = as_config_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security))
-    _replace(folder / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, "utf-8")
-    os.replace(partial, path)
-
-
-def _make(directory: Path, role: str, name: str, hosts: list[str]) -> None:
-    from daedalus.cli.certificate_authority import CertificateAuthority
-
-    authority = CertificateAuthority(directory / "ca")
-    names = _hosts(hosts) if role in _LISTENERS else []
-    authority.issue(directory / _folder(role, name), common_name(role, name), names, datetime.timedelta(days=_DAYS))
+def _lifetime(parsed: argparse.Namespace) -> datetime.timedelta:
+    return datetime.timedelta(days=parsed.days)

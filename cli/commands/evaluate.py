@@ -22,7 +22,7 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_if_stuck, exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
@@ -147,6 +147,7 @@ def _play(
         modules=modules,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,
+        for_evaluation=True,
     )
     try:
         if video is not None:
@@ -156,7 +157,7 @@ def _play(
                 f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
                 "choose another --backend, or install the versions that the run used (versions.json)"
             )
-        runtime = OnnxRuntime(policy.program)
+        runtime = OnnxRuntime(policy.program, progress.stop)
         runtime.load(policy.weights)
         return play_episodes(
             runtime, environments, episodes, seed, sampled=_actions(policy, arguments) == "sampled", progress=progress
@@ -216,13 +217,13 @@ class _Progress:
     """
 
     def __init__(self, stream: TextIO, episodes: int, stop: threading.Event) -> None:
-        self._stream, self._episodes, self._stop = stream, episodes, stop
+        self._stream, self._episodes, self.stop = stream, episodes, stop
         self._terminal = stream.isatty()
         self._due = time.monotonic() + _PROGRESS_SECONDS
         self._rewriting = False
 
     def __call__(self, finished: int, mean: float) -> None:
-        if self._stop.is_set():
+        if self.stop.is_set():
             raise _StoppedError
         if time.monotonic() < self._due:
             return
@@ -242,4 +243,6 @@ class _Progress:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main(stop=stop_on_signals(), output=_reserved_stdout()))
+    stopped = stop_on_signals()
+    exit_if_stuck(stopped)
+    sys.exit(main(stop=stopped, output=_reserved_stdout()))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, raise_descriptor_limit, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -22,6 +22,7 @@ from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
+from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
@@ -47,6 +48,7 @@ def main() -> int:
     started = time.monotonic()
     arguments = learner_parser().parse_args()
     keep_freed_memory()
+    raise_descriptor_limit()
     stop = stop_on_signals()
     if arguments.exit_with_parent:
         exit_with_parent(stop)
@@ -63,7 +65,7 @@ def main() -> int:
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
         restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
-        transport = _open_transport(arguments, credentials, stop)
+        transport = _open_transport(arguments, run.spec, credentials, stop)
     except (TransportError, DamagedError, CredentialsError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -92,15 +94,16 @@ def _addresses(arguments: argparse.Namespace) -> list[str]:
 
 
 def _open_transport(
-    arguments: argparse.Namespace, credentials: Credentials | None, stop: threading.Event
+    arguments: argparse.Namespace, spec: RunSpec, credentials: Credentials | None, stop: threading.Event
 ) -> Transport | None:
     """Connect to a router or listen for actors; return None if stopped before a router answered.
 
     Raises TransportError or CredentialsError.
     """
+    limit = largest_request(spec)
     if arguments.connect:
-        return connect_with_retry(arguments.connect, stop, credentials=credentials)
-    return listen(_addresses(arguments), credentials=credentials)
+        return connect_with_retry(arguments.connect, stop, credentials=credentials, max_message_bytes=limit)
+    return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
 def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:

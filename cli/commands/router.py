@@ -6,13 +6,14 @@ import sys
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging
-from daedalus.cli.processes import stop_on_signals
+from daedalus.cli.processes import raise_descriptor_limit, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
 from daedalus.transport.addresses import check_connecting
 from daedalus.transport.connecting import listen
 from daedalus.transport.credentials import CredentialsError
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
+from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
 
@@ -47,10 +48,25 @@ def parser() -> argparse.ArgumentParser:
         metavar="tcp/HOST:PORT",
         help="another router to join, now or when it starts. May be given several times",
     )
+    options.add_argument(
+        "--max-message-megabytes",
+        type=_megabytes,
+        default=MAX_MESSAGE_BYTES / 2**20,
+        metavar="MIB",
+        help="largest message that the router forwards; it drops larger ones while they arrive. Raise it for networks "
+        "whose snapshots are larger (default: %(default)g)",
+    )
     add_tls(options)
     add_insecure(options)
     add_logging(options)
     return options
+
+
+def _megabytes(text: str) -> float:
+    value = float(text)
+    if not 1.0 <= value <= 1024.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to 1024")
+    return value
 
 
 def router(arguments: list[str]) -> int:
@@ -64,9 +80,11 @@ def router(arguments: list[str]) -> int:
     except SECURITY_ERRORS as error:
         print(f"daedalus router: {error}", file=sys.stderr)
         return 2
+    raise_descriptor_limit()
     stop = stop_on_signals()
     try:
-        transport = listen([parsed.listen], parsed.connect, credentials)
+        limit = int(parsed.max_message_megabytes * 2**20)
+        transport = listen([parsed.listen], parsed.connect, credentials, max_message_bytes=limit)
     except (TransportError, CredentialsError) as error:
         print(f"daedalus router: {error}", file=sys.stderr)
         return 1

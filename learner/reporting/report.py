@@ -1,5 +1,6 @@
 """Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,8 @@ class Health:
     actor_seen: float  # last time with a live actor, or the start
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
-    gradient_fault: bool = False  # whether the last update was skipped
+    left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
+    gradient_fault: str = ""  # why the last update was skipped, if it was
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -37,8 +39,12 @@ class Health:
             found.append(f"no live actor for {now - self.actor_seen:.0f} s")
         elif now - self.updated > _STALLED_SECONDS:
             found.append(f"no update for {now - self.updated:.0f} s")
+        if self.left_out:
+            names = sorted(self.left_out)
+            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+            found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
         if self.gradient_fault:
-            found.append("updates are skipped: the gradient is not finite")
+            found.append(f"updates are skipped: {self.gradient_fault}")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
         return tuple(found)

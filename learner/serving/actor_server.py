@@ -22,7 +22,8 @@ from daedalus.learner.serving.session_watchdog import SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.limits import EVALUATION_LIMITS, JOIN_LIMITS, SNAPSHOT_REQUEST_LIMITS, Limits
+from daedalus.protocol.messages import Refusal, StatusReport
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -85,19 +86,25 @@ class ActorServer:
         self.publisher.open()
         transport.watch_presence(keys.presence(run, "*", "*"), self._on_presence)
         self._serve(keys.rollouts(run, "*"), self.rollouts.offer)
-        self._serve(keys.snapshots(run), self.publisher.answer)
+        self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
         self._serve(keys.status(run), self._on_status)
-        self._serve(keys.evaluations(run, "*"), self.evaluations.offer)
+        self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
-        self._serve(keys.join(run), lambda query: query.reply(responses.join(query.payload, time.monotonic())))
+        self._serve(keys.join(run), self._on_join, JOIN_LIMITS)
         self._watchdog.open()
 
-    def _serve(self, key: str, handler: Callable[[Request], None]) -> None:
+    def _serve(self, key: str, handler: Callable[[Request], None], limits: Limits | None = None) -> None:
+        """Serve a key; refuse queries above `limits` without a copy of their payload."""
+
         def handle(request: Request) -> None:
             self._watchdog.heard()
-            handler(request)
+            if limits is not None and request.size > limits.message_bytes:
+                reason = f"the message has {request.size:,} bytes, more than {limits.message_bytes:,}"
+                request.reply(encode(Refusal(code="malformed", reason=reason)))
+            else:
+                handler(request)
 
         self._transport.serve(key, handle)
 
@@ -139,6 +146,9 @@ class ActorServer:
             with self.lock:
                 self.fleet.set_present(*actor, present)
                 self.lock.notify_all()
+
+    def _on_join(self, request: Request) -> None:
+        request.reply(self._responses.join(request.payload, time.monotonic()))
 
     def _on_status(self, request: Request) -> None:
         with self.lock:

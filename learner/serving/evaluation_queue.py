@@ -1,7 +1,7 @@
 """Requests and reports of evaluators that wait for the learner's thread. State with a lock."""
 
 import threading
-from collections import deque
+from typing import TypeVar
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
@@ -9,15 +9,22 @@ from daedalus.protocol.limits import EVALUATION_LIMITS
 from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.transport.interface import Request
 
-_MAX_WAITING = 64  # messages; further messages are answered not_ready
+_MAX_WAITING = 64  # requests, and as many reports
+
+_M = TypeVar("_M")
 
 
 class EvaluationQueue:
-    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `close`."""
+    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `close`.
+
+    It holds at most one request and one report of each evaluator: a newer message replaces the older one.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: deque[tuple[Request, EvaluationRequest | EvaluationReport]] = deque()
+        # By evaluator, the oldest first.
+        self._requests: dict[str, tuple[Request, EvaluationRequest]] = {}
+        self._reports: dict[str, tuple[Request, EvaluationReport]] = {}
         self._ready = self._closed = False
 
     def open(self) -> None:
@@ -28,7 +35,7 @@ class EvaluationQueue:
         """Refuse all waiting and all later messages, with `reason`."""
         with self._lock:
             self._closed = True
-        for request, _ in self.take():
+        for request, _ in [*self.take_requests(), *self.take_reports()]:
             request.reply(encode(Refusal(code="finished", reason=reason)))
 
     def offer(self, request: Request) -> None:
@@ -44,16 +51,36 @@ class EvaluationQueue:
             request.reply(encode(Refusal(code="malformed", reason=reason)))
             return
         with self._lock:
-            refused = self._closed or not self._ready or len(self._waiting) >= _MAX_WAITING
-            if not refused:
-                self._waiting.append((request, message))
-        if refused:
-            code = "finished" if self._closed else "not_ready"
-            request.reply(encode(Refusal(code=code, reason="no evaluation is possible now")))
+            if self._closed or not self._ready:
+                refused, reason = request, "no evaluation is possible now"
+            elif isinstance(message, EvaluationRequest):
+                refused, reason = _put(self._requests, sender, (request, message)), "a newer request took its place"
+            else:
+                refused, reason = _put(self._reports, sender, (request, message)), "a newer report took its place"
+        if refused is not None:
+            refused.reply(encode(Refusal(code="finished" if self._closed else "not_ready", reason=reason)))
 
-    def take(self) -> list[tuple[Request, EvaluationRequest | EvaluationReport]]:
-        """Return the messages since the last call. The caller replies to each request."""
+    def take_requests(self) -> list[tuple[Request, EvaluationRequest]]:
+        """Return the waiting requests for a policy. The caller replies to each."""
         with self._lock:
-            taken = list(self._waiting)
-            self._waiting.clear()
-        return taken
+            taken, self._requests = self._requests, {}
+        return list(taken.values())
+
+    def take_reports(self) -> list[tuple[Request, EvaluationReport]]:
+        """Return the waiting reports. The caller replies to each."""
+        with self._lock:
+            taken, self._reports = self._reports, {}
+        return list(taken.values())
+
+
+def _put(waiting: dict[str, tuple[Request, _M]], sender: str, entry: tuple[Request, _M]) -> Request | None:
+    """Add a message of `sender`, and return the request that it displaces, if any.
+
+    At capacity it displaces the oldest of the owner with the most, so that nobody fills the queue for the others.
+    """
+    displaced = sender if sender in waiting else None
+    if displaced is None and len(waiting) >= _MAX_WAITING:
+        displaced = keys.first_of_largest_owner(waiting)
+    request = waiting.pop(displaced)[0] if displaced is not None else None
+    waiting[sender] = entry
+    return request

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from daedalus.policy.saving.best_checkpoints import keep_if_best
+from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
 
 _MAX_IN_PROGRESS = 16
@@ -31,11 +32,11 @@ class Evaluations:
     def begin(self, evaluator: str, directory: Path, policy_version: int, env_steps: int) -> None:
         """Start the evaluation of the policy in `directory`; it replaces the evaluator's previous evaluation.
 
-        At capacity, drop the oldest evaluation, because each evaluation keeps a checkpoint on disk.
+        At capacity, drop the oldest evaluation of the owner with the most, because each may keep a checkpoint on disk.
         """
         self.in_progress.pop(evaluator, None)
         while len(self.in_progress) >= _MAX_IN_PROGRESS:
-            del self.in_progress[next(iter(self.in_progress))]
+            del self.in_progress[keys.first_of_largest_owner(self.in_progress)]
         self.in_progress[evaluator] = directory, policy_version, env_steps
 
     def report(self, report: EvaluationReport) -> tuple[Acknowledgement, str]:
@@ -51,6 +52,8 @@ class Evaluations:
             return Acknowledgement(verdict="rejected", reason=reason), ""
         if not np.isfinite(report.returns).all():
             return Acknowledgement(verdict="rejected", reason="returns has a value that is not finite"), ""
+        if (report.lengths < 1).any():
+            return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
         del self.in_progress[report.evaluator]
         mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
         self.newest = {

@@ -19,7 +19,20 @@ from daedalus.protocol.spec import RunSpec
 
 _ROW_BYTES = 1 + 2 + 4 * 4 + 8  # per environment and row, without the observation, rounded up
 _SLACK_BYTES = 64 << 10
-_MAX_REWARD = 1e9  # beyond it squares of returns overflow float32, and no update has a finite gradient
+_MAX_LOG_PROB = 1e-4  # 0, and rounding
+# Largest magnitudes. No healthy actor comes near them, and beyond them squares overflow float32: updates would have no
+# finite gradient. The state of a GRU lies between -1 and 1.
+_LARGEST = {
+    "frames": 1e15,
+    "initial_state": 1.001,
+    "behaviour_log_probs": 1e6,
+    "rewards": 1e9,
+    "episode_returns": math.inf,
+}
+_REMEDIES = {
+    "frames": ": scale or clip the observations",
+    "rewards": ": set environment.reward_scale",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +57,28 @@ class Intake:
         # A synchronous algorithm accepts only rollouts of the newest version.
         self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
         self.state_size = 0  # size of the recurrent state; set before any actor has the program
+
+    def refuse_size(self, sender: str, size: int) -> Rejected | None:
+        """Return the verdict on a message of `size` bytes that no rollout of `sender` has, or None. Reads no message.
+
+        Call this method without the lock.
+        """
+        spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
+        if size <= _SLACK_BYTES:
+            return None
+        if spaces is None or actor is None or not actor.environments:
+            return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
+        plain, queue = self._limits(spaces, actor).message_bytes, self._spec.service.queue_bytes
+        if size > plain:
+            reason = f"the message has {size:,} bytes, and a rollout of this actor at most {plain:,}"
+            return Rejected(verdict="rejected", cause="malformed", reason=reason)
+        if size > queue:
+            reason = (
+                f"the rollout has {size:,} bytes, and service.queue_megabytes allows {queue:,}: raise that setting, or "
+                "use fewer environments per actor (--envs)"
+            )
+            return Rejected(verdict="rejected", cause="unfit", reason=reason)
+        return None
 
     def read(self, sender: str, data: bytes) -> Rollout | Rejected:
         """Decode a message of `sender`, and check its content against the specification.
@@ -133,6 +168,14 @@ class Intake:
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
+        return (
+            self._shape_violation(rollout, spaces, actor)
+            or _number_violation(rollout)
+            or self._value_violation(rollout, spaces)
+            or _episode_violation(rollout)
+        )
+
+    def _shape_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         space, rows = spaces.observation, self._spec.collection.rollout_length
         if (rollout.rows, rollout.environments) != (rows, actor.environments):
             return (
@@ -146,27 +189,39 @@ class Intake:
             )
         if rollout.initial_state.shape[1] != self.state_size:
             return f"initial_state has size {rollout.initial_state.shape[1]}, expected {self.state_size}"
+        return ""
+
+    def _value_violation(self, rollout: Rollout, spaces: Spaces) -> str:
         if rollout.actions.min() < 0 or rollout.actions.max() >= spaces.action.count:
             return f"actions has a value outside {spaces.action}"
-        for name in ("frames", "initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
-            if not np.isfinite(getattr(rollout, name)).all():
-                return f"{name} has a value that is not finite"
-        if (rollout.behaviour_log_probs > 1e-4).any():
+        if rollout.behaviour_log_probs.max() > _MAX_LOG_PROB:
             return "behaviour_log_probs has a value above 0"
         environment = self._spec.environment
         if environment.reward_clip is not None:
             largest = environment.reward_clip * environment.reward_scale
             if np.abs(rollout.rewards).max() > largest * (1 + 1e-5):
                 return f"rewards has a value outside the clip range of +-{largest:g}"
-        if np.abs(rollout.rewards).max() > _MAX_REWARD:
-            return f"rewards has a value beyond +-{_MAX_REWARD:g}: set environment.reward_scale"
-        if (rollout.episode_lengths < 1).any():
-            return "episode_lengths has a value below 1"
-        return _first_episode_violation(rollout)
+        return ""
 
 
-def _first_episode_violation(rollout: Rollout) -> str:
+def _number_violation(rollout: Rollout) -> str:
+    """Return the first array with a value that is not finite or too large, or an empty string."""
+    for name, largest in _LARGEST.items():
+        array: np.ndarray = getattr(rollout, name)
+        if array.dtype.kind != "f" or not array.size:
+            continue
+        low, high = float(array.min()), float(array.max())  # nan if there is a nan
+        if not (math.isfinite(low) and math.isfinite(high)):
+            return f"{name} has a value that is not finite"
+        if max(-low, high) > largest:
+            return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
+    return ""
+
+
+def _episode_violation(rollout: Rollout) -> str:
     """Return where the rollout breaks gymnasium's NEXT_STEP rule, or reports other episodes than ended in it."""
+    if (rollout.episode_lengths < 1).any():
+        return "episode_lengths has a value below 1"
     ends = rollout.terminated | rollout.truncated  # [T, E]
     if (ends & ~rollout.valid).any():
         return "an episode ends in a row that only resets"

@@ -5,6 +5,7 @@ from collections.abc import Set
 from dataclasses import dataclass
 from typing import Protocol
 
+from daedalus.learner.serving.stragglers import Stragglers
 from daedalus.protocol.messages import Rollout
 
 
@@ -27,26 +28,37 @@ class RolloutBuffer(Protocol):
         """Add a rollout. The caller has checked `has_room_for`."""
         ...
 
-    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
+    def heard(self, actor: str) -> None:
+        """Record that an actor sent a rollout, which may have come too late for `add`."""
+        ...
+
+    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
         """Take the next batch if it is complete, else no rollouts.
 
         Args:
           live: names of the live actors.
           policy_version: newest policy version; rollouts beyond the policy lag bound are returned as stale.
+          now: time on the monotonic clock, in seconds.
         """
+        ...
+
+    @property
+    def left_out(self) -> Set[str]:
+        """Names of the live actors that no batch waits for, because they deliver nothing."""
         ...
 
 
 class BarrierBuffer:
     """Buffer of a synchronous algorithm: a batch is one rollout of every live actor, sorted by name.
 
-    The first batch also waits for `first` live actors. A batch does not wait for an actor that has left, but contains
-    its rollout of the current version.
+    The first batch also waits for `first` live actors. A batch does not wait for an actor that has left or that is
+    overdue (stragglers.py), but contains its rollout of the current version.
     """
 
     def __init__(self, first: int) -> None:
         self._first = first
         self._started = False
+        self._stragglers = Stragglers()
         self._waiting: dict[str, Rollout] = {}
 
     def has_room_for(self, rollout: Rollout) -> bool:
@@ -56,17 +68,28 @@ class BarrierBuffer:
     def add(self, rollout: Rollout) -> None:
         """See RolloutBuffer."""
         self._waiting[rollout.identity.actor] = rollout
+        self._stragglers.delivered(rollout.identity.actor)
 
-    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
+    def heard(self, actor: str) -> None:
         """See RolloutBuffer."""
+        self._stragglers.heard(actor)
+
+    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+        """See RolloutBuffer."""
+        awaited = self._stragglers.awaited(live, self._waiting.keys(), now)
         if not self._started and len(live) < self._first:
             return TakenRollouts(rollouts=[], stale=[])
-        if not self._waiting or live - self._waiting.keys():
+        if not self._waiting or awaited:
             return TakenRollouts(rollouts=[], stale=[])
         self._started = True
         rollouts = [self._waiting[actor] for actor in sorted(self._waiting)]
         self._waiting.clear()
         return TakenRollouts(rollouts=rollouts, stale=[])
+
+    @property
+    def left_out(self) -> Set[str]:
+        """See RolloutBuffer."""
+        return self._stragglers.left_out
 
 
 class StreamBuffer:
@@ -89,7 +112,15 @@ class StreamBuffer:
         """See RolloutBuffer."""
         self._waiting.append(rollout)
 
-    def take(self, live: Set[str], policy_version: int) -> TakenRollouts:
+    def heard(self, actor: str) -> None:
+        """See RolloutBuffer. Has no effect: a batch waits for no particular actor."""
+
+    @property
+    def left_out(self) -> Set[str]:
+        """See RolloutBuffer. Always empty."""
+        return frozenset()
+
+    def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
         """See RolloutBuffer."""
         oldest = policy_version - self._max_policy_lag
         stale = [rollout for rollout in self._waiting if rollout.policy_version < oldest]

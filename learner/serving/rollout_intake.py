@@ -8,9 +8,10 @@ One condition, shared with the actor server, guards the fleet, the buffer, the c
 lag of rollouts is relative to.
 """
 
+import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 
 import numpy as np
 
@@ -21,12 +22,15 @@ from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
+from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
 from daedalus.protocol.messages import Acknowledgement, Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request
 
 HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
 _CLOSE_SECONDS = 4.0  # for the intake thread to answer the queued rollouts
+
+_logger = logging.getLogger(__name__)
 
 
 class RolloutIntake:
@@ -59,6 +63,7 @@ class RolloutIntake:
         self._intake = Intake(spec, learner_epoch, fleet)
         self._buffer = _buffer(spec)
         self._requests = _queue(spec)
+        self._named: set[str] = set()  # actors that were logged as left out
         self._closed = False
         self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
 
@@ -81,6 +86,12 @@ class RolloutIntake:
         """Total size of the queued rollouts, in bytes."""
         return self._requests.bytes
 
+    @property
+    def left_out(self) -> Set[str]:
+        """Names of the live actors that no batch waits for, because they deliver nothing."""
+        with self._lock:
+            return self._buffer.left_out
+
     def expect_state_size(self, state_size: int) -> None:
         """Set the size of the recurrent state in a rollout. Call before any actor has the program."""
         self._intake.state_size = state_size
@@ -89,12 +100,27 @@ class RolloutIntake:
         """Queue a rollout, or answer busy. Does not block."""
         if self._closed:
             request.reply(encode(Acknowledgement(verdict="finished")))
+        elif self._refuses_size(request):
+            pass
         elif not self._requests.offer(request):
             request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
             with self._lock:
                 actor = self._fleet.actors.get(keys.last_chunk(request.key))
                 if actor is not None:
                     actor.busy += 1
+
+    def _refuses_size(self, request: Request) -> bool:
+        """Refuse a request that cannot be a rollout of its sender, without a copy of its payload."""
+        sender = keys.last_chunk(request.key)
+        refused = self._intake.refuse_size(sender, request.size)
+        if refused is None:
+            return False
+        with self._lock:
+            refused = self._intake.judge(sender, refused, self._version, time.monotonic())
+            assert isinstance(refused, Rejected)
+            self._counters.rollouts_rejected[refused.cause] += 1
+        request.reply(encode(acknowledgement(refused, self._published_version())))
+        return True
 
     # ------------------------------------------------------------------------------------ the learner's thread
 
@@ -116,8 +142,32 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
+    def count_trained(self, rollouts: list[Rollout], at_fault: list[Rollout]) -> None:
+        """Count the rollouts of a batch for their senders, after its updates.
+
+        Args:
+          rollouts: the rollouts of the batch.
+          at_fault: those for which an update had no finite gradient.
+        """
+        with self._lock:
+            for rollout in rollouts:
+                finite = not any(rollout is each for each in at_fault)
+                actor = self._fleet.find(rollout.identity)
+                if actor is not None:
+                    actor.count_trained(finite=finite)
+                if not finite:
+                    self._counters.rollouts_rejected["non_finite"] += 1
+
     def _take(self, version: int) -> TakenRollouts:
-        return self._buffer.take(self._fleet.live, version)
+        taken = self._buffer.take(self._fleet.live, version, time.monotonic())
+        self._named &= self._fleet.actors.keys()
+        for name in sorted(self._buffer.left_out - self._named):
+            self._named.add(name)
+            _logger.warning(
+                "batches no longer wait for actor %r, which is connected but sends nothing: examine its environment",
+                name,
+            )
+        return taken
 
     def _count(self, taken: TakenRollouts, version: int) -> None:
         actors = self._fleet.actors  # an actor that was absent for long may have been evicted
@@ -155,6 +205,8 @@ class RolloutIntake:
             content = Rejected(
                 verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
             )
+        if isinstance(content, Rollout):
+            self._buffer.heard(sender)
         verdict = self._intake.judge(sender, content, self._version, time.monotonic())
         self._fleet.received(sender, size)
         if isinstance(verdict, Rollout):
@@ -178,6 +230,11 @@ class RolloutIntake:
         self._buffer.add(rollout)
         self._counters.accepted(rollout, size)
         self._lock.notify_all()
+
+
+def largest_request(spec: RunSpec) -> int:
+    """Return the size of the largest query that a learner answers, in bytes: the learner receives none above it."""
+    return max(Limits(max_bytes=spec.service.queue_bytes).message_bytes, EVALUATION_LIMITS.message_bytes)
 
 
 def _queue(spec: RunSpec) -> RequestQueue:

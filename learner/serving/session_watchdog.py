@@ -1,10 +1,12 @@
 """Watchdog that reopens the transport's session if requests no longer reach the learner. Has its own thread."""
 
-import contextlib
+import logging
 import threading
 import time
 
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import RefusedError, Transport, TransportError
+
+_logger = logging.getLogger(__name__)
 
 _SILENCE_SECONDS = 10.0  # without any request for so long, the session may be dead
 
@@ -20,6 +22,7 @@ class SessionWatchdog:
         self._transport, self._own_key = transport, own_key
         self._heard_at = time.monotonic()
         self._closed = threading.Event()
+        self._warned = False  # that the certificate is refused
         self._thread = threading.Thread(target=self._watch, name="session watchdog", daemon=True)
 
     def open(self) -> None:
@@ -37,7 +40,16 @@ class SessionWatchdog:
     def _watch(self) -> None:
         while not self._closed.wait(_SILENCE_SECONDS / 2):
             if time.monotonic() > self._heard_at + _SILENCE_SECONDS:
-                with contextlib.suppress(
-                    TransportError
-                ):  # no router is reachable: the present session keeps trying to connect
-                    self._transport.reopen(unless_served=self._own_key)
+                self._reopen()
+
+    def _reopen(self) -> None:
+        try:
+            self._transport.reopen(unless_served=self._own_key)
+        except RefusedError as error:  # it was revoked or has expired since the start
+            if not self._warned:
+                _logger.error("the learner cannot connect to its router: %s", error)
+            self._warned = True
+        except TransportError:
+            pass  # no router is reachable: the present session keeps trying to connect
+        else:
+            self._warned = False

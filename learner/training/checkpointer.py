@@ -44,6 +44,15 @@ class Checkpointer:
         self._directory, self._spec, self._spaces = directory, spec, spaces
         self._learner, self._program = learner, program
         self._counters, self._evaluations, self._health = counters, evaluations, health
+        self._newest: tuple[int, Path] | None = None  # policy version and directory of the last checkpoint
+
+    def ensure_saved(self) -> Path | None:
+        """Return the checkpoint of the present version; save it if it was not saved. Return None on a disk error."""
+        if self._newest is not None:
+            version, directory = self._newest
+            if version == self._learner.policy_version and directory.exists():
+                return directory
+        return self.save()
 
     def save(self) -> Path | None:
         """Save a checkpoint and return its directory, or None on a disk error."""
@@ -73,4 +82,5 @@ class Checkpointer:
         if self._health.save_fault:
             _logger.info("checkpoints are saved again")
         self._health.saved, self._health.save_fault = time.monotonic(), ""
+        self._newest = self._learner.policy_version, directory
         return directory

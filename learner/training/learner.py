@@ -11,6 +11,7 @@ from daedalus.algorithms.batch import BatchAssembler
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.learner.training.gradient_faults import rollouts_at_fault
 from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
@@ -57,18 +58,22 @@ class Learner:
         """S, the size of the recurrent state of the policy; 0 without memory."""
         return self._network.state_size
 
-    def step(self, rollouts: Sequence[Rollout], progress: float) -> None:
-        """Make all updates of one batch.
+    def step(self, rollouts: Sequence[Rollout], progress: float) -> list[Rollout]:
+        """Make all updates of one batch. Return the rollouts that are at fault if an update was skipped.
 
         Args:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
         batch = self._assembler.join(rollouts).to(self._device)
+        skipped = self.updates_skipped
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             self.policy_version += 1
             self._apply_gradients(terms, self.learning_rate(progress))
         self.metrics.add_batch(batch)
+        if self.updates_skipped == skipped:
+            return []
+        return rollouts_at_fault(self._gradients, self._spaces.observation, self._device, rollouts)
 
     def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:
         """Take one optimiser step with the gradients that were computed last."""

@@ -4,22 +4,21 @@ TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actor
 """
 
 import hashlib
-import os
+import threading
 from typing import Any, Protocol
 
 import numpy as np
-import onnxruntime
 
+from daedalus.policy.acting.call_watchdog import CallWatchdog
+from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.onnx_initializers import with_initializers
-from daedalus.policy.acting.sampling import SAMPLERS
+from daedalus.policy.acting.program_check import check_program
+from daedalus.policy.acting.program_session import ProgramSession
+from daedalus.policy.acting.sampling import SAMPLERS, RandomSource
 
 OBSERVATIONS, STATE = "observations", "state"
 NEXT_STATE = "next_state"
 _MAX_STATE_SIZE = 1 << 16
-
-
-class PolicyError(Exception):
-    """A program or weights that do not fit together or do not fit the spaces: a fault of the sender."""
 
 
 class PolicyRuntime(Protocol):
@@ -38,7 +37,7 @@ class PolicyRuntime(Protocol):
         ...
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Choose one action for each observation: a sample if `random` is given, otherwise the most probable.
 
@@ -65,12 +64,17 @@ class OnnxRuntime:
     convolutions is instead loaded again for each snapshot, with the weights as constants.
     """
 
-    def __init__(self, model: bytes) -> None:
-        """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it."""
+    def __init__(self, model: bytes, stop: threading.Event | None = None) -> None:
+        """Raise PolicyError if `model` is not a program as policy/acting/program.py exports it.
+
+        `stop` ends a call that is in progress; it then raises PolicyError.
+        """
+        check_program(model, (OBSERVATIONS, STATE))
         self._model = model
-        self._session = _session(model)
-        inputs = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
-        outputs = {entry.name: entry.type for entry in self._session.get_outputs()}
+        self._watchdog = CallWatchdog(stop)
+        self._session = ProgramSession(model, self._watchdog)
+        inputs = {entry.name: tuple(entry.shape) for entry in self._session.onnx.get_inputs()}
+        outputs = {entry.name: entry.type for entry in self._session.onnx.get_outputs()}
         self._parameters = next(iter(outputs), "")  # name of the first output
         expected = [self._parameters, NEXT_STATE] if STATE in inputs else [self._parameters]
         known = OBSERVATIONS in inputs and self._parameters in SAMPLERS
@@ -108,21 +112,18 @@ class OnnxRuntime:
                 )
         bound = {name: weights[name] for name in self._shapes}
         if self._convolutional:
-            self._session = _session(with_initializers(self._model, bound))
+            self._session = ProgramSession(with_initializers(self._model, bound), self._watchdog)
         else:
             self._feed = bound
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
         self._feed[OBSERVATIONS] = observations
         if self._state_size:
             self._feed[STATE] = state
-        try:
-            outputs: Any = self._session.run(None, self._feed)
-        except Exception as error:  # onnxruntime's exceptions share no base of their own
-            raise PolicyError(f"the program failed: {_first_line(error)}") from None
+        outputs = self._session.run(self._feed)
         parameters = outputs[0]  # [E, P]
         if parameters.ndim != 2 or parameters.shape[0] != len(observations) or not parameters.shape[1]:
             raise PolicyError(
@@ -137,20 +138,6 @@ class OnnxRuntime:
         return actions, log_probs, state
 
 
-def _session(model: bytes) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    # An actor has one core at most; spinning threads would take time from other processes.
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    # A model may name files to read weights from. A received program must not read files: no such file exists here.
-    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
-    try:
-        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
-
-
 def _state_size(shape: tuple[Any, ...]) -> int:
     match shape:
         case (_, int(size)) if 0 < size <= _MAX_STATE_SIZE:
@@ -158,7 +145,3 @@ def _state_size(shape: tuple[Any, ...]) -> int:
     raise PolicyError(
         f"the program's {STATE!r} has shape {shape}, it must be [rows, S] with S from 1 to {_MAX_STATE_SIZE}"
     )
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

@@ -7,10 +7,18 @@ import numpy as np
 LOGITS = "logits"
 
 
+class RandomSource(Protocol):
+    """Source of the random numbers of one batch of rows: a numpy.random.Generator, or one generator for each row."""
+
+    def random(self, size: int, dtype: type[np.float32]) -> np.ndarray:
+        """Return one uniform number from [0, 1) for each of `size` rows."""
+        ...
+
+
 class ActionSampler(Protocol):
     """Draws actions from the parameters that a program computes."""
 
-    def sample(self, parameters: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def sample(self, parameters: np.ndarray, random: RandomSource) -> tuple[np.ndarray, np.ndarray]:
         """Draw one action for each row.
 
         Args:
@@ -29,7 +37,7 @@ class ActionSampler(Protocol):
 class CategoricalSampler:
     """Samples softmax policies; the parameters are logits."""
 
-    def sample(self, parameters: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def sample(self, parameters: np.ndarray, random: RandomSource) -> tuple[np.ndarray, np.ndarray]:
         """Draw one action from each softmax policy, by inverting its cumulative distribution.
 
         Args:

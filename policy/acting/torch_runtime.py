@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from daedalus.policy.acting.runtime import PolicyError
-from daedalus.policy.acting.sampling import SAMPLERS
+from daedalus.policy.acting.sampling import SAMPLERS, RandomSource
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
 from daedalus.protocol.spaces import Spaces
@@ -49,7 +49,7 @@ class TorchRuntime:
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See PolicyRuntime."""
         output, next_state = self._network.act(torch.from_numpy(observations), torch.from_numpy(state))

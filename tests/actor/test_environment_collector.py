@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from collectors import collect, started_collector
 
+from daedalus.policy.acting.sampling import RandomSource
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -33,7 +34,7 @@ class Scripted:
         pass
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.seen.append(observations.copy())
         self.remembered.append(state.copy())
@@ -208,7 +209,7 @@ class Memoryless(Scripted):
     state_size = 0
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert state.shape == (len(observations), 0)
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state

@@ -1,13 +1,16 @@
-"""play_episodes: every environment plays its share of whole episodes."""
+"""play_episodes: whole episodes in rounds, one in each environment."""
 
 import os
+from typing import Any
 
 import numpy as np
 from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 
+from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
+from daedalus.policy.acting.sampling import RandomSource
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
@@ -20,7 +23,7 @@ class AlwaysZero:
         pass
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert random is None
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
@@ -32,7 +35,7 @@ class Remembering(AlwaysZero):
     state_size = 2
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         chosen = [one_action(stack, memory) for stack, memory in zip(observations, state, strict=True)]
         actions, memories = zip(*chosen, strict=True)
@@ -63,28 +66,29 @@ def one_by_one(episodes: int) -> list[tuple[float, int]]:
     return played
 
 
-def test_each_environment_plays_its_share_of_whole_episodes() -> None:
+def counting(count: int, **fields: Any) -> VectorEnvironment:
+    return make_environments(COUNTING.model_copy(update=fields), count, modules=TEST_MODULES, for_evaluation=True)
+
+
+def test_each_environment_plays_one_episode_of_each_round() -> None:
     """Episodes last 3, 2, 1, 3, ... steps in each environment; by hand: 0+1+2, 10+11, 20, 30+31+32."""
-    environments = make_environments(COUNTING, 2, modules=TEST_MODULES)
-    evaluation = play_episodes(AlwaysZero(), environments, 7, 1, sampled=False)
-    # the first environment plays four, the second three
-    assert sorted(evaluation.returns.tolist()) == [3, 3, 20, 20, 21, 21, 93]
-    assert sorted(evaluation.lengths.tolist()) == [1, 1, 2, 2, 3, 3, 3]
+    evaluation = play_episodes(AlwaysZero(), counting(2), 7, 1, sampled=False)
+    assert evaluation.returns.tolist() == [3, 3, 21, 21, 20, 20, 93]
+    assert evaluation.lengths.tolist() == [3, 3, 2, 2, 1, 1, 3]
 
 
 def test_stacks_and_memory_equal_those_of_episodes_played_one_by_one() -> None:
-    environments = make_environments(COUNTING.model_copy(update={"frame_stack": 4}), 3, modules=TEST_MODULES)
-    evaluation = play_episodes(Remembering(), environments, 20, 1, sampled=False)
-    expected = one_by_one(7) + one_by_one(7) + one_by_one(6)
+    evaluation = play_episodes(Remembering(), counting(3, frame_stack=4), 20, 1, sampled=False)
+    expected = [episode for episode in one_by_one(7) for _ in range(3)][:20]
     returns = [round(float(value), 3) for value in evaluation.returns]
-    assert sorted(zip(returns, evaluation.lengths.tolist(), strict=True)) == sorted(expected)
+    assert list(zip(returns, evaluation.lengths.tolist(), strict=True)) == expected
     # The actions must differ for this test to mean anything: zeros alone would give whole numbers.
     assert len({round(value % 1, 1) for value in returns}) > 3
 
 
 def test_short_episodes_are_not_favoured() -> None:
     """Counting whichever episodes end first would count more short ones."""
-    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 50)
+    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 50, for_evaluation=True)
     few = play_episodes(AlwaysZero(), environments, 50, 1, sampled=False)
     many = play_episodes(AlwaysZero(), environments, 2000, 1, sampled=False)
     assert len(few.returns) == 50
@@ -94,19 +98,18 @@ def test_short_episodes_are_not_favoured() -> None:
 
 def test_progress_is_reported_after_every_step() -> None:
     reports: list[tuple[int, float]] = []
-    environments = make_environments(COUNTING, 2, modules=TEST_MODULES)
     evaluation = play_episodes(
         AlwaysZero(),
-        environments,
+        counting(2),
         3,
         1,
         sampled=False,
         progress=lambda finished, mean: reports.append((finished, mean)),
     )
-    # Steps 1 to 3 end the first episode of both; then a reset row, and two steps to the end of the first's second.
-    assert [finished for finished, _ in reports] == [0, 0, 2, 2, 2, 3]
+    # Steps 1 to 3 end the first episode of both; two more end the second episode of the first.
+    assert [finished for finished, _ in reports] == [0, 0, 2, 2, 3]
     assert np.isnan([mean for _, mean in reports[:2]]).all()
-    assert [mean for _, mean in reports[2:]] == [3, 3, 3, 9]
+    assert [mean for _, mean in reports[2:]] == [3, 3, 9]
     assert evaluation.returns.tolist() == [3, 3, 21]
 
 

@@ -17,7 +17,7 @@ from daedalus.protocol.messages import (
     RunEnded,
     Welcome,
 )
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import RefusedError, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
@@ -75,6 +75,32 @@ def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     actor.join()
     assert isinstance(actor.error, ActorError)
     assert "its environment has 3 choices" in str(actor.error)
+
+
+def test_actor_whose_rollouts_the_learner_cannot_take_ends_with_the_setting_to_raise(network: MemoryNetwork) -> None:
+    """The network drops such a message in silence: nobody would ever answer it."""
+    service = SPEC.service.model_copy(update={"queue_megabytes": 0.0001})
+    learner = ScriptedLearner(network, SPEC.model_copy(update={"service": service}))
+    actor = RunningActor(network)
+    learner.publish(0)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert "fewer environments (--envs), or raise service.queue_megabytes" in str(actor.error)
+    assert learner.rollouts.empty()
+
+
+def test_actor_ends_with_the_reason_when_its_certificate_is_refused(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reopen(_: MemoryTransport) -> bool:
+        raise RefusedError("the certificate expired on 2030-01-01: renew it")
+
+    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
+    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.02)
+    actor = RunningActor(network)
+    actor.join()
+    assert isinstance(actor.error, ActorError)
+    assert str(actor.error) == "the certificate expired on 2030-01-01: renew it"
 
 
 def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:

@@ -149,3 +149,17 @@ def test_synchronous_actor_requests_the_next_version_if_its_push_was_lost(networ
     assert learner.receive()[0].policy_version == 1
     actor.stop.set()
     actor.join()
+
+
+def test_synchronous_actor_whose_stale_rollout_is_rejected_requests_the_next_version(network: MemoryNetwork) -> None:
+    """Otherwise it would collect with the version that it has, for ever, and every rollout would be stale."""
+    spec = SPEC.model_copy(update={"training": SPEC.training.model_copy(update={"algorithm": "a2c"})})
+    learner = ScriptedLearner(network, spec)
+    actor = RunningActor(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    learner.publish(1, push=False)
+    acknowledge(request, "rejected", 1)
+    assert learner.receive()[0].policy_version == 1
+    actor.stop.set()
+    actor.join()

@@ -120,6 +120,16 @@ def test_clipped_gradient_equals_the_policy_gradient_at_a_ratio_of_1(random: tor
     assert_close(gradients[0], gradients[1])
 
 
+@pytest.mark.parametrize("log_ratio", [1e3, 1e30])
+def test_huge_ratio_does_not_overflow_the_clipped_loss(log_ratio: float) -> None:
+    log_ratios = torch.tensor([[log_ratio, 0.1], [log_ratio, -0.1]], requires_grad=True)
+    loss = clipped_policy_loss(log_ratios, torch.tensor([[1.0, 1.0], [-1.0, 1.0]]), torch.ones(2, 2), 0.2)
+    (gradient,) = torch.autograd.grad(loss, log_ratios)
+    assert loss.isfinite()
+    assert gradient.isfinite().all()
+    assert gradient[:, 1].all()
+
+
 def test_clipped_fraction_is_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
     log_ratios = normal(random) / 4.0
     left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}

@@ -10,8 +10,7 @@ import pytest
 from log_lines import LINES
 from processes import LIMIT, until
 
-from daedalus.bridge import connection as client_module
-from daedalus.bridge import service as service_module
+from daedalus.bridge import clients, packet_socket
 from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
 from daedalus.bridge.service import Bridge
 from daedalus.transport.interface import Transport, TransportError
@@ -197,12 +196,13 @@ def test_client_without_greeting_is_disconnected(scene: Scene) -> None:
         stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert stranger.recv(4) == GREETING
         with contextlib.suppress(ConnectionError):  # it is closed with bytes unread
-            assert stranger.recv(1) == b""
+            while stranger.recv(64):
+                pass
     until(lambda: any("uses another protocol" in line for line in LINES))
 
 
 def test_client_that_stalls_within_a_packet_is_disconnected(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "STALL_SECONDS", 0.1)
+    monkeypatch.setattr(packet_socket, "STALL_SECONDS", 0.1)
     caller = scene.call()
     caller.send(Kind.QUERY, 1, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
@@ -243,6 +243,14 @@ def test_disconnection_is_noticed_while_the_budget_is_full(scene: Scene) -> None
     held.clear()
 
 
+def test_number_of_followed_keys_is_limited(scene: Scene) -> None:
+    caller = scene.call()
+    for number in range(9):
+        caller.send(Kind.FOLLOW, number, "daedalus/r/snapshots")
+    kind, _, _, reason = caller.next()
+    assert (kind, b"more than 8 keys" in reason) == (Kind.ERROR, True)
+
+
 def test_number_of_declarations_is_limited(scene: Scene) -> None:
     caller = scene.call()
     for number in range(65):
@@ -257,15 +265,134 @@ def test_unreachable_network_is_reported_to_the_client(scene: Scene) -> None:
 
     scene.open = unreachable
     caller = scene.call()
+    caller.send(Kind.QUERY, 1, "daedalus/r/status")
     assert caller.next() == (Kind.ERROR, 0, "", b"nothing answers at tcp/127.0.0.1:1")
     assert caller.ended()
 
 
+# ------------------------------------------------------------------------------------ places and memory
+
+
+def use(scene: Scene, caller: Caller) -> None:
+    """Send a query and read its end, so that the bridge counts the caller as a client."""
+    caller.send(Kind.QUERY, 1, "daedalus/r/status")
+    assert caller.next()[0] == Kind.END
+
+
 def test_clients_beyond_the_limit_are_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service_module, "_MAX_CLIENTS", 1)
-    scene.call()
-    with socket.create_connection(("127.0.0.1", scene.port), LIMIT) as late:
-        assert late.recv(1) == b""
+    monkeypatch.setattr(clients, "MAX_CLIENTS", 1)
+    first, late = scene.call(), scene.call()
+    use(scene, first)
+    late.send(Kind.QUERY, 1, "daedalus/r/status")
+    kind, _, _, reason = late.next()
+    assert (kind, b"clients are connected already" in reason) == (Kind.ERROR, True)
+    assert late.ended()
+    use(scene, first)
+
+
+def test_new_client_takes_the_place_of_the_longest_silent_one(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clients, "MAX_CLIENTS", 2)
+    monkeypatch.setattr(clients, "IDLE_SECONDS", 0.0)
+    silent, busy, new = scene.call(), scene.call(), scene.call()
+    for caller in (silent, busy, new):
+        use(scene, caller)
+    assert silent.ended()
+    use(scene, busy)
+    until(lambda: any("and a new client needs its place" in line for line in LINES))
+
+
+@pytest.mark.parametrize("greeting", [b"", GREETING], ids=["silent", "greeted"])
+def test_connections_without_a_packet_take_no_place(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, greeting: bytes
+) -> None:
+    monkeypatch.setattr(clients, "MAX_CLIENTS", 1)
+    monkeypatch.setattr(clients, "_MAX_NEW_CONNECTIONS", 4)
+    with contextlib.ExitStack() as stack:
+        address = ("127.0.0.1", scene.port)
+        silent = [stack.enter_context(socket.create_connection(address, LIMIT)) for _ in range(20)]
+        for connection in silent:
+            with contextlib.suppress(ConnectionError):  # the oldest are disconnected already
+                connection.sendall(greeting)
+        use(scene, scene.call())
+        assert len(scene.network.ends) == 2  # no session for the silent ones
+        with contextlib.suppress(ConnectionError):
+            assert silent[0].recv(8) in (b"", GREETING)
+            assert silent[0].recv(8) == b""
+        until(lambda: any("newer connections wait" in line for line in LINES))
+
+
+def test_client_that_sends_no_packet_is_disconnected(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packet_socket, "HANDSHAKE_SECONDS", 0.1)
+    caller = scene.call()
+    kind, _, _, reason = caller.next()
+    assert (kind, b"sent no packet within 0.1 s" in reason) == (Kind.ERROR, True)
+    assert caller.ended()
+
+
+def test_client_that_sends_a_packet_byte_by_byte_is_disconnected(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packet_socket, "STALL_SECONDS", 0.3)
+    caller = scene.call()
+    use(scene, caller)
+    with contextlib.suppress(ConnectionError):
+        for byte in HEADER.pack(0, Kind.QUERY, 100, 0, 1) + b"daedalus/" + b"x" * 1000:
+            caller.socket.sendall(bytes([byte]))
+            threading.Event().wait(0.02)
+    assert any("within a packet" in line for line in LINES)
+
+
+def test_client_that_leaves_answers_unread_is_dropped(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clients, "CLIENT_BYTES", 8 << 20)
+    value = bytes(8 << 20)  # more than the sockets hold
+    scene.end.serve("daedalus/r/snapshots", lambda request: request.reply(value))
+    reader, caller = scene.call(), scene.call()
+    for number in range(4):
+        caller.send(Kind.QUERY, number, "daedalus/r/snapshots")
+    until(lambda: any("bytes of its queries and unread answers wait" in line for line in LINES))
+    until(lambda: len(scene.network.ends) == 1)  # its session ended; the reader sent no packet yet
+    reader.send(Kind.QUERY, 1, "daedalus/r/snapshots")  # one answer of any size fits
+    assert reader.next() == (Kind.ANSWER, 1, "", value)
+    assert reader.next()[0] == Kind.END
+
+
+def test_client_with_the_largest_share_is_dropped_when_all_hold_too_much(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clients, "TOTAL_BYTES", 20 << 20)
+    scene.end.serve("daedalus/r/snapshots", lambda request: request.reply(bytes(8 << 20)))
+    small, large = scene.call(), scene.call()
+    small.send(Kind.QUERY, 1, "daedalus/r/snapshots")
+    assert small.read(1)  # the answer is on its way
+    for number in range(4):
+        large.send(Kind.QUERY, number, "daedalus/r/snapshots")
+    until(lambda: any("bytes of queries and answers wait in the bridge" in line for line in LINES))
+    until(lambda: len(scene.network.ends) == 2)
+    assert len(small.read(HEADER_BYTES - 1 + (8 << 20))) == HEADER_BYTES - 1 + (8 << 20)
+    assert small.next()[0] == Kind.END
+
+
+def test_queries_in_transfer_count_before_their_memory_is_allocated(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clients, "TOTAL_BYTES", MAX_QUERY_BYTES)
+    callers = [scene.call() for _ in range(3)]
+    key = b"daedalus/r/status"
+    for caller in callers:
+        use(scene, caller)
+        caller.socket.sendall(HEADER.pack(MAX_QUERY_BYTES, Kind.QUERY, len(key), 0, 1) + key)
+    until(lambda: any("bytes of queries and answers wait in the bridge" in line for line in LINES))
+    until(lambda: len(scene.network.ends) == 3)  # two callers and the scene's own
+
+
+def test_news_waits_in_the_transport_until_the_client_reads(scene: Scene) -> None:
+    caller = scene.call()
+    for number in range(8):
+        caller.send(Kind.FOLLOW, number, "daedalus/r/snapshots")
+    use(scene, caller)
+    value = bytes(8 << 20)
+    scene.end.publish("daedalus/r/snapshots", value)
+    assert caller.read(1)
+    transport = next(end for end in scene.network.ends if end is not scene.end)
+    assert sum(inbox.newest is not None for inbox in transport._inboxes) == 7
 
 
 def test_stop_disconnects_clients_and_ends_their_presence(scene: Scene) -> None:

@@ -1,13 +1,16 @@
 """Test of `daedalus certs`."""
 
+import datetime
 import json
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 
+from daedalus.cli import certificate_folder
 from daedalus.cli.commands.certs import certs
-from daedalus.transport.credentials import load
+from daedalus.transport.credentials import authorised_names, load
 
 
 def make(directory: Path) -> Path:
@@ -30,21 +33,20 @@ def test_a_key_file_is_readable_by_its_owner_only(tmp_path: Path) -> None:
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
 
 
-def test_issue_and_revoke_update_the_authorised_names_of_learner_and_router(tmp_path: Path) -> None:
+def test_issue_and_revoke_update_the_authorised_clients_of_learner_and_router(tmp_path: Path) -> None:
     made = make(tmp_path / "certs")
     assert certs(["issue", "actor", "arm", "box", "--directory", str(made)]) == 0
     assert certs(["issue", "operator", "ann", "--directory", str(made)]) == 0
     credentials = load(made / "actor-arm", "actor")
     assert (credentials.role, credentials.name) == ("actor", "arm")
     for role in ("learner", "router"):
-        names = json.loads((made / role / "names.json").read_text())
-        assert names == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
+        assert authorised_names(made / role) == {"actors": ["arm", "box"], "operators": ["ann", "operator"]}
     zenohd = json.loads((made / "router" / "zenoh.json5").read_text())
     assert {"actor:arm", "actor:box"} < {
         name for subject in zenohd["access_control"]["subjects"] for name in subject.get("cert_common_names", ())
     }
     assert certs(["revoke", "actor", "box", "--directory", str(made)]) == 0
-    assert json.loads((made / "learner" / "names.json").read_text())["actors"] == ["arm"]
+    assert authorised_names(made / "learner")["actors"] == ["arm"]
     assert not (made / "actor-box").exists()
 
 
@@ -65,6 +67,55 @@ def test_issue_prints_the_folders_that_it_writes(tmp_path: Path, capsys: pytest.
     assert all((folder / "key.pem").is_file() for folder in printed)
 
 
+def test_list_shows_when_each_certificate_expires(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make(tmp_path / "certs")
+    assert certs(["issue", "actor", "arm", "--days", "29", "--directory", str(made)]) == 0
+    shutil.rmtree(made / "actor-arm")  # moved to its host
+    capsys.readouterr()
+    assert certs(["list", "--directory", str(made)]) == 0
+    header, first, *others = capsys.readouterr().out.splitlines()
+    assert header.split() == ["certificate", "expires", "days"]
+    expires = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=29)
+    assert first.split(None, 3) == ["actor-arm", f"{expires:%Y-%m-%d}", "28", "renew it soon"]
+    assert [line.split()[0] for line in others] == ["learner", "operator", "router"]
+    assert all(line.split()[2] == "824" for line in others)
+
+
+def test_renew_replaces_certificates_that_expire_soon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make(tmp_path / "certs")
+    renew = ["renew", "--directory", str(made)]
+    assert certs(renew) == 0
+    assert capsys.readouterr().out.endswith("no certificate expires within 30 days\n")
+    assert certs(["issue", "actor", "arm", "box", "--days", "20", "--directory", str(made)]) == 0
+    assert certs(["issue", "router", "--host", "far", "--days", "20", "--directory", str(made)]) == 0
+    clients = (made / "learner" / "clients.pem").read_bytes()
+    assert certs(renew) == 0
+    days = {folder: load(made / folder, role).days_left() for folder, role in ROLES.items()}
+    assert all(days[folder] > 800 for folder in ROLES)
+    assert "valid for far, " in capsys.readouterr().out  # the hosts stay
+    assert (made / "learner" / "clients.pem").read_bytes() == clients  # nothing to copy to the listeners
+    assert certs([*renew, "actor", "arm", "--days", "7"]) == 0
+    assert load(made / "actor-arm", "actor").days_left() < 8
+    assert load(made / "actor-box", "actor").days_left() > 800
+    assert certs([*renew, "actor", "--days", "6"]) == 0
+    assert load(made / "actor-box", "actor").days_left() < 7
+
+
+ROLES = {"actor-arm": "actor", "actor-box": "actor", "router": "router", "learner": "learner"}
+
+
+def test_more_certificates_than_a_handshake_has_room_for_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = make(tmp_path / "certs")
+    monkeypatch.setattr(certificate_folder, "_MAX_SUBJECT_BYTES", 60)
+    assert certs(["issue", "actor", "arm", "--directory", str(made)]) == 0
+    assert certs(["issue", "actor", "box", "--directory", str(made)]) == 1
+    assert not (made / "actor-box").exists()
+    assert "3 certificates are more than a listener can accept: issue one for each host" in capsys.readouterr().err
+    assert authorised_names(made / "learner")["actors"] == ["arm"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -74,7 +125,9 @@ def test_issue_prints_the_folders_that_it_writes(tmp_path: Path, capsys: pytest.
         (["issue", "actor", "a.b", "--directory", "{certs}"], "'a.b' has a '.': name it 'a'"),
         (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
         (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
-        (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a"),
+        (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a: see `daedalus certs list`"),
+        (["renew", "actor", "a", "--directory", "{certs}"], "no certificate was issued for actor-a"),
+        (["list", "--directory", "{certs}/nowhere"], "holds no CA"),
     ],
 )
 def test_a_mistake_is_reported_in_one_line_and_changes_no_file(

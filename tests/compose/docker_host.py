@@ -15,7 +15,7 @@ from pathlib import Path
 from pip_configuration import for_image, options_of
 
 BASE = "daedalus-test-base"  # the name in override.yml
-_PYTHON = "python:3.11-slim"  # the name in the Dockerfile
+_PYTHON = "python:3.11.14-slim-bookworm"  # the name in the Dockerfile
 _STAND_IN = "daedalus-test-debian"
 _STAND_IN_PACKAGES = "python3,python3-venv,python3-pip,ca-certificates"
 _LIMIT = 120.0  # seconds for a daemon to start

@@ -1,5 +1,6 @@
 """Test of docker-compose.yml and the files that it mounts. `make test-compose` starts the containers."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,8 @@ import pytest
 import yaml
 import zenoh
 from commands import check
+
+from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 ROOT = Path(__file__).parents[2]
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -53,7 +56,7 @@ def test_ports_are_open_on_the_loopback_address_only() -> None:
 
 def test_each_mounted_file_exists() -> None:
     mounts = [mount for service in SERVICES.values() for mount in service.get("volumes", []) if mount.startswith("./")]
-    assert len(mounts) == 4
+    assert len(mounts) == 5
     assert all((ROOT / mount.split(":")[0]).exists() for mount in mounts)
 
 
@@ -66,6 +69,26 @@ def test_host_names_in_addresses_are_services() -> None:
     assert hosts <= SERVICES.keys()
 
 
+def test_each_container_is_limited() -> None:
+    for name, service in SERVICES.items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["mem_limit"], name
+        assert service["pids_limit"] > 0, name
+        assert service["logging"]["options"].keys() == {"max-size", "max-file"}, name
+        assert any(mount.startswith("/tmp:") for mount in service["tmpfs"]), name
+
+
+def test_images_of_others_are_pinned() -> None:
+    for service in SERVICES.values():
+        if not service["image"].startswith("daedalus-"):
+            assert re.search(r":v?\d+\.\d+\.\d+$|@sha256:[0-9a-f]{64}$", service["image"]), service["image"]
+    (base,) = re.findall(r"^ARG BASE=(\S+)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert re.search(r":\d+\.\d+\.\d+-slim-\w+$", base)
+    assert f'_PYTHON = "{base}"' in (ROOT / "tests" / "compose" / "docker_host.py").read_text()
+
+
 def test_the_router_image_has_the_zenoh_version_of_the_constraints() -> None:
     assert f"eclipse-zenoh=={SERVICES['router']['image'].split(':')[1]}\n" in (ROOT / "constraints.txt").read_text()
 
@@ -74,4 +97,6 @@ def test_zenoh_reads_the_configuration_of_the_router() -> None:
     configuration = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
     assert configuration.get_json("mode") == '"router"'
     assert configuration.get_json("listen/endpoints") == '["tcp/0.0.0.0:7447"]'
-    assert configuration.get_json("transport/link/tx/lease") == "2000"
+    settings = session_settings("router", [], [], {}, Capacity())
+    written = {path: json.loads(configuration.get_json(path)) for path in settings if path.startswith("transport/")}
+    assert written == {path: settings[path] for path in written}

@@ -1,5 +1,6 @@
 """Test of learner, actors and status over TLS."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,15 +44,24 @@ def test_authorised_actors_of_other_machines_join_train_over_tls(start: Start, t
     until(lambda: start(*asking, certificates / "operator").wait() == 0)
 
 
-def test_an_unauthorised_actor_gets_a_hint_about_the_list_of_names(start: Start, tls: str, certificates: Path) -> None:
-    """Issue a valid certificate after the start of the learner."""
-    start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run").expect(
-        "actors join with"
-    )
+def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls: str, certificates: Path) -> None:
+    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+    router = start("router", "--listen", tls, "--tls", certificates / "router")
+    router.expect("listening")
+    learner = start("learner", "cartpole", "--connect", tls, "--tls", certificates / "learner", *endless)
+    shutil.copytree(certificates / "actor-arm", certificates / "kept")
+    arm = start("actor", "--connect", tls, "--tls", certificates / "kept")
+    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box")
+    for actor in (arm, box):
+        actor.expect("joined run")
+    assert certs(["revoke", "actor", "arm", "--directory", str(certificates)]) == 0
+    assert arm.wait() == 1
+    arm.expect(r"the service at .* refuses the certificate in .*kept: it was revoked, or issued after")
     assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
-    late = start("actor", "--connect", tls, "--tls", certificates / "actor-late", "--timeout", 3)
-    assert late.wait() == 1
-    late.expect("no learner answered .* actor 'late' authorised by it .or by its router..* is read at start")
+    router.expect("2 actors and 1 operators are authorised; all connections are renewed")
+    start("actor", "--connect", tls, "--tls", certificates / "actor-late").expect("joined run")
+    learner.expect("actors 2")
+    assert [each.process.poll() for each in (router, learner, box)] == [None] * 3
 
 
 def test_mistakes_with_certificates_are_reported_in_one_line(

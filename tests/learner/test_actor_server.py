@@ -155,14 +155,30 @@ def test_evaluator_messages_are_queued_until_the_learner_takes_them(
     evaluator.send(encode(EvaluationRequest(evaluator="e")))
     evaluator.send(encode(REPORT))
     assert evaluator.answers == []
-    (first, asked), (_, report) = server.evaluations.take()
+    ((first, asked),) = server.evaluations.take_requests()
+    ((_, report),) = server.evaluations.take_reports()
     assert asked == EvaluationRequest(evaluator="e")
     assert isinstance(report, EvaluationReport)
-    assert server.evaluations.take() == []
+    assert server.evaluations.take_requests() == server.evaluations.take_reports() == []
     first.reply(server.publisher.newest())
     (answer,) = evaluator.answers
     assert isinstance(answer, Snapshot)
     assert answer.policy_version == 3
+
+
+@pytest.mark.parametrize("message", [EvaluationRequest(evaluator="e"), REPORT])
+def test_newer_message_of_an_evaluator_replaces_the_older_one(
+    server: ActorServer, evaluator: FakeEvaluator, message: Message
+) -> None:
+    """An evaluator that was restarted gets its answer, and one that floods the learner has one message in the queue."""
+    offer_policy(server)
+    for _ in range(3):
+        evaluator.send(encode(message))
+    assert codes(evaluator) == ["not_ready"] * 2
+    waiting = server.evaluations.take_requests() + server.evaluations.take_reports()
+    assert len(waiting) == 1
+    waiting[0][0].reply(server.publisher.newest())
+    assert isinstance(evaluator.answers[-1], Snapshot)
 
 
 def test_evaluation_request_before_the_first_policy_is_refused_as_not_ready(
@@ -170,19 +186,19 @@ def test_evaluation_request_before_the_first_policy_is_refused_as_not_ready(
 ) -> None:
     evaluator.send(encode(EvaluationRequest(evaluator="e")))
     assert codes(evaluator) == ["not_ready"]
-    assert server.evaluations.take() == []
+    assert server.evaluations.take_requests() == []
 
 
-def test_evaluation_requests_above_the_queue_limit_are_refused_as_not_ready(
+def test_full_evaluation_queue_makes_room_by_dropping_messages_of_the_owner_with_the_most(
     server: ActorServer, evaluator: FakeEvaluator
 ) -> None:
     offer_policy(server)
-    for _ in range(64):
-        evaluator.send(encode(EvaluationRequest(evaluator="e")))
-    assert evaluator.answers == []
-    evaluator.send(encode(EvaluationRequest(evaluator="e")))
-    assert codes(evaluator) == ["not_ready"]
-    assert len(server.evaluations.take()) == 64
+    names = ["honest", *(f"greedy.{number}" for number in range(63)), "other", "greedy.63"]
+    for name in names:
+        evaluator.send(encode(EvaluationRequest(evaluator=name)), name)
+    assert codes(evaluator) == ["not_ready"] * 2
+    waiting = [message.evaluator for _, message in server.evaluations.take_requests()]
+    assert waiting == ["honest", *(f"greedy.{number}" for number in range(2, 63)), "other", "greedy.63"]
 
 
 @pytest.mark.parametrize(
@@ -202,7 +218,7 @@ def test_invalid_evaluator_message_is_refused_as_malformed(
     offer_policy(server)
     evaluator.send(payload)
     assert codes(evaluator) == ["malformed"]
-    assert server.evaluations.take() == []
+    assert server.evaluations.take_requests() == server.evaluations.take_reports() == []
 
 
 def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer, evaluator: FakeEvaluator) -> None:
@@ -243,7 +259,7 @@ def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, netw
         thread.start()
     for thread in threads:
         thread.join()
-    taken = {message.evaluator for _, message in server.evaluations.take()}
+    taken = {message.evaluator for _, message in server.evaluations.take_requests()}
     assert taken == {f"e{number}" for number in range(16)}
 
 

@@ -231,6 +231,15 @@ def test_report_with_returns_that_are_not_finite_is_rejected(run: Run, value: fl
     assert run.report(1, 3.0)[0].verdict == "accepted"
 
 
+def test_report_with_a_length_below_1_is_rejected(run: Run) -> None:
+    run.begin(1)
+    lengths = np.array([5, 0], np.int32)
+    report = EvaluationReport(
+        evaluator="e", learner_epoch=EPOCH, policy_version=1, returns=np.ones(2, np.float32), lengths=lengths
+    )
+    assert_not_accepted(run, *run.evaluations.report(report), "rejected", "lengths has a value below 1")
+
+
 # -------------------------------------------------------------------------------------------------- metrics
 
 
@@ -259,3 +268,11 @@ def test_number_of_checkpoints_in_use_is_bounded_when_evaluators_never_report(tm
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / str(number) for number in range(84, 100)}
+
+
+def test_evaluations_of_one_owner_do_not_displace_the_others(tmp_path: Path) -> None:
+    evaluations = Evaluations(learner_epoch=1)
+    evaluations.begin("honest", tmp_path / "honest", 0, 0)
+    for number in range(100):
+        evaluations.begin(f"greedy.{number}", tmp_path / str(number), number, 0)
+    assert evaluations.checkpoints_in_use == {tmp_path / "honest", *(tmp_path / str(n) for n in range(85, 100))}

@@ -456,9 +456,35 @@ def test_rows_that_break_the_reset_rule_are_rejected_as_unfit(
     assert_rejected(harness, encode(rollout), "unfit", reason)
 
 
-@pytest.mark.parametrize("value", [3e38, -2e9])
-def test_rewards_that_no_gradient_survives_are_rejected_as_unfit(harness: Harness, value: float) -> None:
-    assert_rejected(harness, encode(with_value("rewards", value)), "unfit", "environment.reward_scale")
+@pytest.mark.parametrize(
+    ("name", "largest", "reason"),
+    [
+        ("rewards", 1e9, "rewards has a value beyond +-1e+09: set environment.reward_scale"),
+        ("frames", 1e15, "frames has a value beyond +-1e+15: scale or clip the observations"),
+        ("behaviour_log_probs", 1e6, "behaviour_log_probs has a value beyond +-1e+06"),
+    ],
+)
+def test_values_that_no_gradient_survives_are_rejected_as_unfit(
+    harness: Harness, name: str, largest: float, reason: str
+) -> None:
+    assert isinstance(Harness().receive(encode(with_value(name, -largest))), Rollout)
+    assert_rejected(harness, encode(with_value(name, -1.01 * largest)), "unfit", reason)
+    for value in (3e38, -3e38):
+        verdict = Harness().receive(encode(with_value(name, value)))
+        assert isinstance(verdict, Rejected)
+        assert verdict.cause == "unfit"
+
+
+@pytest.mark.parametrize("value", [1.01, -1.01, 3e38])
+def test_state_that_no_gru_can_have_is_rejected_as_unfit(value: float) -> None:
+    harness = Harness()
+    harness.intake.state_size = 5
+    state = np.ones((ENVIRONMENTS, 5), np.float32)
+    assert isinstance(harness.receive(encode(good(initial_state=state))), Rollout)
+    state[1, 2] = value
+    verdict = harness.receive(encode(good(rollout_identity=identity(sequence=1), initial_state=state)))
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == "initial_state has a value beyond +-1.001"
 
 
 # ---------------------------------------------------------------------------------------- at most once

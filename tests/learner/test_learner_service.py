@@ -8,10 +8,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from building import identity, make_rollout
 from log_lines import LINES
-from processes import until
+from processes import LIMIT, until
 
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.learner.reporting.csv_writer import CsvWriter
@@ -19,7 +22,13 @@ from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.service import LearnerService
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, StatusReport
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
@@ -42,7 +51,7 @@ class TrainingRun:
             }
         )
         self.stop = threading.Event()
-        self._network = MemoryNetwork()
+        self.network = MemoryNetwork()
         self._errors: list[BaseException] = []
         self._threads = [
             self._start(self._learn),
@@ -62,7 +71,7 @@ class TrainingRun:
             self._errors.append(error)
 
     def _learn(self) -> None:
-        transport = MemoryTransport(self._network)
+        transport = MemoryTransport(self.network)
         progress = Progress(io.StringIO(), self.spec.training.env_steps)
         try:
             writers = [lambda: CsvWriter(self.directory / "metrics.csv")]
@@ -72,10 +81,14 @@ class TrainingRun:
         finally:
             transport.close()
 
-    def _play(self, role: Any, name: str) -> None:
-        transport = MemoryTransport(self._network)
+    def play(self, role: Any, name: str, *arguments: Any) -> None:
+        """Start another actor or evaluator."""
+        self._threads.append(self._start(self._play, role, name, *arguments))
+
+    def _play(self, role: Any, name: str, *arguments: Any) -> None:
+        transport = MemoryTransport(self.network)
         try:
-            role(ActorConfig(name=name, incarnation=1), transport, self.stop).run()
+            role(ActorConfig(name=name, incarnation=1), transport, self.stop, *arguments).run()
         finally:
             transport.close()
 
@@ -87,6 +100,8 @@ class TrainingRun:
         assert not self._errors
 
     def rows(self) -> list[dict[str, str]]:
+        if not (self.directory / "metrics.csv").exists():
+            return []
         with open(self.directory / "metrics.csv", newline="") as file:
             return list(csv.DictReader(file))
 
@@ -139,12 +154,7 @@ def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path:
     training = {"env_steps": 10**9, "stop_when_solved": False, "algorithm": algorithm, **FEW_UPDATES}
     training_run = TrainingRun(tmp_path, training=training)
     try:
-        until(
-            lambda: (
-                (training_run.directory / "metrics.csv").exists()
-                and any(row.get("policy_loss") for row in training_run.rows())
-            )
-        )
+        until(lambda: any(row.get("policy_loss") for row in training_run.rows()))
     finally:
         training_run.end()
     last = training_run.rows()[-1]
@@ -153,3 +163,98 @@ def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path:
     assert updates % (4 if algorithm == "appo" else 1) == 0
     summary = json.loads((training_run.directory / "summary.json").read_text())
     assert "malformed" not in summary["rollouts_rejected"]
+
+
+def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_training_continues(tmp_path: Path) -> None:
+    training_run = TrainingRun(
+        tmp_path,
+        environment={"id": "CartPole-v1"},
+        policy={"hidden": [8], "activation": "relu"},
+        training={"env_steps": 10**9, "stop_when_solved": False, "algorithm": "a3c"},
+    )
+    hostile = MemoryTransport(training_run.network)
+    try:
+        until(lambda: len(training_run.rows()) > 1)
+        status = decode(hostile.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+        assert isinstance(status, StatusReport)
+        spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+        join = Join(actor="hostile", incarnation=1, spaces=spaces, environments=1)
+        hostile.query(keys.join("run"), encode(join), timeout=LIMIT)
+        answer, sequence = Acknowledgement(verdict="busy"), 0
+        while answer.verdict != "quarantined":
+            rollout = make_rollout(
+                identity("hostile", sequence, epoch=status.status.learner_epoch),
+                version=answer.policy_version,
+                rows=8,
+                environments=1,
+                frames=np.full((9, 1, 4), 1e15, np.float32),
+                actions=np.zeros((8, 1), np.uint8),
+            )
+            (data,) = hostile.query(keys.rollouts("run", "hostile"), encode(rollout), timeout=LIMIT)
+            message = decode(data, Limits())
+            assert isinstance(message, Acknowledgement)
+            answer, sequence = message, sequence + 1
+        assert answer.reason.startswith("updates with 3 of its rollouts had no finite gradient")
+        rows = len(training_run.rows())
+        until(lambda: len(training_run.rows()) > rows + 1 and training_run.rows()[-1]["policy_loss"])
+    finally:
+        training_run.end()
+    assert "update skipped: the gradient is not finite with rollouts of hostile; the weights are unchanged" in LINES
+    summary = json.loads((training_run.directory / "summary.json").read_text())
+    assert summary["updates_skipped"] == summary["rollouts_rejected"]["non_finite"] >= 3
+    weights = read_policy(checkpoints(training_run.directory)[0]).weights
+    assert all(np.isfinite(array).all() for array in weights.values())
+
+
+class HangingCollector(EnvironmentCollector):
+    """Collector whose environment can be made to hang, as a broken simulator does."""
+
+    def __init__(self, responds: threading.Event) -> None:
+        super().__init__()
+        self._responds = responds
+
+    def collect(self, identity: RolloutIdentity) -> Rollout:
+        assert self._responds.wait(LIMIT)
+        return super().collect(identity)
+
+
+def test_actor_whose_environment_hangs_does_not_hold_the_updates_of_a2c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daedalus.learner.serving.stragglers._PATIENCE_SECONDS", 0.5)
+    training_run = TrainingRun(
+        tmp_path,
+        environment={"id": "CartPole-v1"},
+        collection={"actors": 2, "envs_per_actor": 1, "rollout_length": 8},
+        training={"env_steps": 10**9, "stop_when_solved": False, "algorithm": "a2c"},
+    )
+    responds = threading.Event()
+    responds.set()
+    training_run.play(ActorService, "b", HangingCollector(responds))
+    observer = MemoryTransport(training_run.network)
+
+    def env_steps(name: str) -> int:
+        return {actor.actor: actor.env_steps for actor in status().actors}.get(name, 0)
+
+    def status() -> RunStatus:
+        report = decode(observer.query(keys.status("run"), timeout=LIMIT)[0], Limits())
+        assert isinstance(report, StatusReport)
+        return report.status
+
+    try:
+        until(training_run.rows)
+        until(lambda: env_steps("b"))
+        responds.clear()
+        until(lambda: status().problems == ("batches do not wait for b: connected, but without rollouts",))
+        before = env_steps("a")
+        until(lambda: env_steps("a") > before)
+        before = env_steps("b")
+        responds.set()
+        until(lambda: env_steps("b") > before)
+        until(lambda: not status().problems)
+    finally:
+        responds.set()
+        training_run.end()
+    assert (
+        "batches no longer wait for actor 'b', which is connected but sends nothing: examine its environment" in LINES
+    )

@@ -26,51 +26,51 @@ def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name() -> None
     buffer, live = BarrierBuffer(1), {"a", "b", "c"}
     for actor in ("c", "a"):
         buffer.add(rollout(actor))
-        assert actors(buffer.take(live, 0)) == []
+        assert actors(buffer.take(live, 0, 0.0)) == []
     buffer.add(rollout("b"))
-    assert actors(buffer.take(live, 0)) == ["a", "b", "c"]
-    assert actors(buffer.take(live, 1)) == []
+    assert actors(buffer.take(live, 0, 0.0)) == ["a", "b", "c"]
+    assert actors(buffer.take(live, 1, 0.0)) == []
 
 
 def test_first_batch_of_the_barrier_waits_for_the_configured_number_of_actors() -> None:
     buffer = BarrierBuffer(3)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0)) == []
-    assert actors(buffer.take({"a", "b", "c"}, 0)) == []
+    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
+    assert actors(buffer.take({"a", "b", "c"}, 0, 0.0)) == []
     buffer.add(rollout("c"))
-    assert actors(buffer.take({"a", "b", "c"}, 0)) == ["a", "b", "c"]
+    assert actors(buffer.take({"a", "b", "c"}, 0, 0.0)) == ["a", "b", "c"]
 
 
 def test_later_batches_of_the_barrier_wait_only_for_live_actors() -> None:
     buffer = BarrierBuffer(2)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0)) == ["a", "b"]
+    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == ["a", "b"]
     buffer.add(rollout("a"))
-    assert actors(buffer.take({"a"}, 1)) == ["a"]
+    assert actors(buffer.take({"a"}, 1, 0.0)) == ["a"]
 
 
 def test_barrier_does_not_wait_for_an_actor_that_has_left() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("a"))
-    assert actors(buffer.take({"a", "b"}, 0)) == []
-    assert actors(buffer.take({"a"}, 0)) == ["a"]
+    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
+    assert actors(buffer.take({"a"}, 0, 0.0)) == ["a"]
 
 
 def test_barrier_uses_the_rollout_of_an_actor_that_has_left() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("b"))
     buffer.add(rollout("a"))
-    assert actors(buffer.take({"a"}, 0)) == ["a", "b"]
+    assert actors(buffer.take({"a"}, 0, 0.0)) == ["a", "b"]
 
 
 def test_barrier_waits_for_an_actor_that_joins_later() -> None:
     buffer = BarrierBuffer(1)
     buffer.add(rollout("a"))
-    assert actors(buffer.take({"a", "b"}, 0)) == []
+    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
     buffer.add(rollout("b"))
-    assert actors(buffer.take({"a", "b"}, 0)) == ["a", "b"]
+    assert actors(buffer.take({"a", "b"}, 0, 0.0)) == ["a", "b"]
 
 
 def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
@@ -78,12 +78,12 @@ def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
     buffer.add(rollout("a"))
     assert not buffer.has_room_for(rollout("a", 1))
     assert buffer.has_room_for(rollout("b"))
-    buffer.take({"a"}, 0)
+    buffer.take({"a"}, 0, 0.0)
     assert buffer.has_room_for(rollout("a", 1))
 
 
 def test_empty_barrier_returns_no_batch() -> None:
-    assert actors(BarrierBuffer(0).take(set(), 0)) == []
+    assert actors(BarrierBuffer(0).take(set(), 0, 0.0)) == []
 
 
 # --------------------------------------------------------------------------------------------- the stream
@@ -93,36 +93,36 @@ def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
     buffer = StreamBuffer(2, 0)
     for sequence in range(3):
         buffer.add(rollout("a" if sequence % 2 else "b", sequence))
-    assert sequences(buffer.take({"a", "b", "c"}, 0).rollouts) == [0, 1]
-    assert buffer.take({"a"}, 0).rollouts == []
+    assert sequences(buffer.take({"a", "b", "c"}, 0, 0.0).rollouts) == [0, 1]
+    assert buffer.take({"a"}, 0, 0.0).rollouts == []
     buffer.add(rollout("b", 3))
-    assert sequences(buffer.take(set(), 0).rollouts) == [2, 3]
+    assert sequences(buffer.take(set(), 0, 0.0).rollouts) == [2, 3]
 
 
 def test_stream_returns_stale_rollouts_separately() -> None:
     buffer = StreamBuffer(2, 3)
     for sequence, version in enumerate((0, 1, 5, 1, 4)):
         buffer.add(rollout("a", sequence, version))
-    taken = buffer.take({"a"}, 5)
+    taken = buffer.take({"a"}, 5, 0.0)
     assert sequences(taken.stale) == [0, 1, 3]
     assert sequences(taken.rollouts) == [2, 4]
-    assert buffer.take({"a"}, 5).stale == []
+    assert buffer.take({"a"}, 5, 0.0).stale == []
 
 
 def test_stream_returns_a_rollout_with_policy_lag_at_the_bound() -> None:
     buffer = StreamBuffer(1, 3)
     buffer.add(rollout("a", version=2))
-    assert sequences(buffer.take(set(), 5).rollouts) == [0]
+    assert sequences(buffer.take(set(), 5, 0.0).rollouts) == [0]
 
 
 def test_stream_returns_stale_rollouts_when_no_batch_is_complete() -> None:
     buffer = StreamBuffer(2, 0)
     buffer.add(rollout("a", 0, version=0))
     buffer.add(rollout("a", 1, version=1))
-    taken = buffer.take(set(), 1)
+    taken = buffer.take(set(), 1, 0.0)
     assert (sequences(taken.rollouts), sequences(taken.stale)) == ([], [0])
     buffer.add(rollout("a", 2, version=1))
-    assert sequences(buffer.take(set(), 1).rollouts) == [1, 2]
+    assert sequences(buffer.take(set(), 1, 0.0).rollouts) == [1, 2]
 
 
 @pytest.mark.parametrize(("batch", "room"), [(1, 2), (2, 2), (3, 3)])
@@ -132,5 +132,5 @@ def test_stream_has_room_for_a_batch_and_at_least_two_rollouts(batch: int, room:
         assert buffer.has_room_for(rollout("a", sequence))
         buffer.add(rollout("a", sequence))
     assert not buffer.has_room_for(rollout("a", room))
-    buffer.take(set(), 0)
+    buffer.take(set(), 0, 0.0)
     assert buffer.has_room_for(rollout("a", room))

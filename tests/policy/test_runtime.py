@@ -24,7 +24,7 @@ from daedalus.policy.acting.runtime import (
     PolicyRuntime,
     program_hash,
 )
-from daedalus.policy.acting.sampling import LOGITS
+from daedalus.policy.acting.sampling import LOGITS, RandomSource
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.protocol.spec import PolicySpec
 
@@ -56,7 +56,7 @@ def generator() -> np.random.Generator:
 @pytest.mark.parametrize("random", [generator, lambda: None], ids=["sampled", "greedy"])
 @pytest.mark.parametrize("rows", [1, 17])
 def test_both_runtimes_choose_the_same_actions(
-    policy: Policy, rows: int, random: Callable[[], np.random.Generator | None]
+    policy: Policy, rows: int, random: Callable[[], RandomSource | None]
 ) -> None:
     both = policy.runtimes()
     for seed in (0, 1):  # also after weights are replaced
@@ -312,10 +312,10 @@ def test_only_programs_with_convolutions_use_constants(policy: Policy) -> None:
     runtime = OnnxRuntime(policy.program)
     runtime.load(policy.weights())
     weights = policy.acting_names()
-    fed = {entry.name for entry in runtime._session.get_inputs()} & weights
+    fed = {entry.name for entry in runtime._session.onnx.get_inputs()} & weights
     assert fed == (set() if policy.network.convolutional else weights)
     # onnxruntime does not arrange constants that an input could override.
-    assert not runtime._session.get_overridable_initializers()
+    assert not runtime._session.onnx.get_overridable_initializers()
 
 
 # ------------------------------------------------------------------------------------------ the weights

@@ -12,6 +12,7 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daedalus.policy.acting.sampling import RandomSource
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits
@@ -94,7 +95,7 @@ class Spectator:
         pass
 
     def act(
-        self, observations: np.ndarray, state: np.ndarray, random: np.random.Generator | None
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.seen.append(observations.copy())
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state

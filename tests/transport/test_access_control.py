@@ -1,5 +1,6 @@
 """Permissions of each role over real TLS on a real router, and rejected certificates."""
 
+import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -203,19 +204,19 @@ def test_certificate_of_another_ca_is_rejected(address: str, strange: Path) -> N
 def test_foreign_certificate_with_our_ca_file_is_rejected(address: str, certificates: Path, strange: Path) -> None:
     """The client trusts our CA, but its certificate is signed by another one."""
     (strange / "actor-box" / "ca.pem").write_bytes((certificates / "actor-box" / "ca.pem").read_bytes())
-    with pytest.raises(CredentialsError, match="different CAs"):
-        load(strange / "actor-box", "actor")
-    with pytest.raises(RefusedError, match=r"refuses the certificate in .*different CAs"):
-        connect([address], unchecked(strange / "actor-box"))
+    with pytest.raises(RefusedError, match=r"refuses the certificate in .*revoked, or issued after the service's copy"):
+        connect([address], load(strange / "actor-box", "actor"))
 
 
 def test_expired_certificate_is_rejected_when_loaded(certificates: Path) -> None:
-    with pytest.raises(CredentialsError, match="expired: issue a new one"):
+    with pytest.raises(
+        CredentialsError, match=r"the certificate expired on \d{4}-\d\d-\d\d: renew it \(daedalus certs renew\)"
+    ):
         load(issue_expired(certificates, "actor", "arm"), "actor")
 
 
 def test_expired_certificate_is_refused_with_a_reason(address: str, certificates: Path) -> None:
-    with pytest.raises(RefusedError, match=r"refuses the certificate in .*expired"):
+    with pytest.raises(RefusedError, match=r"expired-actor: the certificate expired on .*: renew it"):
         connect([address], unchecked(issue_expired(certificates, "actor", "arm")))
 
 
@@ -230,7 +231,7 @@ def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> No
     with pytest.raises(CredentialsError, match="holds the certificate of actor 'arm', but learner is required"):
         load(certificates / "actor-arm", "learner")
     folder = certificates / "actor-arm"
-    (folder / "names.json").write_text('{"actors": [], "operators": []}')
+    shutil.copyfile(certificates / "router" / "clients.pem", folder / "clients.pem")
     address, router = listen_somewhere(folder)
     with closing(router), pytest.raises(RefusedError, match="cannot be verified"):
         connect([address], load(certificates / "actor-box", "actor"))
@@ -247,20 +248,6 @@ def test_host_missing_in_the_certificate_is_not_trusted(certificates: Path) -> N
         pytest.raises(RefusedError, match=r"mismatch.*--host"),
     ):
         connect([other], load(certificates / "actor-arm", "actor"))
-
-
-def test_revoked_name_has_no_permissions(tmp_path: Path) -> None:
-    from daedalus.cli.commands.certs import certs
-
-    folder = make_certificates(tmp_path / "certs")
-    arm = load(folder / "actor-arm", "actor")
-    kept = tmp_path / "kept"
-    (folder / "actor-arm").rename(kept)
-    assert certs(["revoke", "actor", "arm", "--directory", str(folder)]) == 0
-    address, router = listen_somewhere(folder / "router")
-    router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
-    with closing(router), closing(connect([address], unchecked(kept, arm.role, arm.name))) as actor:
-        assert actor.query(keys.join("r"), timeout=DENIED_SECONDS) == []
 
 
 @pytest.mark.parametrize(
@@ -286,9 +273,9 @@ def test_key_of_another_certificate_is_reported(certificates: Path, tmp_path: Pa
         load(tmp_path, "actor")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"actors": []}'])
-def test_listener_without_authorised_names_does_not_start(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("text", ["", "-----BEGIN CERTIFICATE-----\n", "\0"])
+def test_listener_without_authorised_clients_does_not_start(tmp_path: Path, text: str) -> None:
     folder = make_certificates(tmp_path / "certs") / "learner"
-    (folder / "names.json").write_text(text)
-    with pytest.raises(CredentialsError, match=r"names\.json"):
+    (folder / "clients.pem").write_text(text)
+    with pytest.raises(CredentialsError, match=r"no readable clients\.pem"):
         listen(["tls/127.0.0.1:0"], credentials=load(folder, "learner"))

@@ -1,0 +1,76 @@
+"""An onnxruntime session for a program that another process wrote: its operators, memory and time are bounded."""
+
+import contextlib
+import functools
+import os
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from daedalus.policy.acting.call_watchdog import CallWatchdog
+from daedalus.policy.acting.errors import PolicyError
+
+MAX_MEMORY_BYTES = 1 << 30  # of all tensors that the programs of this process compute
+# onnxruntime computes constants when it loads a program, in memory that the limit above does not cover.
+_MAX_CONSTANT_BYTES = 256 << 10  # each; a program has at most MAX_NODES
+_CONFIGURATION = {
+    "session.use_env_allocators": "1",
+    "session.load_model_format": "ONNX",  # not onnxruntime's own format, which the checks do not read
+    # A model may name files to read weights from. A received program must not read files: no such file exists here.
+    "session.model_external_initializers_file_folder_path": os.devnull,
+    "optimization.constant_folding_max_output_size_in_bytes": str(_MAX_CONSTANT_BYTES),
+}
+
+
+class ProgramSession:
+    """A loaded program. The caller has checked it (policy/acting/program_check.py)."""
+
+    def __init__(self, model: bytes, watchdog: CallWatchdog) -> None:
+        """Raise PolicyError if onnxruntime cannot load the program."""
+        _bound_memory()
+        options = onnxruntime.SessionOptions()
+        # An actor has one core at most; spinning threads would take time from other processes.
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        for name, value in _CONFIGURATION.items():
+            options.add_session_config_entry(name, value)
+        self._watchdog = watchdog
+        self._run_options = onnxruntime.RunOptions()
+        watchdog.begin(lambda: options.set_load_cancellation_flag(True))
+        try:
+            self.onnx = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's exceptions share no base of their own
+            raise PolicyError(f"the program cannot be run: {_first_line(error)}") from None
+        finally:
+            watchdog.end()
+
+    def run(self, feed: dict[str, np.ndarray]) -> list[Any]:
+        """Return the program's outputs. Raises PolicyError if it fails or does not end in time."""
+        self._watchdog.begin(self._terminate)
+        try:
+            return self.onnx.run(None, feed, self._run_options)
+        except Exception as error:  # onnxruntime's exceptions share no base of their own
+            late = "it took too long: " if self._run_options.terminate else ""
+            raise PolicyError(f"the program failed: {late}{_first_line(error)}") from None
+        finally:
+            self._watchdog.end()
+
+    def _terminate(self) -> None:
+        """Make the running call fail after its present node; later calls fail too."""
+        self._run_options.terminate = True
+
+
+@functools.cache
+def _bound_memory() -> None:
+    """Limit the memory of all sessions of this process that use its common allocator."""
+    information = onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    )
+    with contextlib.suppress(Exception):  # the user's own code has registered an allocator: it is used instead
+        onnxruntime.create_and_register_allocator(information, onnxruntime.OrtArenaCfg({"max_mem": MAX_MEMORY_BYTES}))
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

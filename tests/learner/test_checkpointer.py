@@ -1,0 +1,66 @@
+"""learner/training/checkpointer.py: each policy version is saved once for evaluations."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from building import EPOCH, POLICY, SPACES, make_rollouts, run_spec
+
+from daedalus.learner.reporting.report import Health
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.training.checkpointer import Checkpointer
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.saving.saved_policy import read_policy
+from daedalus.protocol.spec import TrainingSpec
+
+
+def written(directory: Path) -> int:
+    """Return a number that changes with every writing of a checkpoint."""
+    return (directory / "manifest.json").stat().st_ino
+
+
+def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
+    learner = Learner(TrainingSpec(), POLICY, SPACES)
+    checkpointer = Checkpointer(
+        tmp_path,
+        run_spec(),
+        SPACES,
+        learner,
+        b"program",
+        counters=lambda: RunCounters(10).state(0.0),
+        evaluations=Evaluations(EPOCH),
+        health=Health(started=0.0, updated=0.0, actor_seen=0.0),
+    )
+    first = checkpointer.ensure_saved()
+    assert first is not None
+    before = written(first)
+    assert checkpointer.ensure_saved() == first
+    assert written(first) == before
+    learner.step(make_rollouts(1), 0.0)
+    second = checkpointer.ensure_saved()
+    assert second is not None
+    assert read_policy(second).policy_version == 1
+    shutil.rmtree(second)
+    assert checkpointer.ensure_saved() == second
+    assert second.is_dir()
+
+
+def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    health = Health(started=0.0, updated=0.0, actor_seen=0.0)
+    checkpointer = Checkpointer(
+        tmp_path,
+        run_spec(),
+        SPACES,
+        Learner(TrainingSpec(), POLICY, SPACES),
+        b"program",
+        counters=lambda: RunCounters(10).state(0.0),
+        evaluations=Evaluations(EPOCH),
+        health=health,
+    )
+    (tmp_path / "checkpoints").write_text("in the way")
+    assert checkpointer.ensure_saved() is None
+    assert health.save_fault
+    (tmp_path / "checkpoints").unlink()
+    assert checkpointer.ensure_saved() is not None
+    assert not health.save_fault

@@ -1,0 +1,142 @@
+"""Updates without a finite gradient: which rollouts are at fault, and what happens to their senders."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from building import (
+    ENVIRONMENTS,
+    EPOCH,
+    POLICY,
+    RECURRENT,
+    ROWS,
+    SPACES,
+    identity,
+    joined_fleet,
+    make_rollout,
+    run_spec,
+)
+
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.service import _gradient_fault
+from daedalus.learner.serving.fleet import Actor
+from daedalus.learner.serving.rollout_intake import RolloutIntake
+from daedalus.learner.training.learner import Learner
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
+
+RELU = PolicySpec(hidden=(8,), activation="relu")
+HUGE_REWARDS: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), 1e30, np.float32)}
+HUGE_FRAMES: dict[str, Any] = {"frames": np.full((ROWS + 1, ENVIRONMENTS, 3), 1e30, np.float32)}
+
+
+def rollout(actor: str, state_size: int = 0, **replaced: Any) -> Rollout:
+    return make_rollout(identity(actor), seed=ord(actor), state_size=state_size, **replaced)
+
+
+def senders(rollouts: list[Rollout]) -> list[str]:
+    return [each.identity.actor for each in rollouts]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy", "huge"),
+    [
+        ("a2c", RELU, HUGE_FRAMES),
+        ("a3c", POLICY, HUGE_REWARDS),
+        ("impala", RECURRENT, HUGE_REWARDS),
+        ("appo", RELU, HUGE_REWARDS),
+        ("appo", RECURRENT, HUGE_REWARDS),
+    ],
+)
+def test_rollouts_without_a_finite_gradient_are_found(algorithm: str, policy: PolicySpec, huge: dict[str, Any]) -> None:
+    learner = Learner(TrainingSpec.model_validate({"algorithm": algorithm}), policy, SPACES)
+    size = learner.state_size
+    batch = [rollout("a", size), rollout("b", size, **huge), rollout("c", size), rollout("d", size, **huge)]
+    assert senders(learner.step(batch, 0.0)) == ["b", "d"]
+    assert learner.updates_skipped > 0
+    assert all(np.isfinite(array).all() for array in learner.weights().values())
+    skipped = learner.updates_skipped
+    assert learner.step([batch[0], batch[2]], 0.0) == []
+    assert learner.updates_skipped == skipped
+
+
+def test_search_for_the_fault_does_not_change_the_parameters() -> None:
+    """A skipped update leaves the parameters as they were, and the next update starts from them."""
+    learners = [Learner(TrainingSpec(algorithm="a2c"), RELU, SPACES) for _ in range(2)]
+    learners[0].step([rollout("a"), rollout("b", **HUGE_FRAMES)], 0.0)
+    for learner in learners:
+        learner.step([rollout("a")], 0.0)
+    for name, array in learners[0].weights().items():
+        np.testing.assert_array_equal(array, learners[1].weights()[name])
+
+
+def test_no_sender_is_at_fault_if_the_parameters_are() -> None:
+    learner = Learner(TrainingSpec(algorithm="a2c"), RELU, SPACES)
+    for array in learner.weights().values():
+        array.fill(1e30)  # the arrays share memory with the parameters
+    assert learner.step([rollout("a"), rollout("b")], 0.0) == []
+    assert learner.updates_skipped == 1
+
+
+# ---------------------------------------------------------------------------------------------- the senders
+
+
+def test_actor_is_quarantined_after_three_rollouts_at_fault() -> None:
+    actor = Actor("a")
+    for _ in range(2):
+        actor.count_trained(finite=False)
+    assert not actor.quarantined
+    actor.count_trained(finite=False)
+    assert actor.quarantined.startswith("updates with 3 of its rollouts had no finite gradient")
+    assert actor.rejected == {"non_finite": 3}
+
+
+def test_few_good_rollouts_in_between_do_not_prevent_the_quarantine() -> None:
+    """Each rollout at fault costs a whole batch: a sender of one in ten must not go on for ever."""
+    actor = Actor("a")
+    for _ in range(3):
+        actor.count_trained(finite=False)
+        for _ in range(99):
+            actor.count_trained(finite=True)
+    assert actor.quarantined
+
+
+def test_a_hundred_good_rollouts_make_up_for_the_rollouts_at_fault() -> None:
+    actor = Actor("a")
+    for _ in range(5):
+        for _ in range(2):
+            actor.count_trained(finite=False)
+        for _ in range(100):
+            actor.count_trained(finite=True)
+    assert not actor.quarantined
+
+
+def test_new_incarnation_starts_with_a_clean_record() -> None:
+    actor = Actor("a")
+    for _ in range(2):
+        actor.count_trained(finite=False)
+    actor.start_incarnation(2)
+    actor.count_trained(finite=False)
+    assert not actor.quarantined
+
+
+def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
+    fleet, counters = joined_fleet("a", "b"), RunCounters(10)
+    intake = RolloutIntake(
+        run_spec(), threading.Condition(), fleet, counters, lambda: 0, learner_epoch=EPOCH, start_version=0
+    )
+    batch = [rollout("a"), rollout("b"), make_rollout(identity("b", incarnation=9)), rollout("z")]
+    for _ in range(3):
+        intake.count_trained(batch, [batch[1], batch[3]])
+    assert counters.rollouts_rejected == {"non_finite": 6}
+    assert fleet.live == {"a"}
+    assert not fleet.actors["a"].rejected
+    assert fleet.actors["b"].rejected == {"non_finite": 3}
+
+
+def test_fault_names_the_senders() -> None:
+    assert _gradient_fault([]) == "the gradient is not finite"
+    assert _gradient_fault([rollout("b"), rollout("a"), rollout("b")]) == (
+        "the gradient is not finite with rollouts of a, b"
+    )

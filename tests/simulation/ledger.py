@@ -1,0 +1,198 @@
+"""What happened to each rollout, and the invariants of the protocol."""
+
+from collections import Counter
+from collections.abc import Set
+from dataclasses import dataclass, field
+
+from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.intake import Rejected
+from daedalus.learner.serving.rollout_buffer import TakenRollouts
+from daedalus.protocol.messages import Acknowledgement, Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.spec import RunSpec
+
+from .kernel import Kernel
+
+_BASE = 128  # numbers below 257 survive the bfloat16 of compact snapshots
+
+
+class Violation(Exception):  # noqa: N818 - the usual word
+    """An invariant does not hold."""
+
+
+@dataclass(slots=True)
+class Life:
+    """One life of the learner, from its start to its end."""
+
+    number: int  # from 0
+    epoch: int
+    added: dict[RolloutIdentity, None] = field(default_factory=dict)  # to the buffer
+    trained: dict[RolloutIdentity, None] = field(default_factory=dict)
+    stale: dict[RolloutIdentity, None] = field(default_factory=dict)  # in the buffer
+    judged: dict[RolloutIdentity, None] = field(default_factory=dict)
+    answers: dict[RolloutIdentity, Counter[str]] = field(default_factory=dict)
+    published: dict[int, float] = field(default_factory=dict)  # when, by version
+    ended: bool = False
+
+    def has_verdict(self, identity: RolloutIdentity) -> bool:
+        """Return whether the learner has decided about a rollout."""
+        return identity in self.judged or bool(self.answers.get(identity, Counter()).keys() - {"busy"})
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """A rollout that an actor has made."""
+
+    identity: RolloutIdentity
+    at: float
+
+
+class Ledger:
+    """Record of one simulation."""
+
+    def __init__(self, kernel: Kernel, spec: RunSpec) -> None:
+        self._kernel, self._spec = kernel, spec
+        self.lives: list[Life] = []
+        self.collected: list[Collected] = []  # by the number that each rollout carries
+        self._numbers: dict[RolloutIdentity, int] = {}
+        self.freshest: dict[
+            str, float
+        ] = {}  # by actor: when the newest policy was published that it was trained on with
+
+    def require(self, holds: bool, text: str) -> None:
+        """Raise Violation, and end the simulation, unless something holds."""
+        if not holds:
+            error = Violation(text)
+            self._kernel.log("VIOLATION", text)
+            self._kernel.fail(error)
+            raise error
+
+    # ------------------------------------------------------------------------------------------------ weights
+
+    @staticmethod
+    def token(life: int, version: int) -> list[float]:
+        """Return the weights of a policy version: numbers that say which life of the learner made it."""
+        return [float(life), float(version // _BASE), float(version % _BASE)]
+
+    def begin_life(self, epoch: int, version: int) -> Life:
+        """Note the start of a learner with a policy version."""
+        self.lives.append(Life(len(self.lives), epoch, published={version: self._kernel.now}))
+        return self.lives[-1]
+
+    # ------------------------------------------------------------------------------------------------- actors
+
+    def used(self, snapshot: Snapshot, epoch: int) -> None:
+        """Check a snapshot that an actor collects with in its session with a learner of an epoch."""
+        self.require(snapshot.learner_epoch == epoch, "an actor loads a snapshot of another learner epoch")
+        life = next(life for life in self.lives if life.epoch == epoch)
+        weights = snapshot.weights["w"].tolist()
+        self.require(
+            weights == self.token(life.number, snapshot.policy_version),
+            f"snapshot of version {snapshot.policy_version} of life {life.number} carries the weights {weights}",
+        )
+
+    def collect(self, identity: RolloutIdentity) -> int:
+        """Note a new rollout, and return the number that it carries."""
+        self.require(identity not in self._numbers, f"two rollouts have the identity {identity}")
+        self._numbers[identity] = len(self.collected)
+        self.collected.append(Collected(identity, self._kernel.now))
+        self._kernel.log("collect", identity.actor, identity.incarnation, identity.sequence)
+        return self._numbers[identity]
+
+    # ------------------------------------------------------------------------------------------------ learner
+
+    def answered(self, life: Life, identity: RolloutIdentity, answer: Acknowledgement) -> None:
+        """Check an answer on its way to an actor."""
+        verdicts = life.answers.setdefault(identity, Counter())
+        verdicts[answer.verdict] += 1
+        self._kernel.log("answer", identity.actor, identity.sequence, answer.verdict, answer.reason)
+        if answer.verdict == "accepted":
+            self.require(identity in life.added, f"{identity} was answered accepted, but is not in the buffer")
+            self.require(verdicts["accepted"] == 1, f"{identity} was accepted twice")
+        self.require(answer.verdict != "quarantined", f"an honest actor is quarantined: {answer.reason}")
+        self.require(
+            answer.policy_version == 0 or answer.policy_version in life.published,
+            f"an answer mentions version {answer.policy_version}, which was not published",
+        )
+
+    def judged(self, life: Life, rollout: Rollout, verdict: Rollout | Rejected, incarnation: int) -> None:
+        """Check the verdict on a rollout; `incarnation` is the newest of its actor that has joined."""
+        identity = rollout.identity
+        if verdict is rollout:
+            text = f"a rollout of an earlier incarnation is accepted: {identity}"
+            self.require(identity.incarnation == incarnation, text)
+        life.judged[identity] = None
+
+    def added(self, life: Life, rollout: Rollout) -> None:
+        """Check a rollout that is put into the buffer."""
+        identity = rollout.identity
+        self.require(identity not in life.added, f"{identity} is put into the buffer twice")
+        life.added[identity] = None
+        self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
+        self.require(
+            identity.learner_epoch == life.epoch, f"a rollout of another learner epoch is accepted: {identity}"
+        )
+        life_number, high, low, number = rollout.frames[0, 0].tolist()
+        self.require(
+            [life_number, high, low] == self.token(life.number, rollout.policy_version),
+            f"{identity} claims version {rollout.policy_version}, but its weights were {life_number, high, low}",
+        )
+        self.require(self._numbers.get(identity) == int(number), f"{identity} carries another rollout's content")
+
+    def took(self, life: Life, taken: TakenRollouts, version: int, live: Set[str]) -> None:
+        """Check what is taken out of the buffer."""
+        for rollout in taken.stale:
+            self.require(rollout.identity not in life.stale, f"{rollout.identity} is stale twice")
+            life.stale[rollout.identity] = None
+        synchronous = self._spec.algorithm.synchronous
+        bound = 0 if synchronous else self._spec.training.policy_lag_bound
+        for rollout in taken.rollouts:
+            identity = rollout.identity
+            self.require(identity not in life.trained, f"{identity} is trained twice")
+            self.require(identity in life.added and identity not in life.stale, f"{identity} was not accepted")
+            life.trained[identity] = None
+            lag = version - rollout.policy_version
+            self.require(0 <= lag <= bound, f"{identity} has a policy lag of {lag}, the bound is {bound}")
+            published = life.published[rollout.policy_version]
+            self.freshest[identity.actor] = max(published, self.freshest.get(identity.actor, 0.0))
+        if taken.rollouts:
+            names = [rollout.identity.actor for rollout in taken.rollouts]
+            self._kernel.log("train", version, *names)
+            if synchronous:
+                self.require(len(set(names)) == len(names), f"a batch has two rollouts of one actor: {names}")
+                self.require(live <= set(names), f"a batch misses a live actor: {names} of {sorted(live)}")
+
+    def check_counts(self, life: Life, accepted: int, trained: int, waiting: int) -> None:
+        """Check that accepted = trained + stale + waiting in the buffer, and the learner's counters."""
+        balance = (
+            f"{accepted} accepted ({len(life.added)} put into the buffer), {trained} trained "
+            f"({len(life.trained)} taken), {len(life.stale)} stale, {waiting} waiting"
+        )
+        self.require(accepted == len(life.added), f"the counter of accepted rollouts is wrong: {balance}")
+        self.require(trained == len(life.trained), f"the counter of trained rollouts is wrong: {balance}")
+        self.require(
+            accepted == trained + len(life.stale) + waiting, f"accepted is not trained + stale + waiting: {balance}"
+        )
+
+
+def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
+    """Note every verdict, and every rollout that is put into the buffer and taken out of it."""
+    intake, buffer = server.rollouts._intake, server.rollouts._buffer
+    judge, add, take = intake.judge, buffer.add, buffer.take
+
+    def noted_judge(sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
+        verdict = judge(sender, content, policy_version, now)
+        if isinstance(content, Rollout):
+            ledger.judged(life, content, verdict, server.fleet.actors[sender].incarnation)
+        return verdict
+
+    def noted_add(rollout: Rollout) -> None:
+        ledger.added(life, rollout)
+        add(rollout)
+
+    def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:
+        taken = take(live, policy_version)
+        ledger.took(life, taken, policy_version, live)
+        return taken
+
+    intake.judge = noted_judge  # type: ignore[method-assign]
+    buffer.add, buffer.take = noted_add, noted_take  # type: ignore[method-assign]

@@ -1,0 +1,151 @@
+"""The simulation finds nothing in the code as it is, finds what is broken in it, and repeats a seed exactly."""
+
+import hashlib
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
+from daedalus.actor.session.snapshot_feed import SnapshotFeed
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.fleet import Actor, Fleet, SequenceWindow
+from daedalus.learner.serving.intake import Intake
+from daedalus.learner.serving.rollout_buffer import StreamBuffer
+from daedalus.protocol.messages import Acknowledgement, Rollout
+
+from .simulate import simulate
+
+SEEDS = 200
+SEEDS_TO_FIND = 200  # within which a break must be found
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def test_no_seed_violates_an_invariant() -> None:
+    for seed in range(SEEDS):
+        result = simulate(seed)
+        assert result.failure is None, "\n".join(result.lines[-60:])
+
+
+def digest(seed: int) -> str:
+    return hashlib.sha256("\n".join(simulate(seed).lines).encode()).hexdigest()
+
+
+def test_a_seed_repeats_exactly() -> None:
+    """In another process too, in which sets have another order."""
+    seeds = range(20)
+    here = [digest(seed) for seed in seeds]
+    assert [digest(seed) for seed in seeds] == here
+    code = f"""
+import logging
+from simulation.test_simulation import digest
+logging.disable(logging.CRITICAL)
+print(*(digest(seed) for seed in {seeds}))
+"""
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "PYTHONHASHSEED": "7"}
+    words = [sys.executable, "-c", code]
+    process = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    assert process.stdout.split() == here
+
+
+# ------------------------------------------------------------------------------------------- broken code
+
+
+def accepts_duplicates(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(SequenceWindow, "__contains__", lambda _window, _sequence: False)
+
+
+def does_not_fence(patch: pytest.MonkeyPatch) -> None:
+    """Rollouts for another learner epoch, or of another incarnation, are accepted."""
+    patch.setattr(Intake, "_check_identity", lambda _intake, _sender, _rollout: None)
+
+
+def counts_twice(patch: pytest.MonkeyPatch) -> None:
+    counted = RunCounters.accepted
+
+    def accepted(counters: RunCounters, rollout: Rollout, size: int) -> None:
+        counted(counters, rollout, size)
+        if rollout.identity.sequence % 8 == 7:
+            counted(counters, rollout, size)
+
+    patch.setattr(RunCounters, "accepted", accepted)
+
+
+def does_not_send_again(patch: pytest.MonkeyPatch) -> None:
+    acknowledge = InFlightRollouts.acknowledge
+
+    def forgetful(rollouts: InFlightRollouts, sequence: int, answer: Acknowledgement | None, now: float) -> None:
+        if answer is not None:
+            acknowledge(rollouts, sequence, answer, now)
+
+    patch.setattr(InFlightRollouts, "acknowledge", forgetful)
+
+
+def drops_without_an_answer(patch: pytest.MonkeyPatch) -> None:
+    acknowledge = InFlightRollouts.acknowledge
+
+    def forgetful(rollouts: InFlightRollouts, sequence: int, answer: Acknowledgement | None, now: float) -> None:
+        if answer is None:
+            rollouts.rollouts.pop(sequence, None)
+        else:
+            acknowledge(rollouts, sequence, answer, now)
+
+    patch.setattr(InFlightRollouts, "acknowledge", forgetful)
+
+
+def requests_no_lost_snapshot(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(SnapshotFeed, "request_newest", lambda _feed: None)
+
+
+def waits_for_the_departed(patch: pytest.MonkeyPatch) -> None:
+    def is_live(_fleet: Fleet, actor: Actor) -> bool:
+        return actor.environments > 0 and not actor.quarantined
+
+    patch.setattr(Fleet, "is_live", is_live)
+
+
+def trains_on_stale_rollouts(patch: pytest.MonkeyPatch) -> None:
+    take = StreamBuffer.take
+
+    def greedy(buffer: StreamBuffer, live: frozenset[str], policy_version: int) -> Any:
+        buffer._max_policy_lag = 10**9
+        return take(buffer, live, policy_version)
+
+    patch.setattr(StreamBuffer, "take", greedy)
+
+
+@pytest.mark.parametrize(
+    ("break_code", "finding"),
+    [
+        (accepts_duplicates, "twice"),
+        (does_not_fence, "another learner epoch"),
+        (counts_twice, "accepted"),
+        (does_not_send_again, "no progress"),
+        (drops_without_an_answer, "was lost"),
+        (requests_no_lost_snapshot, "no progress"),
+        (waits_for_the_departed, "no progress"),
+        (trains_on_stale_rollouts, "policy lag"),
+    ],
+)
+def test_broken_code_is_found(
+    break_code: Callable[[pytest.MonkeyPatch], None], finding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    break_code(monkeypatch)
+    for seed in range(SEEDS_TO_FIND):
+        failure = simulate(seed).failure
+        if failure is not None and finding in str(failure):
+            print(f"{break_code.__name__}: seed {seed}: {failure}")
+            return
+    pytest.fail(f"not found in {SEEDS_TO_FIND} seeds")

@@ -1,0 +1,172 @@
+"""A listener applies changed certificates without a restart: revoked ones are refused, new ones accepted."""
+
+import datetime
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from certificates import make_certificates
+from log_lines import LINES
+from processes import LIMIT, until
+from test_access_control import listen_somewhere
+
+from daedalus.cli.certificate_folder import CertificateFolder, Identity
+from daedalus.protocol import keys
+from daedalus.transport import credentials_watch
+from daedalus.transport.credentials import CredentialsError, load
+from daedalus.transport.interface import RefusedError, Request, Transport, TransportError
+from daedalus.transport.zenoh_session import session_opener
+from daedalus.transport.zenoh_transport import connect
+
+DAYS = datetime.timedelta(days=365)
+ARM, BOX, LATE = (Identity("actor", name) for name in ("arm", "box", "late"))
+
+
+@pytest.fixture(autouse=True)
+def _poll_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(credentials_watch, "_POLL_SECONDS", 0.05)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> CertificateFolder:
+    return CertificateFolder(make_certificates(tmp_path / "certs"))
+
+
+@pytest.fixture
+def address(folder: CertificateFolder) -> Iterator[str]:
+    """Run a router that answers joins itself."""
+    where, router = listen_somewhere(folder.directory / "router")
+    router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
+    with closing(router):
+        yield where
+
+
+def client(address: str, folder: CertificateFolder, identity: Identity) -> Transport:
+    return connect([address], load(folder.directory / identity.folder, identity.role))
+
+
+def answered(end: Transport) -> bool:
+    return end.query(keys.join("r"), timeout=LIMIT) == [b"welcome"]
+
+
+def test_revoked_certificate_loses_its_session_and_gets_no_other(address: str, folder: CertificateFolder) -> None:
+    kept = folder.directory / "kept"
+    shutil.copytree(folder.directory / ARM.folder, kept)
+    with closing(connect([address], load(kept, "actor"))) as arm, closing(client(address, folder, BOX)) as box:
+        assert answered(arm)
+        folder.revoke([ARM])
+        until(lambda: not answered(arm))
+        until(lambda: answered(box))
+        with pytest.raises(RefusedError, match=r"refuses the certificate in .*kept: it was revoked"):
+            arm.reopen()
+        with pytest.raises(RefusedError, match="it was revoked"):
+            connect([address], load(kept, "actor"))
+        assert not answered(arm)
+    # A new certificate of the same name does not make the revoked one valid again.
+    folder.issue([ARM], DAYS)
+    with closing(eventually(address, folder, ARM)) as arm:
+        until(lambda: answered(arm))
+    with pytest.raises(RefusedError, match="it was revoked"):
+        connect([address], load(kept, "actor"))
+
+
+def eventually(address: str, folder: CertificateFolder, identity: Identity) -> Transport:
+    """Connect as soon as the router has read the changed certificates."""
+    ends: list[Transport] = []
+
+    def opened() -> bool:
+        try:
+            ends.append(client(address, folder, identity))
+        except TransportError:
+            return False
+        return True
+
+    until(opened)
+    return ends[0]
+
+
+def test_certificate_that_is_issued_later_is_accepted(address: str, folder: CertificateFolder) -> None:
+    with closing(client(address, folder, BOX)) as box:
+        folder.issue([LATE], DAYS)
+        with closing(eventually(address, folder, LATE)) as late:
+            until(lambda: answered(late))
+            until(lambda: answered(box))
+    assert any("3 actors and 1 operators are authorised; all connections are renewed" in line for line in LINES)
+
+
+def test_renewed_certificates_are_used_by_listener_and_client(address: str, folder: CertificateFolder) -> None:
+    """The listener's is used at once, a client's from its next connection on; the one before stays valid."""
+    with closing(client(address, folder, ARM)) as arm:
+        folder.issue([Identity("router"), ARM], DAYS)
+        until(lambda: any("connections are renewed" in line for line in LINES))
+        until(lambda: answered(arm))
+
+
+def test_damaged_files_are_not_used(address: str, folder: CertificateFolder) -> None:
+    with closing(client(address, folder, ARM)) as arm:
+        (folder.directory / "router" / "clients.pem").write_text("half a fi")
+        until(lambda: any("the changed certificates are not used: " in line for line in LINES))
+        assert answered(arm)
+        folder.revoke([BOX])
+        until(lambda: any("1 actors and 1 operators are authorised" in line for line in LINES))
+        until(lambda: answered(arm))
+
+
+def test_requests_that_wait_while_the_session_is_renewed_do_no_harm(folder: CertificateFolder) -> None:
+    """Their answers are lost; the sender asks again."""
+    address, router = listen_somewhere(folder.directory / "router")
+    waiting: list[Request] = []
+    renewed = threading.Event()
+    with closing(router), closing(client(address, folder, ARM)) as arm:
+        router.serve(keys.join("r"), lambda request: request.reply(b"welcome") if renewed.is_set() else hold(request))
+
+        def hold(request: Request) -> None:
+            waiting.append(request)
+
+        arm.query_async(keys.join("r"), b"payload", timeout=LIMIT, on_answer=lambda _: None)
+        until(lambda: waiting)
+        folder.revoke([BOX])
+        until(lambda: any("connections are renewed" in line for line in LINES))
+        renewed.set()
+        assert waiting[0].payload == b"payload"
+        waiting[0].reply(b"late")
+        until(lambda: answered(arm))
+
+
+def test_closed_router_is_not_opened_again(folder: CertificateFolder) -> None:
+    address, router = listen_somewhere(folder.directory / "router")
+    router.close()
+    folder.revoke([BOX])
+    until(lambda: all(thread.name != "credentials watch" for thread in threading.enumerate()))
+    with pytest.raises(Exception, match="nothing answers"):
+        client(address, folder, ARM)
+
+
+def test_a_warning_30_days_before_a_certificate_expires(folder: CertificateFolder) -> None:
+    folder.issue([ARM], datetime.timedelta(days=29, hours=1))
+    for identity in (ARM, BOX):
+        session_opener("client", [], [], load(folder.directory / identity.folder, "actor"), 1)
+    warnings = [line for line in LINES if "renew it" in line]
+    assert len(warnings) == 1
+    assert "actor-arm expires in 29 days: renew it (daedalus certs renew)" in warnings[0]
+
+
+def test_client_whose_certificate_expires_in_use_is_told_so(address: str, folder: CertificateFolder) -> None:
+    with closing(client(address, folder, ARM)) as arm:
+        folder.issue([ARM], -datetime.timedelta(days=1))
+        with pytest.raises(RefusedError, match=r"actor-arm: the certificate expired on .*: renew it"):
+            arm.reopen()  # fails, with or without the router
+
+
+def test_expiry_of_the_certificate_in_the_folder_is_checked(folder: CertificateFolder) -> None:
+    arm = load(folder.directory / ARM.folder, "actor")
+    arm.check_expiry()
+    folder.issue([ARM], -datetime.timedelta(days=1))
+    assert -1.1 < arm.days_left() < -0.9
+    with pytest.raises(CredentialsError, match=r"actor-arm: the certificate expired on \d{4}-\d\d-\d\d"):
+        arm.check_expiry()
+    folder.issue([ARM], DAYS)
+    arm.check_expiry()
