@@ -181,6 +181,8 @@ class LearnerService:
             if now >= log_at:
                 recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
+                if hint := self._reporter.hint():
+                    _logger.warning("%s", hint)
             if now >= save_at:
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds

@@ -12,7 +12,7 @@ import numpy as np
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import environments_for, play_episodes
+from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.learner_queries import LearnerQueries, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -31,6 +31,7 @@ class Evaluator:
         """`stop` ends `run`, also in the middle of an episode."""
         self._config, self._stop = config, stop
         self._queries = LearnerQueries(transport)
+        self._warned_of_cuts = False
 
     def run(self) -> None:
         """Evaluate until `stop` or until the run is over.
@@ -89,9 +90,13 @@ class Evaluator:
             wanted.episodes,
             seed,
             sampled=wanted.actions == "sampled",
+            longest=wanted.max_episode_env_steps,
             progress=self._raise_if_stopped,
         )
         _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
+        if evaluation.cut.any() and not self._warned_of_cuts:
+            self._warned_of_cuts = True
+            _logger.warning("%s", cut_note(int(evaluation.cut.sum()), wanted.episodes, wanted.max_episode_env_steps))
         self._queries.report_evaluation(
             welcome.run,
             EvaluationReport(
@@ -105,7 +110,8 @@ class Evaluator:
         )
         return True
 
-    def _raise_if_stopped(self, _finished: int, _mean: float) -> None:
+    def _raise_if_stopped(self, _finished: int, _mean: float) -> bool:
         """End an evaluation on `stop`, in the middle of an episode: called after every step."""
         if self._stop.is_set():
             raise RunOverError("stopped")
+        return False

@@ -17,7 +17,7 @@ from gymnasium.envs.registration import load_env_creator
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
+from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
@@ -97,7 +97,7 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
     spec, modules = _environment(policy, arguments), _modules(policy, arguments)
     modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-    progress = _Progress(sys.stderr, arguments.episodes, stop)
+    progress = _Progress(sys.stderr, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
     try:
         if arguments.video is None:
@@ -160,7 +160,13 @@ def _play(
         runtime = OnnxRuntime(policy.program, progress.stop)
         runtime.load(policy.weights)
         return play_episodes(
-            runtime, environments, episodes, seed, sampled=_actions(policy, arguments) == "sampled", progress=progress
+            runtime,
+            environments,
+            episodes,
+            seed,
+            sampled=_actions(policy, arguments) == "sampled",
+            longest=policy.spec.evaluation.max_episode_env_steps,
+            progress=lambda finished, mean: progress(finished, mean) or (video is not None and video.is_full),
         )
     finally:
         environments.close()
@@ -189,6 +195,7 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
         "best_checkpoint": is_best(policy.directory),
         "policy_version": policy.policy_version,
         "episodes": len(returns),
+        "notes": [note] if (note := _note(evaluation, policy.spec.evaluation.max_episode_env_steps)) else [],
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "return_min": float(returns.min()),
@@ -199,6 +206,14 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
     }
 
 
+def _note(evaluation: Evaluation, longest: int) -> str:
+    """Return a message about episodes that were cut, or an empty string."""
+    cut = int((evaluation.cut & (evaluation.lengths == longest)).sum())
+    if cut:
+        return cut_note(cut, len(evaluation.cut), longest)
+    return "the last episode was cut at the end of the video" if evaluation.cut.any() else ""
+
+
 def _text(result: dict[str, Any]) -> str:
     best = "best checkpoint, " if result["best_checkpoint"] else ""
     text = (
@@ -207,7 +222,9 @@ def _text(result: dict[str, Any]) -> str:
         f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
         f"over {result['episodes']} {result['actions']} episodes"
     )
-    return f"{text}\nvideo: {result['video']}, {result['video_seconds']:.1f} s" if "video" in result else text
+    if "video" in result:
+        text += f"\nvideo: {result['video']}, {result['video_seconds']:.1f} s"
+    return "\n".join([text, *result["notes"]])
 
 
 class _Progress:
@@ -216,23 +233,24 @@ class _Progress:
     On a terminal it rewrites one line.
     """
 
-    def __init__(self, stream: TextIO, episodes: int, stop: threading.Event) -> None:
-        self._stream, self._episodes, self.stop = stream, episodes, stop
+    def __init__(self, stream: TextIO, episodes: int, longest: int, stop: threading.Event) -> None:
+        self._stream, self._episodes, self._longest, self.stop = stream, episodes, longest, stop
         self._terminal = stream.isatty()
         self._due = time.monotonic() + _PROGRESS_SECONDS
         self._rewriting = False
 
-    def __call__(self, finished: int, mean: float) -> None:
+    def __call__(self, finished: int, mean: float) -> bool:
         if self.stop.is_set():
             raise _StoppedError
         if time.monotonic() < self._due:
-            return
+            return False
         self._due = time.monotonic() + _PROGRESS_SECONDS
-        so_far = f", mean return {mean:.1f}" if finished else ""
+        so_far = f", mean return {mean:.1f}" if finished else f" (each is cut after {self._longest:,} env_steps)"
         line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
         self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
         self._stream.flush()
         self._rewriting = self._terminal
+        return False
 
     def end(self) -> None:
         """Clear the rewritten line."""

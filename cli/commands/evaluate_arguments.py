@@ -90,7 +90,7 @@ def _add_watching(options: argparse.ArgumentParser) -> None:
         help="width of the video in pixels (default: as rendered, for a gif at most 320)",
     )
     watching.add_argument(
-        "--max-seconds", type=float, metavar="S", help="length of the video. The episodes are still played to their end"
+        "--max-seconds", type=float, metavar="S", help="length of the video. The evaluation ends with it"
     )
     watching.add_argument("--render", action="store_true", help="show the episodes in a window, at human speed")
 

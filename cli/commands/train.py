@@ -183,4 +183,4 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
-    return f"{trained}\n{evaluated}\n{folder}"
+    return "\n".join([trained, evaluated, *evaluation["notes"], folder])

@@ -221,16 +221,31 @@ def test_a_video_of_an_atari_game_uses_gymnasiums_implementation(tmp_path: Path,
     assert on_gymnasium["video_seconds"] == 2 * 41 / 60
 
 
-def test_max_seconds_cuts_the_gif_but_not_the_episodes(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_max_seconds_ends_the_gif_and_the_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)
-    result = evaluate(run, *options, "--max-seconds", 0.2, "--width", 150)
-    assert result["video_seconds"] == 0.2
+    result = evaluate(run, *options, "--max-seconds", 0.1, "--width", 150)
+    assert result["video_seconds"] == 0.1
     with Image.open(tmp_path / "short.gif") as image:
         assert image.size == (150, 100)
-        assert getattr(image, "n_frames", 1) == 3  # every fourth of ten
-    assert len(result["returns"]) == 3
-    assert sum(result["lengths"]) > 10
+        assert getattr(image, "n_frames", 1) == 2  # every fourth of five
+    assert result["lengths"] == [4]
+    assert result["notes"] == ["the last episode was cut at the end of the video"]
+
+
+def test_episodes_that_never_end_are_cut_and_the_result_says_so(
+    tmp_path: Path, evaluate: Callable[..., dict], capsys: pytest.CaptureFixture[str]
+) -> None:
+    endless = COUNTING.model_copy(update={"kwargs": {"ends": [10**9]}})
+    run = save(tmp_path / "run", endless, 1, evaluation={"max_episode_env_steps": 30})
+    note = (
+        "2 of 2 episodes were cut after 30 env_steps (evaluation.max_episode_env_steps): if the environment never ends "
+        "them, set environment.max_episode_steps"
+    )
+    result = evaluate(run, "--episodes", 2)
+    assert (result["lengths"], result["notes"]) == ([30, 30], [note])
+    assert main([str(run), "--episodes", "2", "--allow-module", "counting_environment"]) == 0
+    assert capsys.readouterr().out.endswith(f" greedy episodes\n{note}\n")
 
 
 def test_render_needs_a_screen(
@@ -360,7 +375,7 @@ def test_progress_is_written_to_standard_error(
     assert main([str(run), *options]) == 0
     captured = capsys.readouterr()
     lines = captured.err.splitlines()
-    assert lines[0] == "evaluation: 0 of 2 episodes"
+    assert lines[0] == "evaluation: 0 of 2 episodes (each is cut after 27,000 env_steps)"
     assert lines[2].startswith("evaluation: 1 of 2 episodes, mean return 3.")
     assert len(json.loads(captured.out)["returns"]) == 2
 
