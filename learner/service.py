@@ -23,6 +23,7 @@ from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -63,6 +64,7 @@ class LearnerService:
         *,
         started: float,
         restored: "Checkpoint | None" = None,
+        modules: UserModules = NO_MODULES,
     ) -> None:
         """Construct the service.
 
@@ -75,9 +77,10 @@ class LearnerService:
           open_writers: functions that open the metrics writers.
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
+          modules: modules that may be imported for the policy.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
-        self._open_writers, self._restored = open_writers, restored
+        self._open_writers, self._restored, self._modules = open_writers, restored, modules
         self._counters = RunCounters(spec.training.target_episodes)
         self._annealing = Annealing(budget=spec.training.env_steps)
         if restored is not None:
@@ -125,7 +128,7 @@ class LearnerService:
             if spaces is None:
                 _logger.info("stopped before the first actor joined")
                 return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
-            learner = Learner(self._spec.training, self._spec.policy, spaces)
+            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
@@ -205,6 +208,8 @@ class LearnerService:
             if now >= log_at:
                 recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
+                if hint := self._reporter.hint():
+                    _logger.warning("%s", hint)
             if now >= save_at:
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds

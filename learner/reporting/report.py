@@ -13,6 +13,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+_LONG_EPISODE = 10_000  # env_steps in each environment without the end of an episode: give a hint
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -93,6 +94,24 @@ class RateMeter:
         }
         self._mark(counters, now)
         return self.rates
+
+
+class EpisodeHint:
+    """Hint that no episode has ended after many steps, given once."""
+
+    def __init__(self) -> None:
+        self._given = False
+
+    def take(self, counters: RunCounters, fleet: Fleet) -> str:
+        """Return the hint if it is due, else an empty string."""
+        environments = sum(fleet.actors[name].environments for name in fleet.live)
+        if self._given or counters.episodes or counters.env_steps < max(environments, 1) * _LONG_EPISODE:
+            return ""
+        self._given = True
+        return (
+            f"no episode has ended after {_LONG_EPISODE:,} env_steps in each environment: "
+            "if the environment never ends them, set environment.max_episode_steps"
+        )
 
 
 def episode_statistics(counters: RunCounters) -> dict[str, float]:

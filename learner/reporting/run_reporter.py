@@ -4,7 +4,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.report import Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.report import EpisodeHint, Health, RateMeter, metrics_row, run_status, summary
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluations import Evaluations
@@ -38,6 +38,7 @@ class RunReporter:
         self._counters, self._annealing, self._fleet, self._lock = counters, annealing, fleet, lock
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
+        self._hint = EpisodeHint()
 
     def begin(self, now: float) -> None:
         """Start to measure rates, at the begin of training."""
@@ -68,6 +69,11 @@ class RunReporter:
                 "entropy_bonus": learner.entropy_bonus(progress),
             }
             return metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
+
+    def hint(self) -> str:
+        """Return a hint for the user if one is due, else an empty string."""
+        with self._lock:
+            return self._hint.take(self._counters, self._fleet)
 
     def details(self, learner: "Learner") -> Details:
         """Return the distributions and the picture that belong to a metrics row."""

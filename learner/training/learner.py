@@ -17,6 +17,7 @@ from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import Spaces
@@ -26,8 +27,12 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 class Learner:
     """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
-    def __init__(self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces) -> None:
+    def __init__(
+        self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES
+    ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
+
+        `modules` may be imported for the policy.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces.
         """
@@ -40,7 +45,7 @@ class Learner:
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
         self._device = torch.device(spec.device)
-        self._network = ActorCritic(policy, spaces).to(self._device)
+        self._network = ActorCritic(policy, spaces, modules).to(self._device)
         self._gradients = GradientComputer(spec, self._network)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())

@@ -6,6 +6,7 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
@@ -123,7 +124,10 @@ def brightened(environment: gymnasium.Env) -> gymnasium.Env:
 
 
 def test_user_wrapper_receives_the_frames() -> None:
-    plain, wrapped = make_environments(_spec(), 1), make_environments(_spec(), 1, wrap=f"{__name__}:brightened")
+    plain, wrapped = (
+        make_environments(_spec(), 1),
+        make_environments(_spec(wrap=f"{__name__}:brightened"), 1, modules=TEST_MODULES),
+    )
     try:
         np.testing.assert_array_equal(wrapped.reset(3), np.minimum(plain.reset(3), 235) + 20)
     finally:

@@ -76,7 +76,9 @@ def test_summary_counts_agree_with_each_other(solved: tuple[Path, str]) -> None:
 
 def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     directory, _ = solved
-    names = {entry.name.split(".out.")[0] for entry in directory.iterdir()}
+    names = {entry.name.split(".out.")[0] for entry in directory.iterdir()} - {
+        "output.log"
+    }  # written by a slow evaluation
     assert names == {"config.toml", "versions.json", "metrics.csv", "events", "checkpoints", "summary.json"}
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
@@ -162,11 +164,19 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
     assert result["solved"]
 
 
-def test_an_environment_module_in_the_working_directory_is_found(start: Start, tmp_path: Path) -> None:
+def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> None:
+    """The module is in the working directory; it prints in every step, also from a process of its own."""
     source = (Path(__file__).parent.parent / "counting_environment.py").read_text()
-    (tmp_path / "my_module.py").write_text(source)
+    noise = "        print('noise'); self._step or os.system('echo from a process')\n"
+    noisy = source.replace("        self._step += 1\n", f"{noise}        self._step += 1\n")
+    (tmp_path / "my_module.py").write_text(noisy.replace("import gymnasium\n", "import os\nimport gymnasium\n", 1))
     running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, "--run-dir", "own")
     assert running.wait() == 0, running.output
+    assert running.lines.count("noise") < 200
+    running.expect(r"[\d,]+ lines of output were not shown; see own/output.log")
+    log = (tmp_path / "own" / "output.log").read_text().splitlines()
+    for line in ("[actor-1] noise", "[evaluation-0] noise", "[evaluation-0] from a process"):
+        assert line in log
     result = summary(tmp_path / "own")
     assert result["env_steps"] >= 2000
     assert result["solved"] is False

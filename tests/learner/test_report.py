@@ -10,7 +10,15 @@ from building import EPOCH, joined_fleet, make_rollout, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
-from daedalus.learner.reporting.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
+from daedalus.learner.reporting.report import (
+    EpisodeHint,
+    Health,
+    RateMeter,
+    episode_statistics,
+    metrics_row,
+    run_status,
+    summary,
+)
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -48,6 +56,22 @@ def test_rates_are_since_the_last_measurement() -> None:
 def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
     meter = RateMeter(trained_counters(), 10.0)
     assert meter.measure(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
+
+
+def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
+    counters, fleet, hint = RunCounters(100), joined_fleet("a", "b"), EpisodeHint()  # six environments
+    counters.env_steps = 59_999
+    assert hint.take(counters, fleet) == ""
+    counters.env_steps = 60_000
+    assert hint.take(counters, fleet) == (
+        "no episode has ended after 10,000 env_steps in each environment: if the environment never ends them, "
+        "set environment.max_episode_steps"
+    )
+    assert hint.take(counters, fleet) == ""
+    assert EpisodeHint().take(trained_counters(1.0), fleet) == ""
+    ended = trained_counters(1.0)
+    ended.env_steps = 10**9
+    assert EpisodeHint().take(ended, fleet) == ""
 
 
 def test_episode_statistics_are_over_the_newest_episodes() -> None:

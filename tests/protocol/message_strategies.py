@@ -59,7 +59,8 @@ run_specs = st.builds(
     RunSpec,
     environment=st.builds(
         EnvironmentSpec,
-        id=st.text(min_size=1, max_size=20),
+        id=st.sampled_from(["Any-v0", "ALE/Pong-v5", "my.module:Mine-v0", "ä"]),
+        wrap=st.none() | st.just("my.module:wrap"),
         kwargs=st.dictionaries(text, json_values, max_size=3),
         max_episode_steps=st.none() | positive,
         action_table=st.none() | st.lists(st.tuples(floats, floats), min_size=2, max_size=3).map(tuple),
