@@ -19,6 +19,7 @@ from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
@@ -47,7 +48,7 @@ class ActorConfig:
     run: str = keys.ANY_RUN
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
-    wrap: str | None = None  # module:function, applied to each environment
+    modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
 
@@ -64,7 +65,7 @@ class ActorService:
     ) -> None:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
         self._config, self._transport, self._stop = config, transport, stop
-        self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
+        self._collector = collector or EnvironmentCollector(config.environments, config.modules)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
@@ -110,8 +111,8 @@ class ActorService:
 
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
-        spaces, count = self._collector.prepare(welcome.spec)
         self._end.follow(welcome.run, welcome.learner_epoch)
+        spaces, count = self._collector.prepare(welcome.spec)
         self._feed.begin(welcome)
         self._declare_presence(welcome.run)
         join = replace(self._join, spaces=spaces, environments=count)

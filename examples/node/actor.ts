@@ -237,13 +237,13 @@ export class Actor {
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
 function checkSupported(spec: link.EnvironmentSpec): void {
-  const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,
     kwargs: Object.keys(kwargs).length > 0,
     action_repeat: action_repeat !== 1,
     frame_stack: frame_stack !== 1,
-    ...{ action_table, no_reward_limit, crop, grey, resize },
+    ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
   if (unsupported.length === 0) return;

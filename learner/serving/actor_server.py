@@ -32,6 +32,7 @@ from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
 _LEAVE_SECONDS = 5.0  # after the end of the run, for the actors to leave
+_ASK_SECONDS = 2.0  # in which an actor asks again that was refused because its name is in use
 _REPEAT_SECONDS = 0.5  # between repetitions of the message that the run is over
 _HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
@@ -67,7 +68,8 @@ class ActorServer:
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
         self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
-        self._ended = b""  # the encoded RunEnded, after the end
+        self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
+        self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
@@ -119,8 +121,12 @@ class ActorServer:
         with self.lock:
             if self._ended:
                 return
-            self._ended = encode(
-                RunEnded(learner_epoch=self._epoch, outcome="finished" if finished else "stopped", reason=reason)
+            outcome = "finished" if finished else "stopped"
+            self._ended = encode(RunEnded(learner_epoch=self._epoch, outcome=outcome, reason=reason))
+            self._ended_at = time.monotonic()
+            self._were_cut_off = any(
+                self._ended_at < actor.last_seen + _LEAVE_SECONDS and not self.fleet.is_present(actor)
+                for actor in self.fleet.actors.values()
             )
         self._responses.end(self._ended, finished=finished)
         self._publish_end()
@@ -138,16 +144,21 @@ class ActorServer:
 
     def await_departures(self, stop: threading.Event) -> None:
         """Wait until all actors have left, at most 5 s, and repeat that the run is over. Call after `close`."""
-        now = time.monotonic()
-        deadline, repeat_at = now + _LEAVE_SECONDS, now + _REPEAT_SECONDS
-        while (now := time.monotonic()) < deadline and not stop.is_set():
+        repeat_at = self._ended_at + _REPEAT_SECONDS
+        while self._expects_actors(time.monotonic()) and not stop.is_set():
             with self.lock:
-                if not self.fleet.live:
-                    return
                 self.lock.wait(HEARTBEAT_SECONDS)
-            if now >= repeat_at:
+            if time.monotonic() >= repeat_at:
                 self._publish_end()
-                repeat_at = now + _REPEAT_SECONDS
+                repeat_at += _REPEAT_SECONDS
+        self._publish_end()  # to whoever has just begun to join
+
+    def _expects_actors(self, now: float) -> bool:
+        """Return whether an actor may not know of the end yet: it is present, was cut off, or is about to ask again."""
+        if now > self._ended_at + _LEAVE_SECONDS:
+            return False
+        with self.lock:
+            return bool(self.fleet.live) or self._were_cut_off or now < self._responses.postponed_at + _ASK_SECONDS
 
     def await_spaces(self, stop: threading.Event) -> Spaces | None:
         """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first."""

@@ -3,6 +3,7 @@
 State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
 
+import math
 import threading
 
 from daedalus.learner.serving.fleet import Fleet
@@ -34,6 +35,7 @@ class QueryResponses:
         self._program: Program | None = None
         self._encoded_program = b""
         self._ending: Refusal | None = None  # of joins after the end
+        self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
 
     def join(self, data: bytes, now: float) -> bytes:
         """Return the answer to a Join: a Welcome, or a Refusal with the reason. Notifies the lock after a Welcome."""
@@ -48,6 +50,8 @@ class QueryResponses:
         with self._lock:
             refusal = self._fleet.join(message, now)
             if refusal is not None:
+                if refusal.code == "name_taken":
+                    self.postponed_at = now
                 return encode(refusal)
             seed = self._fleet.seed_for(message.actor, self._start_version)
             self._lock.notify_all()
