@@ -24,7 +24,6 @@ from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
@@ -223,15 +222,14 @@ class LearnerService:
         if not rollouts:
             return
         skipped = learner.updates_skipped
-        at_fault = learner.step(rollouts, progress)
+        left_out = learner.step(rollouts, progress)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
-        self._server.rollouts.count_trained(rollouts, at_fault)
+        self._server.rollouts.count_trained(rollouts, left_out)
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
-        fault = _gradient_fault(at_fault) if skipped else ""
         if skipped and not self._health.gradient_fault:
-            _logger.warning("update skipped: %s; the weights are unchanged", fault)
-        self._health.gradient_fault = fault
+            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
+        self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
 
     def _status(self) -> RunStatus:
@@ -243,12 +241,6 @@ class LearnerService:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
             _logger.warning("summary not written: %s", error.strerror)
-
-
-def _gradient_fault(at_fault: list[Rollout]) -> str:
-    """Return why an update was skipped, with the senders of the rollouts that are at fault."""
-    senders = sorted({rollout.identity.actor for rollout in at_fault})
-    return "the gradient is not finite" + (f" with rollouts of {', '.join(senders[:5])}" if senders else "")
 
 
 def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:

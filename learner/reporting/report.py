@@ -27,7 +27,7 @@ class Health:
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
-    gradient_fault: str = ""  # why the last update was skipped, if it was
+    gradient_fault: bool = False  # whether the last update was skipped
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -46,7 +46,7 @@ class Health:
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
         if self.gradient_fault:
-            found.append(f"updates are skipped: {self.gradient_fault}")
+            found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
         return tuple(found)

@@ -8,6 +8,7 @@ import pytest
 from saved_runs import CARTPOLE, save, score
 
 from daedalus.cli import select_best as module
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate_arguments import parser
 from daedalus.cli.select_best import select_best
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
@@ -25,7 +26,8 @@ def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return [{"return_mean": 1.0, "return_std": 0.0} for _ in commands]
 
     monkeypatch.setattr(module, "play", play)
-    select_best(run, read_policy(checkpoints(run)[0]).spec, ["--episodes", "20"], threading.Event())
+    with ChildOutput(tmp_path / "output.log", lambda _: None, lambda _: None) as output:
+        select_best(run, read_policy(checkpoints(run)[0]).spec, ["--episodes", "20"], threading.Event(), output)
     assert len(started) == 2
     return started
 

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -212,12 +211,12 @@ def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_trainin
             message = decode(data, Limits())
             assert isinstance(message, Acknowledgement)
             answer, sequence = message, sequence + 1
-        assert re.match(r"updates with [3-9] of its rollouts had no finite gradient", answer.reason)
+        assert answer.reason.startswith("3 of its rollouts had no finite gradient")
         rows = len(training_run.rows())
         until(lambda: len(training_run.rows()) > rows + 1 and training_run.rows()[-1]["policy_loss"])
     finally:
         training_run.end()
-    assert "update skipped: the gradient is not finite with rollouts of hostile; the weights are unchanged" in LINES
+    assert "a rollout of actor 'hostile' has no finite gradient, and was left out" in LINES
     summary = json.loads((training_run.directory / "summary.json").read_text())
     assert summary["updates_skipped"] == summary["rollouts_rejected"]["non_finite"] >= 3
     weights = read_policy(checkpoints(training_run.directory)[0]).weights

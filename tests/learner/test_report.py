@@ -131,7 +131,7 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
         ({"actor_seen": 90.0}, 1, ()),
         ({"updated": 44.0}, 1, ("no update for 61 s",)),
         ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
-        ({"gradient_fault": "the gradient is not finite"}, 1, ("updates are skipped: the gradient is not finite",)),
+        ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
         ({"left_out": {"b", "a"}}, 3, ("batches do not wait for a, b: connected, but without rollouts",)),
         (
             {"left_out": set("abcdefg")},
