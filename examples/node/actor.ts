@@ -123,7 +123,8 @@ export class Actor {
     for (let loaded = -1; ; ) {
       await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {
-        const due = () => this.#version > loaded || this.#rejected;
+        // A rejected rollout is replaced, unless a newer version is out: another one of this version would be stale.
+        const due = () => this.#version > loaded || (this.#rejected && this.#publishedVersion <= loaded);
         await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
       } else if (this.#publishedVersion > this.#version) {
