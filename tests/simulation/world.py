@@ -12,7 +12,7 @@ from .network import Network
 from .settings import Settings
 from .traffic import LinkRequest
 
-_STOP_SECONDS = 11.0  # in which a process ends that is asked to stop: two queries of 5 s may have no answer
+_STOP_SECONDS = 7.0  # in which a process ends that is asked to stop: a query of 5 s may have no answer
 
 
 class World:
