@@ -8,7 +8,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,6 +64,7 @@ class LearnerService:
         started: float,
         restored: "Checkpoint | None" = None,
         modules: UserModules = NO_MODULES,
+        certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
         """Construct the service.
 
@@ -77,6 +78,7 @@ class LearnerService:
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
           modules: modules that may be imported for the policy.
+          certificate_days_left: function that returns the days until the certificate of this process expires.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._restored, self._modules = open_writers, restored, modules
@@ -87,7 +89,9 @@ class LearnerService:
             self._annealing = _resumed_annealing(restored, spec)
         epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
-        self._health = Health(started=started, updated=started, actor_seen=started)
+        self._health = Health(
+            started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
+        )
         self._server = ActorServer(
             directory.name,
             spec,

@@ -40,7 +40,12 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
+from daedalus.transport.security import (
+    SECURITY_ERRORS,
+    certificate_days_left,
+    credentials_to_connect,
+    credentials_to_listen,
+)
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
@@ -81,7 +86,7 @@ def main() -> int:
         return stopped
     try:
         _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, arguments.started or started, restored)
+        outcome = _train(run, transport, stop, progress, arguments.started or started, restored, credentials)
         return _status(outcome, run.spec, stopped)
     except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
@@ -133,6 +138,7 @@ def _train(
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
+    credentials: Credentials | None,
 ) -> Outcome:
     """Run the learner to its end."""
     directory = run.directory
@@ -146,6 +152,7 @@ def _train(
         started=started,
         restored=restored,
         modules=run.modules,
+        certificate_days_left=lambda: certificate_days_left(credentials),
     )
     return service.run()
 

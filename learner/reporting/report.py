@@ -1,6 +1,6 @@
 """Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,8 @@ class Health:
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
     gradient_fault: bool = False  # whether the last update was skipped
+    # Days until the certificate of this process expires, or None without one.
+    certificate_days_left: Callable[[], float | None] = lambda: None
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -191,6 +193,7 @@ def run_status(
         queue_bytes=queue_bytes,
         queue_bytes_limit=spec.service.queue_bytes,
         checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        certificate_days_left=health.certificate_days_left(),
         rollouts_rejected=dict(counters.rollouts_rejected),
         actors=fleet.statuses(now),
     )

@@ -70,7 +70,7 @@ class Intake:
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
         if size <= _SLACK_BYTES:
             return None
-        if spaces is None or actor is None or not actor.environments:
+        if spaces is None or actor is None:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
         plain, queue = self._limits(spaces, actor.environments).message_bytes, self._spec.service.queue_bytes
         if size > plain:
@@ -91,7 +91,7 @@ class Intake:
         result may change in the meantime.
         """
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
-        if spaces is None or actor is None or not actor.environments:
+        if spaces is None or actor is None:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
         if actor.quarantined:
             return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)

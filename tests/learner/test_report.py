@@ -109,12 +109,12 @@ def test_first_row_omits_unknown_values() -> None:
 def test_status_contains_the_run_and_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0)
+    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0, certificate_days_left=lambda: 7.5)
     status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
     assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
-    assert (status.problems, status.checkpoint_age_seconds) == ((), 5.0)
+    assert (status.problems, status.checkpoint_age_seconds, status.certificate_days_left) == ((), 5.0, 7.5)
     assert (status.queue_bytes, status.queue_bytes_limit) == (77, 64 * 2**20)
     assert [actor.actor for actor in status.actors] == ["a", "b"]
 

@@ -124,6 +124,7 @@ MESSAGES: dict[str, Message] = {
             queue_bytes=0,
             queue_bytes_limit=2**26,
             checkpoint_age_seconds=None,
+            certificate_days_left=600.5,
             rollouts_rejected={"stale": 2, "unfit": 1},
             actors=(
                 ActorStatus(

@@ -106,6 +106,7 @@ statuses = st.builds(
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
     problems=st.lists(text, max_size=3).map(tuple),
     checkpoint_age_seconds=st.none() | floats,
+    certificate_days_left=st.none() | floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
