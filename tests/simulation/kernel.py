@@ -74,7 +74,8 @@ class _Worker:
                 pass
             except BaseException as error:
                 kernel.fail(error)
-            sys.settrace(None)
+            if kernel.fine_files:
+                sys.settrace(None)
             self.task = self.kernel = None  # type: ignore[assignment]
             _Worker.idle.append(self)
             kernel.finish(task)
