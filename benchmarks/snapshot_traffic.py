@@ -85,7 +85,7 @@ def measure(arguments: argparse.Namespace, link: LinkChoice) -> Measured:
             here.wait("all actors", lambda: _trained(here) == arguments.actors)
             time.sleep(arguments.warm_up)
             first, carried, cpu, began = _status(here), dict(proxy.carried), _cpu(learner.process.pid), time.monotonic()
-            lags = []
+            lags, last = [], first
             while time.monotonic() < began + arguments.seconds:
                 time.sleep(0.5)
                 last = _status(here)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from daedalus.cli.child_output import INHERITED, Streams
+from daedalus.cli.child_output import OpenStreams, Streams, inherited
 from daedalus.cli.processes import STOPPED
 
 _MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
@@ -24,9 +24,7 @@ _ACTORS_NICENESS = 5  # added to the niceness of the learner
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
-def start(
-    module: str, *arguments: str, one_thread: bool = False, streams: Streams = INHERITED
-) -> subprocess.Popen[bytes]:
+def start(module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
     """Start `python -m module` with a pipe as its standard input.
 
     The pipe closes when this process ends for any reason, and the child process then ends by itself.
@@ -42,6 +40,10 @@ def start(
 
 class FailedError(Exception):
     """Error of a process that failed too often."""
+
+    def __init__(self, name: str, failures: int) -> None:
+        super().__init__(f"{name} failed {failures} times; see the error above")
+        self.name = name
 
 
 @dataclass(slots=True)
@@ -92,7 +94,7 @@ class Supervised:
             lived = now - self._started
             self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
         if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
-            raise FailedError(f"{self.name} failed {self.failures} times; see the error above")
+            raise FailedError(self.name, self.failures)
         self.restarts += 1
         self._start(first=False)
         return f"{self.name} {_describe(status)}; started again"
@@ -106,13 +108,14 @@ def _describe(status: int) -> str:
 
 
 def supervised_actor(
-    name: str, connect: str, options: tuple[str, ...] = (), streams: Streams = INHERITED
+    name: str, connect: str, options: tuple[str, ...] = (), open_streams: OpenStreams = inherited
 ) -> Supervised:
     """Start an actor, or the evaluator, under supervision."""
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
         arguments = ["--connect", connect, "--name", name, *options]
-        process = start("daedalus.cli.commands.actor", *arguments, one_thread=True, streams=streams)
+        with open_streams(name) as streams:
+            process = start("daedalus.cli.commands.actor", *arguments, streams=streams, one_thread=True)
         with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
             os.setpriority(os.PRIO_PROCESS, process.pid, niceness)

@@ -1,7 +1,7 @@
 """Rules of Zenoh's access control: what each role may do on an untrusted network, by the names in certificates.
 
 Everything that these rules do not allow is denied. Plain TCP connections have full access: a router accepts them on
-loopback only (transport/addresses.py). Pure functions.
+loopback only (transport/addresses.py). So have connections over a Unix socket. Pure functions.
 """
 
 from collections.abc import Iterable
@@ -41,7 +41,7 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     ]
     subjects: list[dict[str, Any]] = [
         {"id": "learner and routers", "cert_common_names": [common_name("learner"), common_name("router")]},
-        {"id": "this machine", "link_protocols": ["tcp"]},
+        {"id": "this machine", "link_protocols": ["tcp", "unixsock-stream"]},
     ]
     policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
     shared = [rule["id"] for rule in _actors_rules()]

@@ -12,7 +12,7 @@ import numpy as np
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import environments_for, play_episodes
+from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.service import ActorConfig
@@ -34,6 +34,7 @@ class Evaluator:
         self._config, self._stop = config, stop
         self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
+        self._warned_of_cuts = False
 
     def run(self) -> bool:
         """Evaluate until `stop` or until the run is over; return whether the run finished.
@@ -63,7 +64,7 @@ class Evaluator:
         )
         environment = spec.environment.as_evaluated()
         count = environments_for(episodes, environment)
-        environments = make_environments(environment, count, wrap=self._config.wrap, for_evaluation=True)
+        environments = make_environments(environment, count, modules=self._config.modules, for_evaluation=True)
         try:
             due = time.monotonic() + interval
             for number in itertools.count():
@@ -94,9 +95,13 @@ class Evaluator:
             wanted.episodes,
             seed,
             sampled=wanted.actions == "sampled",
-            progress=lambda _finished, _mean: self._end.check(),  # after every step
+            longest=wanted.max_episode_env_steps,
+            progress=self._raise_if_ended,
         )
         _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
+        if evaluation.cut.any() and not self._warned_of_cuts:
+            self._warned_of_cuts = True
+            _logger.warning("%s", cut_note(int(evaluation.cut.sum()), wanted.episodes, wanted.max_episode_env_steps))
         self._queries.report_evaluation(
             welcome.run,
             EvaluationReport(
@@ -109,3 +114,8 @@ class Evaluator:
             self._end,
         )
         return True
+
+    def _raise_if_ended(self, _finished: int, _mean: float) -> bool:
+        """End an evaluation with the run or on `stop`, in the middle of an episode: called after every step."""
+        self._end.check()
+        return False

@@ -65,6 +65,7 @@ class LearnerQueries:
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
         while True:
+            end.check()  # a request may take 5 s
             awaited = "a learner"
             try:
                 welcome = self.request_join(run, join)

@@ -20,6 +20,7 @@ from daedalus.actor.session.snapshot_source import FIRST_PUSH_SECONDS, MISSED_PU
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
@@ -46,7 +47,7 @@ class ActorConfig:
     run: str = keys.ANY_RUN
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
-    wrap: str | None = None  # module:function, applied to each environment
+    modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
 
@@ -63,7 +64,7 @@ class ActorService:
     ) -> None:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
         self._config, self._transport, self._stop = config, transport, stop
-        self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
+        self._collector = collector or EnvironmentCollector(config.environments, config.modules)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
@@ -167,6 +168,7 @@ class ActorService:
         for _ in range(2):
             if seconds <= allowed:
                 return
+            self._end.check()  # a request may take 5 s
             began = time.monotonic()
             self._queries.program(welcome.run)
             seconds = time.monotonic() - began

@@ -84,9 +84,10 @@ class SessionMonitor:
     def _probe_if_silent(self) -> None:
         """After a long silence ask whether the learner is there: a dead session can look alive.
 
-        Raises LearnerLostError if nobody responds.
+        Raises LearnerLostError if nobody responds, and RunOverError as `check` does.
         """
         if time.monotonic() > self._presence.heard_at + _SILENCE_SECONDS:
+            self._end.check()  # a request may take 5 s
             if not self._queries.learner_responds(self._uploads.run, self._join):
                 raise LearnerLostError
             self._presence.heard()

@@ -10,10 +10,10 @@ import logging
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import (
     STOPPED,
@@ -22,7 +22,7 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
-from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_to_resume
+from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
@@ -35,11 +35,17 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
+from daedalus.transport.security import (
+    SECURITY_ERRORS,
+    certificate_days_left,
+    credentials_to_connect,
+    credentials_to_listen,
+)
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
@@ -47,15 +53,6 @@ if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Run:
-    """Run to train, from the command line."""
-
-    spec: RunSpec
-    directory: Path
-    exists: bool  # whether the run directory was created before
 
 
 def main() -> int:
@@ -68,9 +65,12 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        run = _resolve(arguments)
+        run = choose_run(arguments)
         credentials = _credentials(arguments)
-    except (SettingsError, *SECURITY_ERRORS) as error:
+    except ModuleNotAllowedError as error:
+        print(f"daedalus learner: {allowing(error, ['daedalus', 'learner', *sys.argv[1:]])}", file=sys.stderr)
+        return BAD_USAGE
+    except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
     progress = Progress(sys.stdout, run.spec.training.env_steps)
@@ -86,27 +86,13 @@ def main() -> int:
         return stopped
     try:
         _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, arguments.started or started, restored)
+        outcome = _train(run, transport, stop, progress, arguments.started or started, restored, credentials)
         return _status(outcome, run.spec, stopped)
     except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
     finally:
         transport.close()
-
-
-def _resolve(arguments: argparse.Namespace) -> _Run:
-    """Return the run that the arguments define. Raises SettingsError."""
-    if arguments.prepared:
-        return _Run(spec=run_directory.read_config(arguments.prepared), directory=arguments.prepared, exists=True)
-    if arguments.resume:
-        spec, directory, exists = resolve_to_resume(arguments)
-    else:
-        spec, directory = resolve(arguments)
-        exists = False
-    if not exists:
-        run_directory.check_free(directory)
-    return _Run(spec=spec, directory=directory, exists=exists)
 
 
 def _credentials(arguments: argparse.Namespace) -> Credentials | None:
@@ -134,23 +120,25 @@ def _open_transport(
     return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
-def _announce(run: _Run, arguments: argparse.Namespace) -> None:
+def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
     """Create the run directory if it is new, and log how actors join. Raises SettingsError."""
     if not run.exists:
         run_directory.create(run.directory, run.spec)
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        _logger.info("actors join with: daedalus actor --connect %s", ", ".join(_addresses(arguments)))
+        options = [", ".join(_addresses(arguments)), *allow_settings(spec.environment.user_modules)]
+        _logger.info("actors join with: daedalus actor --connect %s", " ".join(options))
 
 
 def _train(
-    run: _Run,
+    run: ChosenRun,
     transport: Transport,
     stop: threading.Event,
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
+    credentials: Credentials | None,
 ) -> Outcome:
     """Run the learner to its end."""
     directory = run.directory
@@ -163,6 +151,8 @@ def _train(
         [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
         started=started,
         restored=restored,
+        modules=run.modules,
+        certificate_days_left=lambda: certificate_days_left(credentials),
     )
     return service.run()
 

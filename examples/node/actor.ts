@@ -123,7 +123,8 @@ export class Actor {
     for (let loaded = -1; ; ) {
       await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {
-        const due = () => this.#version > loaded || this.#rejected;
+        // A rejected rollout is replaced, unless a newer version is out: another one of this version would be stale.
+        const due = () => this.#version > loaded || (this.#rejected && this.#publishedVersion <= loaded);
         await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
       } else if (this.#publishedVersion > this.#version) {
@@ -237,13 +238,13 @@ export class Actor {
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
 function checkSupported(spec: link.EnvironmentSpec): void {
-  const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,
     kwargs: Object.keys(kwargs).length > 0,
     action_repeat: action_repeat !== 1,
     frame_stack: frame_stack !== 1,
-    ...{ action_table, no_reward_limit, crop, grey, resize },
+    ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
   if (unsupported.length === 0) return;

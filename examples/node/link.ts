@@ -8,6 +8,7 @@ export interface EnvironmentSpec {
   id: string;
   kwargs: Record<string, unknown>;
   max_episode_steps: number | null;
+  wrap: string | null;
   action_table: unknown;
   action_repeat: number;
   no_reward_limit: number | null;

@@ -145,21 +145,23 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
-    def count_trained(self, rollouts: list[Rollout], at_fault: list[Rollout]) -> None:
+    def count_trained(self, rollouts: list[Rollout], left_out: list[Rollout]) -> None:
         """Count the rollouts of a batch for their senders, after its updates.
 
         Args:
           rollouts: the rollouts of the batch.
-          at_fault: those for which an update had no finite gradient.
+          left_out: those that were left out of updates, because they have no finite gradient.
         """
         with self._lock:
             for rollout in rollouts:
-                finite = not any(rollout is each for each in at_fault)
+                finite = not any(rollout is each for each in left_out)
                 actor = self._fleet.find(rollout.identity)
                 if actor is not None:
                     actor.count_trained(finite=finite)
                 if not finite:
                     self._counters.rollouts_rejected["non_finite"] += 1
+                if not finite and actor is not None and actor.rejected["non_finite"] == 1:
+                    _logger.warning("a rollout of actor %r has no finite gradient, and was left out", actor.name)
 
     def _take(self, version: int) -> TakenRollouts:
         taken = self._buffer.take(self._fleet.live, version, time.monotonic())

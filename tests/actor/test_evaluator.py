@@ -55,6 +55,15 @@ def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
     assert seen - {0.0}
 
 
+def test_evaluated_episodes_are_not_cut_by_the_no_reward_limit(network: MemoryNetwork) -> None:
+    """The first reward of the first episode is 0, at which training would cut it."""
+    learner = ScriptedLearner(network, run_spec(no_reward_limit=1))
+    evaluator = RunningEvaluator(network)
+    learner.give(learner.snapshot(version=1))
+    assert learner.receive_report().lengths.tolist() == [3, 3]
+    evaluator.end(learner)
+
+
 def test_each_evaluation_uses_the_policy_given_then(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     for version, action in ((5, 3), (6, 1), (8, 0)):
         learner.give(learner.snapshot(version, action))
@@ -180,6 +189,9 @@ class Endless:
         self.playing.set()
         over = np.full(2, self.over)
         return np.zeros((2, 2), np.float32), np.zeros(2), over, np.zeros(2, np.bool_)
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
 
     def close(self) -> None:
         self.closed.set()

@@ -116,7 +116,14 @@ def test_an_actor_that_sends_nan_rewards_is_quarantined_and_prints_the_reason(
     source = (Path(__file__).parent.parent / "nan_environment.py").read_text()
     (tmp_path / "nan_environment.py").write_text(source)
     learner = start("learner", "--env", "nan_environment:Broken-v0", "--listen", address, "--run-dir", "run", *ENDLESS)
-    actor = start("actor", "--connect", address, "--name", "broken")
+    learner.expect("actors join with: .* --allow-module nan_environment")
+    careful = start("actor", "--connect", address, "--name", "careful")
+    assert careful.wait() == 1
+    assert careful.lines[-1] == (
+        "daedalus actor: the learner asks for environment.id=nan_environment:Broken-v0, but the module nan_environment "
+        "may not be imported here; if you trust that code, add --allow-module nan_environment"
+    )
+    actor = start("actor", "--connect", address, "--name", "broken", "--allow-module", "nan_environment")
     assert actor.wait() == 1
     assert "quarantined this actor: 3 unfit rollouts in a row, the last: rewards has a value" in actor.output
     report = actor_status(status(), "broken")

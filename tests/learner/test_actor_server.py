@@ -120,6 +120,20 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
         server.close("the test is over")
 
 
+def test_rows_that_only_reset_are_not_counted_for_their_actor(network: MemoryNetwork) -> None:
+    server = open_server(network, run_spec(actors=1, algorithm="impala"), RunCounters(10))
+    actor = MemoryTransport(network)
+    join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+    try:
+        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        rollout = make_rollout(identity("a"))
+        actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        server.rollouts.count_trained(server.rollouts.take_batch(0), [])
+        assert server.fleet.actors["a"].env_steps == np.count_nonzero(rollout.valid) < rollout.valid.size
+    finally:
+        server.close("the test is over")
+
+
 class FakeEvaluator:
     """Evaluator that sends without waiting and keeps the answers."""
 

@@ -52,6 +52,7 @@ def _rollout(frames: np.ndarray) -> Rollout:
         valid=cells != 4,
         episode_returns=np.array([1.5, -2.0], np.float32),
         episode_lengths=np.array([12, 9], np.int32),
+        episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
     )
 
 
@@ -124,6 +125,7 @@ MESSAGES: dict[str, Message] = {
             queue_bytes=0,
             queue_bytes_limit=2**26,
             checkpoint_age_seconds=None,
+            certificate_days_left=600.5,
             rollouts_rejected={"stale": 2, "unfit": 1},
             actors=(
                 ActorStatus(

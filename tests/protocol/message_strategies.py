@@ -59,7 +59,8 @@ run_specs = st.builds(
     RunSpec,
     environment=st.builds(
         EnvironmentSpec,
-        id=st.text(min_size=1, max_size=20),
+        id=st.sampled_from(["Any-v0", "ALE/Pong-v5", "my.module:Mine-v0", "ä"]),
+        wrap=st.none() | st.just("my.module:wrap"),
         kwargs=st.dictionaries(text, json_values, max_size=3),
         max_episode_steps=st.none() | positive,
         action_table=st.none() | st.lists(st.tuples(floats, floats), min_size=2, max_size=3).map(tuple),
@@ -105,6 +106,7 @@ statuses = st.builds(
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
     problems=st.lists(text, max_size=3).map(tuple),
     checkpoint_age_seconds=st.none() | floats,
+    certificate_days_left=st.none() | floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
@@ -140,6 +142,12 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+        episode_info={
+            name: bits(random, "<f4", (draw(st.integers(1, episodes)),))
+            for name in (
+                draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
+            )
+        },
     )
 
 
