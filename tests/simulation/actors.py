@@ -29,7 +29,7 @@ _KEPT = 2  # rollouts that a client keeps while it cannot send
 class Runtime:
     """In place of OnnxRuntime: a policy that is never run."""
 
-    def __init__(self, model: bytes) -> None:
+    def __init__(self, model: bytes, *_: object) -> None:
         assert model
 
 
@@ -172,7 +172,7 @@ class ActorProcess:
             outcome = "name in use"
         except ActorError as error:
             outcome = f"error: {error}"
-            self.ledger.require(False, f"{self.process.name} gives up: {error}")
+            self.ledger.require(False, self.process.name, "gives up:", error)
         self.link.close()
         self.process.kill()  # the user's thread of a client
         self._end(outcome)

@@ -123,6 +123,7 @@ class LearnerProcess:
                 hang, self.hang_seconds = self.hang_seconds, 0.0
                 kernel.sleep(self.settings.train_seconds * kernel.random.random() + hang)
                 self.version += self._updates(rollouts)
+                server.rollouts.count_trained(rollouts, at_fault=[])
                 server.publisher.publish_if_due(self.version, self._weights(), len(rollouts))
             if kernel.now >= save_at:
                 self.disk.version, self.disk.counters = self.version, counters.state(0.0)

@@ -3,6 +3,7 @@
 import socket
 import time
 from contextlib import ExitStack, closing
+from typing import Any
 
 import pytest
 from processes import LIMIT, until
@@ -19,7 +20,7 @@ MIB = 1 << 20
 NO_ANSWER_SECONDS = 2.0
 
 
-def listen_somewhere(**options: int) -> tuple[str, Transport]:
+def listen_somewhere(**options: Any) -> tuple[str, Transport]:
     while True:
         endpoint = free_endpoint()
         try:
