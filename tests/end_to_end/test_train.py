@@ -15,6 +15,8 @@ import pytest
 import safetensors.numpy
 from processes import Running, processes_mentioning, until
 
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
+
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
@@ -36,6 +38,14 @@ def is_port_closed(output: str) -> bool:
     port = int(output.split("tcp/127.0.0.1:")[1].split(";")[0])
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def is_free(directory: Path) -> bool:
+    try:
+        RunLock(directory).close()
+    except RunInUseError:
+        return False
+    return True
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +92,15 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     names = {entry.name.split(".out.")[0] for entry in directory.iterdir()} - {
         "output.log"
     }  # written by a slow evaluation
-    assert names == {"config.toml", "versions.json", "metrics.csv", "events", "checkpoints", "summary.json"}
+    assert names == {
+        "learner.lock",
+        "config.toml",
+        "versions.json",
+        "metrics.csv",
+        "events",
+        "checkpoints",
+        "summary.json",
+    }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
     assert float(rows[-1]["entropy"]) > 0
@@ -143,12 +161,19 @@ def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: 
     assert is_port_closed(running.output)
 
 
-def test_the_child_processes_end_when_train_is_killed(start: Start) -> None:
+def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
     address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
     running.expect(r"updates .*/s")
+    second = start("resume", "orphan-run")
+    assert second.wait() == 1
+    assert second.lines == [
+        f"daedalus resume: run directory orphan-run is in use by process {running.process.pid} on "
+        f"{socket.gethostname()}: stop it first, or choose another --run-dir"
+    ]
     running.process.kill()
     until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))
+    until(lambda: is_free(tmp_path / "orphan-run"))
 
 
 def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
@@ -192,7 +217,9 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     assert running.wait() in (0, 3), running.output
     records = [json.loads(line) for line in running.lines if line.startswith("{")]
     assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.cli.local_run", "daedalus.learner.service"} <= {record["logger"] for record in records}
+    assert {"daedalus.cli.local_run", "daedalus.learner.serving.evaluation_server"} <= {
+        record["logger"] for record in records
+    }
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
     *progress, outcome, evaluation, folder = plain
