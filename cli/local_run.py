@@ -4,7 +4,6 @@
 """
 
 import logging
-import socket
 import subprocess
 import threading
 import time
@@ -18,6 +17,7 @@ from daedalus.cli.supervisor import FailedError, Supervised, start, stop, superv
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class LocalRun:
     started: float  # on the monotonic clock; the seconds of the run count from this time
     lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
-    listen: str | None = None  # address for actors of other hosts, in addition to a free port of this machine
+    listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False
     log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
@@ -96,8 +96,16 @@ def run_locally(
 
 def _train(run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
+    with private_address() as address:
+        return _train_at(address, run, stopping, output, learner_streams)
+
+
+def _train_at(
+    address: str, run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams
+) -> int:
+    """Run the learner, and connect this machine's actors to it at an address."""
     spec, options = run.spec, _actor_options(run)
-    listening, address = _addresses(run)
+    listening = _listening(run, address)
     learner = _supervised_learner(run, listening, learner_streams)
     actors: list[Supervised] = []
     try:
@@ -132,14 +140,13 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     return *_logging_options(level, run.log_json), *allow_settings(run.spec.environment.user_modules)
 
 
-def _addresses(run: LocalRun) -> tuple[list[str], str]:
-    """Return the learner's options for listening, and the address for this machine's actors, which use no TLS."""
-    own = f"tcp/127.0.0.1:{_free_port()}" if run.listen is None or run.tls else run.listen
-    addresses = [own] if run.listen in (None, own) else [own, run.listen]
+def _listening(run: LocalRun, own: str) -> list[str]:
+    """Return the learner's options for listening, at its own address and at that for actors of other hosts."""
+    addresses = [own, run.listen] if run.listen else [own]
     listening = [word for address in addresses for word in ("--listen", address)]
     if run.tls:
         listening += ["--tls", str(run.tls)]
-    return [*listening, *(["--insecure"] if run.insecure else [])], own
+    return [*listening, *(["--insecure"] if run.insecure else [])]
 
 
 def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenStreams) -> Supervised:
@@ -205,9 +212,3 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     summary["evaluation"] = {**evaluation, "select_best": chosen, "seconds": time.monotonic() - began}
     run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
     return summary
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

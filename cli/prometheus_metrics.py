@@ -46,6 +46,12 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         "Age of the newest checkpoint.",
         lambda run: run.checkpoint_age_seconds,
     ),
+    (
+        GaugeMetricFamily,
+        "certificate_days_left",
+        "Days until the learner's certificate expires.",
+        lambda run: run.certificate_days_left,
+    ),
 )
 
 _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ...] = (

@@ -28,8 +28,8 @@ examples:
   daedalus learner cartpole --connect tcp/router:7447
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
 
-exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped early, 2 bad usage"""
+exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage"""
 
 
 def add_settings(options: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from daedalus.cli.child_output import OpenStreams, Streams, inherited
+from daedalus.cli.processes import STOPPED
 
 _MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
 _SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
@@ -81,7 +82,7 @@ class Supervised:
     def failed_at_once(self) -> bool:
         """Whether the first process failed soon after its start, so that a restart would not help."""
         status = self.process.poll()
-        failed = status is not None and status > 0 and status not in self.ended
+        failed = status is not None and status > 0 and status not in (STOPPED, *self.ended)
         return failed and self.restarts == 0 and time.monotonic() - self._started < _SOON_SECONDS
 
     def check(self) -> str | None:
@@ -99,15 +100,21 @@ class Supervised:
                 return None
             self._start(first=False)
             return f"{self.name} ended before the run; started again"
-        if status > 0:
+        if status > 0 and status != STOPPED:
             lived = now - self._started
             self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
         if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
             raise FailedError(self.name, self.failures)
         self.restarts += 1
         self._start(first=False)
-        how = f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
-        return f"{self.name} {how}; started again"
+        return f"{self.name} {_describe(status)}; started again"
+
+
+def _describe(status: int) -> str:
+    """Return how a process ended that had more to do."""
+    if status == STOPPED:
+        return "was stopped by a signal"
+    return f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
 
 
 def supervised_actor(

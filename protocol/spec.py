@@ -158,7 +158,7 @@ class TrainingSpec(Specification):
     entropy_bonus: Annotated[float, Field(ge=0.0)] = 0.01
     """Weight of the policy's entropy."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
-    """Anneal the entropy bonus to this value over the budget. Unset: constant."""
+    """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
     normalize_advantages: bool = False
     """Scale the advantages of each update to mean 0 and standard deviation 1."""
 
@@ -167,7 +167,7 @@ class TrainingSpec(Specification):
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
     """Learning rate at the start."""
     learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Anneal the learning rate to this value over the budget. Unset: constant."""
+    """Anneal the learning rate linearly to this value over the budget. Unset: constant."""
     optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
     """Epsilon of the optimiser."""
     rmsprop_decay: UnitInterval = 0.99

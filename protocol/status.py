@@ -44,5 +44,6 @@ class RunStatus(Specification):
     queue_bytes: int  # of rollouts that wait to be decoded
     queue_bytes_limit: int
     checkpoint_age_seconds: float | None  # None before the first checkpoint of this process
+    certificate_days_left: float | None  # of the learner's certificate; None without one
     rollouts_rejected: dict[str, int]  # by cause, including senders that never joined
     actors: tuple[ActorStatus, ...]

@@ -34,10 +34,10 @@ from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
-def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
+def run_spec(seconds: float = 0.001, episodes: int = 2, **environment: Any) -> RunSpec:
     return RunSpec.model_validate(
         {
-            "environment": {"id": "counting_environment:Counting-v0"},
+            "environment": {"id": "counting_environment:Counting-v0", **environment},
             "evaluation": {"seconds": seconds, "episodes": episodes},
         }
     )

@@ -116,6 +116,8 @@ class RunningActor:
         timeout: float | None = None,
         link: LinkChoice = "auto",
         collector: Collector | None = None,
+        *,
+        begin: bool = True,
     ) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
@@ -123,6 +125,10 @@ class RunningActor:
         config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
         self._service = ActorService(config, self.transport, self.stop, collector)
         self._thread = threading.Thread(target=self._run, daemon=True)
+        if begin:
+            self.begin()
+
+    def begin(self) -> None:
         self._thread.start()
 
     def _run(self) -> None:

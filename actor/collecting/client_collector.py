@@ -85,8 +85,8 @@ class ClientCollector:
         """See Collector."""
         return bool(self._full)
 
-    def collect(self, identity: RolloutIdentity) -> Rollout | None:
-        """See Collector. Return the oldest full rollout."""
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:
+        """See Collector. Return the oldest full rollout. `on_row` has no effect: the caller's loop makes the rows."""
         with self._lock:
             return replace(self._full.popleft(), identity=identity) if self._full else None
 

@@ -1,5 +1,7 @@
 """Rollouts from environments that the actor creates and steps itself. No network, no threads."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
@@ -68,14 +70,15 @@ class EnvironmentCollector:
         """See Collector. `collect` never waits for anybody here."""
         return True
 
-    def collect(self, identity: RolloutIdentity) -> Rollout:
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout:
         """See Collector. Step the environments until the rollout is full."""
         writer, environments = self._writer, self._environments
         assert writer is not None
         assert environments is not None
+        on_row()
         while not writer.record(*environments.step(writer.act())):
-            pass
-        return writer.finish(identity, self._policy_version)
+            on_row()
+        return writer.finish(identity, self._policy_version, environments.take_episode_info())
 
     def close(self) -> None:
         """See Collector. Close the environments."""

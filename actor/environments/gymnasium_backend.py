@@ -18,6 +18,7 @@ from daedalus.actor.environments.environment_errors import (
     unknown_environment,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -34,6 +35,7 @@ class GymnasiumEnvironments:
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
+        self._episode_info = EpisodeInfo()
 
     def reset(self, seed: int) -> np.ndarray:
         """See BackendEnvironments."""
@@ -41,7 +43,14 @@ class GymnasiumEnvironments:
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See BackendEnvironments."""
-        return self._environment.step(actions)[:4]
+        frames, rewards, terminated, truncated, info = self._environment.step(actions)
+        if info:
+            self._episode_info.add(info, terminated | truncated)
+        return frames, rewards, terminated, truncated
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See BackendEnvironments."""
+        return self._episode_info.take()
 
     def close(self) -> None:
         """See BackendEnvironments."""

@@ -1,7 +1,8 @@
 """`daedalus learner`: construct one learner and run it.
 
-Exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped early, 2 bad usage.
+Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
+learner that a signal stopped exits with processes.STOPPED.
 """
 
 import argparse
@@ -16,7 +17,13 @@ from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, raise_descriptor_limit, stop_on_signals
+from daedalus.cli.processes import (
+    STOPPED,
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    raise_descriptor_limit,
+    stop_on_signals,
+)
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -36,7 +43,12 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
+from daedalus.transport.security import (
+    SECURITY_ERRORS,
+    certificate_days_left,
+    credentials_to_connect,
+    credentials_to_listen,
+)
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
@@ -89,21 +101,22 @@ def _serve(
         stack.enter_context(RunLock(run.directory))
     restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
+    stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
-        return FAILED
+        return stopped
     stack.callback(transport.close)
-    if run.exists:
-        _announce(run, arguments)
-        return _train(run, transport, stop, progress, started, restored)
-    lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
-    stack.enter_context(lock)
-    run = replace(run, directory=lock.directory)
+    if not run.exists:
+        lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
+        stack.enter_context(lock)
+        run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments)
-        return _train(run, transport, stop, progress, started, restored)
+        outcome = _train(run, transport, stop, progress, started, restored, credentials)
     except _FAILURES:
-        run_directory.remove_failed(run.directory)
+        if not run.exists:
+            run_directory.remove_failed(run.directory)
         raise
+    return _status(outcome, run.spec, stopped)
 
 
 def _credentials(arguments: argparse.Namespace) -> Credentials | None:
@@ -147,8 +160,9 @@ def _train(
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
-) -> int:
-    """Run the learner to its end and return the exit status."""
+    credentials: Credentials | None,
+) -> Outcome:
+    """Run the learner to its end."""
     directory = run.directory
     service = LearnerService(
         run.spec,
@@ -160,8 +174,9 @@ def _train(
         started=started,
         restored=restored,
         modules=run.modules,
+        certificate_days_left=lambda: certificate_days_left(credentials),
     )
-    return _status(service.run(), run.spec)
+    return service.run()
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
@@ -177,10 +192,10 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
-def _status(outcome: Outcome, spec: RunSpec) -> int:
-    """Return the exit status for the end of a run."""
+def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
+    """Return the exit status for the end of a run; `stopped` is that of a run that was stopped."""
     if not outcome.finished:
-        return FAILED
+        return stopped if outcome.saved else FAILED
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED
 

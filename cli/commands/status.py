@@ -10,6 +10,7 @@ from daedalus.protocol.limits import STATUS_LIMITS
 from daedalus.protocol.messages import StatusReport
 from daedalus.protocol.status import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect
+from daedalus.transport.credentials import WARNING_DAYS
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
@@ -89,6 +90,7 @@ def _table(status: RunStatus) -> str:
         f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
         f"epoch {status.learner_epoch:x}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
+        *_expiry(status.certificate_days_left),
         f"  return {mean}, env_steps {status.env_steps:,} of {status.env_steps_budget:,}, "
         f"updates {status.updates:,}{skipped}",
         f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
@@ -101,6 +103,12 @@ def _table(status: RunStatus) -> str:
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
     ]
     return "\n".join(lines)
+
+
+def _expiry(days: float | None) -> list[str]:
+    if days is None or days > WARNING_DAYS:
+        return []
+    return [f"  the learner's certificate expires in {days:.0f} days: renew it (daedalus certs renew)"]
 
 
 def _line(actor: ActorStatus) -> str:

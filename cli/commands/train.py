@@ -43,7 +43,7 @@ before the target, 1 failed or stopped, 2 bad usage"""
 
 _RESUME = """\
 Continues a run from its newest undamaged checkpoint, with the same weights, optimiser state, counters and random state.
-The environments start new episodes."""
+The environments start new episodes. With another budget, annealed settings continue from the values that they had."""
 
 _RESUME_EXAMPLES = """\
 examples:
@@ -124,7 +124,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--listen",
         metavar="tcp/HOST:PORT",
-        help="address where more actors may join (default: a free port of this machine)",
+        help="address where more actors may join (default: none; the processes of the run use a private Unix socket)",
     )
     add_tls(options)
     add_insecure(options)

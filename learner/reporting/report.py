@@ -1,11 +1,12 @@
 """Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.spec import RunSpec
@@ -26,7 +27,9 @@ class Health:
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
-    gradient_fault: str = ""  # why the last update was skipped, if it was
+    gradient_fault: bool = False  # whether the last update was skipped
+    # Days until the certificate of this process expires, or None without one.
+    certificate_days_left: Callable[[], float | None] = lambda: None
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -45,7 +48,7 @@ class Health:
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
         if self.gradient_fault:
-            found.append(f"updates are skipped: {self.gradient_fault}")
+            found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
         return tuple(found)
@@ -134,7 +137,7 @@ def metrics_row(
     learning: dict[str, float],
     wall_seconds: float,
 ) -> dict[str, float]:
-    """Return one metrics row, with columns of learner/reporting/metrics.py.
+    """Return one metrics row, with columns of learner/reporting/metrics.py and the scalars of the environment.
 
     Args:
       counters: counters of the run.
@@ -156,6 +159,7 @@ def metrics_row(
         "rollouts_rejected": counters.rollouts_rejected.total(),
         "updates_skipped": counters.updates_skipped,
         **learning,
+        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
     }
 
 
@@ -189,6 +193,7 @@ def run_status(
         queue_bytes=queue_bytes,
         queue_bytes_limit=spec.service.queue_bytes,
         checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        certificate_days_left=health.certificate_days_left(),
         rollouts_rejected=dict(counters.rollouts_rejected),
         actors=fleet.statuses(now),
     )

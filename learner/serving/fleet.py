@@ -17,7 +17,7 @@ from daedalus.protocol.status import ActorStatus
 _MAX_ACTORS = 16_384
 _MAX_WINDOWS = 8  # incarnations of an actor whose sequence numbers are kept
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
-_MAX_NON_FINITE = 3  # rollouts at fault for skipped updates, after which the incarnation is quarantined
+_MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
 _FINITE_AGAIN = 100  # rollouts in a row with finite gradients, after which those before no longer count
 _REORDERING = 1024  # largest distance of sequence numbers that arrive out of order
 
@@ -61,7 +61,7 @@ class Actor:
     rejected: Counter[str] = field(default_factory=Counter)
     busy: int = 0  # number of `busy` answers
     consecutive_unfit: int = 0  # rollouts that violate the specification
-    non_finite: int = 0  # rollouts at fault for skipped updates
+    non_finite: int = 0  # rollouts without a finite gradient
     finite_in_a_row: int = 0  # rollouts that were trained on since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
     env_steps: int = 0
@@ -93,10 +93,10 @@ class Actor:
             self.quarantined = f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}"
 
     def count_trained(self, *, finite: bool) -> None:
-        """Count a rollout that was trained on. Quarantine the actor if several were at fault for skipped updates.
+        """Count a rollout that was trained on. Quarantine the actor if several had no finite gradient.
 
-        Unlike a rejected rollout, such a rollout costs the rollouts of other actors too. Therefore it takes many good
-        ones to make up for it.
+        Unlike a rejected rollout, such a rollout costs the learner much time. Therefore it takes many good ones to make
+        up for it.
         """
         if finite:
             self.finite_in_a_row += 1
@@ -107,8 +107,7 @@ class Actor:
         self.non_finite, self.finite_in_a_row = self.non_finite + 1, 0
         if self.non_finite >= _MAX_NON_FINITE:
             self.quarantined = (
-                f"updates with {self.non_finite} of its rollouts had no finite gradient: its observations or rewards "
-                "are too large"
+                f"{self.non_finite} of its rollouts had no finite gradient: its observations or rewards are too large"
             )
 
     def start_incarnation(self, incarnation: int) -> None:

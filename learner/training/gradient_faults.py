@@ -1,4 +1,4 @@
-"""Which rollouts of a batch are at fault if an update has no finite gradient. Rare, so it may be slow."""
+"""Which rollouts of a batch are at fault if the gradient of an update is not finite. Rare, so it may be slow."""
 
 from collections.abc import Sequence
 from dataclasses import replace

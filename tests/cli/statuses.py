@@ -46,6 +46,7 @@ def run_status(**changes: Any) -> RunStatus:
         "queue_bytes": 0,
         "queue_bytes_limit": 1024,
         "checkpoint_age_seconds": 3.0,
+        "certificate_days_left": None,
         "rollouts_rejected": {"stale": 2},
         "actors": (),
     }

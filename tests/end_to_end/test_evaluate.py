@@ -87,6 +87,12 @@ def play_one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[i
     return returns, taken
 
 
+def test_episodes_are_not_cut_by_the_no_reward_limit(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    """The first reward of the first episode is 0, at which training would cut it."""
+    run = save(tmp_path / "run", COUNTING.model_copy(update={"no_reward_limit": 1}), 3)
+    assert evaluate(run, "--episodes", 2, "--envs", 2)["lengths"] == [3, 3]
+
+
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_the_returns_equal_those_of_episodes_played_one_by_one(
     tmp_path: Path, evaluate: Callable[..., dict], memory: str

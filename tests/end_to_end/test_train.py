@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
-from processes import Running, processes_mentioning, until
+from processes import Running, listening_ports, processes_mentioning, until
 
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
@@ -34,10 +34,8 @@ def newest_checkpoint(directory: Path) -> Path:
     return max((directory / "checkpoints").iterdir())
 
 
-def is_port_closed(output: str) -> bool:
-    port = int(output.split("tcp/127.0.0.1:")[1].split(";")[0])
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) != 0
+def is_socket_removed(output: str) -> bool:
+    return not Path(output.split("unixsock-stream/")[1].split(";")[0]).parent.exists()
 
 
 def is_free(directory: Path) -> bool:
@@ -108,7 +106,7 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
 
 def test_no_process_and_no_open_port_is_left(solved: tuple[Path, str]) -> None:
     assert not processes_mentioning("solved-run")
-    assert is_port_closed(solved[1])
+    assert is_socket_removed(solved[1])
 
 
 def test_evaluate_plays_a_finished_run(solved: tuple[Path, str], start: Start) -> None:
@@ -153,17 +151,18 @@ def test_resume_restores_the_exact_state_and_continues(solved: tuple[Path, str],
 def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: Path, number: signal.Signals) -> None:
     running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS)
     running.expect(r"updates .*/s")
+    assert not any(map(listening_ports, processes_mentioning("stopped-run")))  # every user could connect there
     running.process.send_signal(number)
     assert running.wait() == 1
     running.expect("continue with: daedalus resume stopped-run")
     assert newest_checkpoint(tmp_path / "stopped-run").name.isdigit()
     assert not processes_mentioning("stopped-run")
-    assert is_port_closed(running.output)
+    assert is_socket_removed(running.output)
 
 
 def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
-    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     second = start("resume", "orphan-run")
     assert second.wait() == 1
@@ -180,7 +179,7 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
     running = start(
         "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 4_000_000
     )
-    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
     os.kill(victim, signal.SIGKILL)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from building import EPOCH, joined_fleet, make_rollout, run_spec
 
+from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
 from daedalus.learner.reporting.report import (
     EpisodeHint,
@@ -21,6 +22,10 @@ from daedalus.learner.reporting.report import (
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.update_metrics import METRICS
 
+DIAGNOSTICS = (
+    *("behaviour_kl", "rho_mean", "rho_effective_share", "rho_clipped_fraction"),
+    *VALUE_ERROR_QUANTILES,
+)
 EVERYTHING = np.ones((6, 3), np.bool_)
 
 
@@ -87,7 +92,7 @@ def test_row_has_every_column_when_all_values_are_known() -> None:
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False)
     rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
-    learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
+    learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
     assert set(row) == set(COLUMNS)
@@ -104,12 +109,12 @@ def test_first_row_omits_unknown_values() -> None:
 def test_status_contains_the_run_and_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0)
+    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0, certificate_days_left=lambda: 7.5)
     status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
     assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
-    assert (status.problems, status.checkpoint_age_seconds) == ((), 5.0)
+    assert (status.problems, status.checkpoint_age_seconds, status.certificate_days_left) == ((), 5.0, 7.5)
     assert (status.queue_bytes, status.queue_bytes_limit) == (77, 64 * 2**20)
     assert [actor.actor for actor in status.actors] == ["a", "b"]
 
@@ -126,7 +131,7 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
         ({"actor_seen": 90.0}, 1, ()),
         ({"updated": 44.0}, 1, ("no update for 61 s",)),
         ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
-        ({"gradient_fault": "the gradient is not finite"}, 1, ("updates are skipped: the gradient is not finite",)),
+        ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
         ({"left_out": {"b", "a"}}, 3, ("batches do not wait for a, b: connected, but without rollouts",)),
         (
             {"left_out": set("abcdefg")},

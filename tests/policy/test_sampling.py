@@ -19,11 +19,10 @@ logits_of_any_size = arrays.arrays(
 ).filter(lambda logits: bool(np.isfinite(logits).any(axis=-1).all()))  # a policy may not rule out every action
 
 
-class Uniforms(np.random.Generator):
-    """A generator that always returns the same number."""
+class Uniforms:
+    """A source of random numbers that always returns the same number."""
 
     def __init__(self, value: float) -> None:
-        super().__init__(np.random.PCG64(0))
         self._value = value
 
     def random(self, size: int, dtype: type[np.float32]) -> np.ndarray:

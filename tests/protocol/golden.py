@@ -52,6 +52,7 @@ def _rollout(frames: np.ndarray) -> Rollout:
         valid=cells != 4,
         episode_returns=np.array([1.5, -2.0], np.float32),
         episode_lengths=np.array([12, 9], np.int32),
+        episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
     )
 
 
@@ -103,7 +104,7 @@ MESSAGES: dict[str, Message] = {
         returns=np.array([1.0, 2.5], np.float32),
         lengths=np.array([10, 20], np.int32),
     ),
-    "run_ended": RunEnded(learner_epoch=9, reason="the learner has finished"),
+    "run_ended": RunEnded(learner_epoch=9, outcome="finished", reason="the learner has finished"),
     "status_report": StatusReport(
         status=RunStatus(
             run="r",
@@ -123,6 +124,7 @@ MESSAGES: dict[str, Message] = {
             queue_bytes=0,
             queue_bytes_limit=2**26,
             checkpoint_age_seconds=None,
+            certificate_days_left=600.5,
             rollouts_rejected={"stale": 2, "unfit": 1},
             actors=(
                 ActorStatus(

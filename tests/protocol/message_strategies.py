@@ -106,6 +106,7 @@ statuses = st.builds(
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
     problems=st.lists(text, max_size=3).map(tuple),
     checkpoint_age_seconds=st.none() | floats,
+    certificate_days_left=st.none() | floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
@@ -141,6 +142,12 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+        episode_info={
+            name: bits(random, "<f4", (draw(st.integers(1, episodes)),))
+            for name in (
+                draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
+            )
+        },
     )
 
 
@@ -212,7 +219,9 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
-    RunEnded: st.builds(RunEnded, learner_epoch=counters, reason=text),
+    RunEnded: st.builds(
+        RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
+    ),
     StatusReport: st.builds(StatusReport, status=statuses),
 }
 messages = st.one_of(*KINDS.values())

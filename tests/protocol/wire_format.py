@@ -105,7 +105,7 @@ STATUS = wire(  # every field of a status, as another implementation could write
                 **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second"), 1.0),
                 "policy_lag_mean": 0.0,
                 **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), 0),
-                **dict.fromkeys(("episode_return_mean", "checkpoint_age_seconds")),
+                **dict.fromkeys(("episode_return_mean", "checkpoint_age_seconds", "certificate_days_left")),
                 "problems": [],
                 "rollouts_rejected": {},
                 "actors": [],

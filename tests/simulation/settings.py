@@ -56,7 +56,7 @@ def draw(seed: int) -> Settings:
     real_codec = random.random() < 0.05
     spec = _spec(random, small_queue=0.004 if real_codec else 0.0002)
     faulty = random.uniform(1.0, 12.0)
-    collect = random.choice((0.1, 0.3, 1.0))
+    collect = random.choice((0.1, 0.5, 1.0))
     return Settings(
         spec=spec,
         embedded=random.random() < 0.5,
@@ -69,7 +69,7 @@ def draw(seed: int) -> Settings:
         checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
         real_codec=real_codec,
-        heartbeat_seconds=random.choice((0.2, 2.0, 2.0)),  # a long one shows a thread that should have been told
+        heartbeat_seconds=random.choice((0.2, 2.0, 2.0, 2.0)),  # a long one shows a thread that should have been told
         patience_seconds=random.choice((60.0, 3.0)),
         fine=random.random() < 0.03,
     )
@@ -125,7 +125,7 @@ def _weather(random: Random) -> Weather:
 def _faults(random: Random, seconds: float) -> tuple[tuple[float, str, float], ...]:
     kinds = random.sample(FAULTS, random.randint(1, 4))
     if random.random() < 0.4:
-        kinds.append(random.choice(("kill learner", "stop learner")))
+        kinds.append(random.choice(("kill learner", "stop learner", "twin")))
     count = random.choice((0, 1, 2, 4, 8))
     drawn = [
         (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0))) for _ in range(count)
