@@ -18,6 +18,7 @@ from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
@@ -78,6 +79,7 @@ class LearnerService:
             self._counters.restore(restored.counters)
         epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
+        self._heartbeat = Heartbeat(directory)
         self._health = Health(started=started, updated=started, actor_seen=started)
         self._server = ActorServer(
             directory.name,
@@ -113,7 +115,7 @@ class LearnerService:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop)
+            spaces = self._server.await_spaces(self._stop, self._heartbeat.beat)
             if spaces is None:
                 return Outcome(solved=False, finished=False, seconds_to_target=None)
             learner = Learner(self._spec.training, self._spec.policy, spaces)
@@ -123,6 +125,7 @@ class LearnerService:
             return self._learn(learner, self._checkpointer(learner))
         finally:
             self._close_server()
+            self._heartbeat.clear()
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
         """Publish the policy and return its checkpointer."""
@@ -168,6 +171,7 @@ class LearnerService:
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+            self._heartbeat.beat()
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._counters.reached(training.target_return):

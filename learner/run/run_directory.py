@@ -3,6 +3,7 @@
 config.toml      all settings; reproduces the run      metrics.csv   one row for each log interval
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
+heartbeat        its age shows that the learner works (heartbeat.py)
 """
 
 import json

@@ -26,7 +26,7 @@ def read(data: bytes) -> Message:
 
 def test_welcome_contains_run_epoch_specification_and_seed() -> None:
     responses, fleet = make_responses()
-    answer = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    answer = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(answer, Welcome)
     assert (answer.run, answer.learner_epoch, answer.spec) == ("run", 5, SPEC)
     assert answer.seed == fleet.seed_for("a", 0)
@@ -35,7 +35,7 @@ def test_welcome_contains_run_epoch_specification_and_seed() -> None:
 def test_message_that_is_not_a_join_is_refused() -> None:
     responses, fleet = make_responses()
     for data, code in ((b"\xff", "mismatch"), (encode(RunEnded(learner_epoch=1, reason="")), "malformed")):
-        answer = read(responses.join(data, 0.0))
+        answer = read(responses.join("a", data, 0.0))
         assert isinstance(answer, Refusal)
         assert answer.code == code
     assert not fleet.actors
@@ -72,7 +72,7 @@ def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     assert responses.snapshot() == b"newest"
     responses.close(b"run_ended")
     assert responses.snapshot() == b"run_ended"
-    late = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    late = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"
 
@@ -82,7 +82,7 @@ def test_join_with_observations_too_large_for_memory_is_refused_and_fixes_no_spa
     responses, fleet = make_responses()
     huge = ArraySpace.model_construct(kind="array", shape=(2**40,), dtype="float32", frames=1)
     spaces = Spaces.model_construct(observation=huge, action=DiscreteSpace(count=2))
-    answer = read(responses.join(encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
+    answer = read(responses.join("a", encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
     assert isinstance(answer, Refusal)
     assert "use at most" in answer.reason
     assert fleet.spaces is None
