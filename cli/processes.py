@@ -12,6 +12,8 @@ import traceback
 
 _logger = logging.getLogger(__name__)
 
+# Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
+STOPPED = 128 + signal.SIGTERM
 _STUCK_SECONDS = 4.0  # a process ends within 5 s of a signal
 
 

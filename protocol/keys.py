@@ -9,9 +9,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 ANY_RUN = "*"
 
 
+def is_name(name: str) -> bool:
+    """Return whether `name` can be one chunk of a key."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str, what: str) -> str:
     """Return `name` if it can be one chunk of a key. Raises ValueError, which names `what` it is, otherwise."""
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ValueError(
             f"{what} {name!r} must be 1 to 64 letters, digits, '.', '_' or '-', starting with a letter or digit"
         )
@@ -41,6 +46,11 @@ def evaluations(run: str, evaluator: str) -> str:
 def snapshots(run: str) -> str:
     """Return the key where snapshots are published, and where the newest is queried."""
     return f"daedalus/{run}/snapshots"
+
+
+def run_end(run: str) -> str:
+    """Return the key where the learner publishes that it ends."""
+    return f"daedalus/{run}/end"
 
 
 def presence(run: str, actor: str, incarnation: int | str) -> str:

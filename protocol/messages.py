@@ -6,14 +6,17 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 Time first: row t holds observation t, the action chosen from it and the reward that action earned.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, RunStatus
+
+MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +91,8 @@ class Rollout:
     valid: np.ndarray  # [T, E] bool, False where the environment only reset
     episode_returns: np.ndarray  # [K] float32, unscaled undiscounted returns of the episodes that ended in this rollout
     episode_lengths: np.ndarray  # [K] int32, their env_steps
+    # By name [n] float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
+    episode_info: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.actions.ndim != 2:
@@ -115,6 +120,19 @@ class Rollout:
             raise ValueError("episode_returns and episode_lengths must both be [K]")
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
+        self._check_episode_info()
+
+    def _check_episode_info(self) -> None:
+        if len(self.episode_info) > MAX_INFO_NAMES:
+            raise ValueError(f"episode_info has {len(self.episode_info)} names, at most {MAX_INFO_NAMES} are allowed")
+        most = min(len(self.episode_returns), MAX_INFO_VALUES)
+        for name, values in self.episode_info.items():
+            check_name(name, "the name in episode_info")
+            if values.ndim != 1 or values.dtype != np.float32 or not 1 <= len(values) <= most:
+                raise ValueError(
+                    f"episode_info {name!r} must be float32 [n], with n from 1 to {most}, "
+                    f"not {values.dtype} {values.shape}"
+                )
 
     @property
     def rows(self) -> int:
@@ -234,9 +252,14 @@ class EvaluationReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnded:
-    """The run is over and actors end. Learner -> actors, on `snapshots`."""
+    """The learner ends. Learner -> actors and evaluators, on `end`.
+
+    finished: the run is over, and actors leave.
+    stopped: the run is not over, and actors wait for the learner to return.
+    """
 
     learner_epoch: int
+    outcome: Literal["finished", "stopped"]
     reason: str
 
 

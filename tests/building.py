@@ -44,7 +44,7 @@ def make_rollout(
     stack: int = 1,
     state_size: int = 0,
     seed: int = 0,
-    **replaced: np.ndarray,
+    **replaced: Any,
 ) -> Rollout:
     """Return a rollout with random content: terminations, truncations and the reset rows after them."""
     random = np.random.default_rng(seed)

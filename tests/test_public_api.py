@@ -204,7 +204,9 @@ def test_the_pretrained_policy_plays_gymnasiums_car_racing() -> None:
 
 def test_stacked_frames_are_cleared_by_reset(tmp_path: Path) -> None:
     save(tmp_path, COUNTING, 1)
-    policy = daedalus.load_policy(tmp_path)
+    with pytest.raises(EnvironmentSetupError, match=r"pass allow_modules=\['counting_environment'\]"):
+        daedalus.load_policy(tmp_path)
+    policy = daedalus.load_policy(tmp_path, allow_modules=["counting_environment"])
     space = policy.observation_space
     observations = [space.sample() for _ in range(5)]
     actions = [policy.act(observation) for observation in observations]

@@ -1,7 +1,7 @@
 """Rules of Zenoh's access control: what each role may do on an untrusted network, by the names in certificates.
 
 Everything that these rules do not allow is denied. Plain TCP connections have full access: a router accepts them on
-loopback only (transport/addresses.py). Pure functions.
+loopback only (transport/addresses.py). So have connections over a Unix socket. Pure functions.
 """
 
 from collections.abc import Iterable
@@ -41,7 +41,7 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     ]
     subjects: list[dict[str, Any]] = [
         {"id": "learner and routers", "cert_common_names": [common_name("learner"), common_name("router")]},
-        {"id": "this machine", "link_protocols": ["tcp"]},
+        {"id": "this machine", "link_protocols": ["tcp", "unixsock-stream"]},
     ]
     policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
     shared = [rule["id"] for rule in _actors_rules()]
@@ -73,15 +73,16 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 
 
 def _actors_rules() -> list[dict[str, Any]]:
-    """Return the rules of every actor: query programs and snapshots; subscribe to snapshots; watch the learner."""
+    """Return the rules of every actor: query programs and snapshots; subscribe; watch the learner."""
     queried = [keys.program(_RUN, "*"), keys.snapshots(_RUN)]
+    published = [keys.snapshots(_RUN), keys.run_end(_RUN)]
     served = [*queried, *_own_keys("*")]
     return [
         _rule("actors query", ["ingress"], ["query"], queried),
         _rule("actors receive replies", ["egress"], ["reply"], queried),
         _rule("actors discover queryables", ["egress"], ["declare_queryable"], served),
-        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], [keys.snapshots(_RUN)]),
-        _rule("actors receive snapshots", ["egress"], ["put"], [keys.snapshots(_RUN)]),
+        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], published),
+        _rule("actors receive publications", ["egress"], ["put"], published),
         _rule(
             "actors watch the learner",
             ["ingress"],

@@ -43,6 +43,13 @@ class VectorEnvironment(Protocol):
         """
         ...
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """Return scalars of `info` at the ends of the episodes since the last call: name -> [n] float32.
+
+        Empty if the environment reports none, or the backend does not pass them on.
+        """
+        ...
+
     def close(self) -> None:
         """Close the environments. Idempotent."""
         ...
@@ -72,6 +79,10 @@ class BackendEnvironments(Protocol):
 
     def step(self, actions: np.ndarray) -> Step:
         """See VectorEnvironment; actions [E, *action_shape] are the environment's own."""
+        ...
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See VectorEnvironment."""
         ...
 
     def close(self) -> None:

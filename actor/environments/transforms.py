@@ -82,6 +82,10 @@ class TransformedEnvironment:
         frames, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
         return self._transforms.frames(frames), rewards, terminated, truncated
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See VectorEnvironment."""
+        return self._environments.take_episode_info()
+
     def close(self) -> None:
         """See VectorEnvironment."""
         self._environments.close()

@@ -12,12 +12,14 @@ from typing import Literal
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
+from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
@@ -46,7 +48,7 @@ class ActorConfig:
     run: str = keys.ANY_RUN
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
-    wrap: str | None = None  # module:function, applied to each environment
+    modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
 
@@ -63,22 +65,23 @@ class ActorService:
     ) -> None:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
         self._config, self._transport, self._stop = config, transport, stop
-        self._collector = collector or EnvironmentCollector(config.environments, config.wrap)
+        self._collector = collector or EnvironmentCollector(config.environments, config.modules)
         self._join = Join(actor=config.name, incarnation=config.incarnation)
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
         self._uploads = UploadSession(transport, config.name, self._presence, self._lock)
-        self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, stop)
-        self._feed = SnapshotFeed(transport, self._queries, config.name, self._presence.heard)
+        self._end = RunEndWatch(transport, stop, self._lock.announce_change)
+        self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, self._end)
+        self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
         self._runs: set[str] = set()  # in which this actor's presence is declared
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout in this learner epoch
         self._loaded_version = -1  # the policy version that the collector uses
         self._warned_of_rejections = False
 
-    def run(self) -> None:
-        """Collect until `stop` or until the learner says that the run is over.
+    def run(self) -> bool:
+        """Collect until `stop` or until the learner says that the run is over; return whether the run finished.
 
         Raises ActorError if the actor is refused or quarantined, or finds no learner within its timeout;
         EnvironmentSetupError if the environment cannot be created here; PolicyError if the policy does not run.
@@ -87,10 +90,11 @@ class ActorService:
             while True:
                 try:
                     self._join_run(self._find_learner())
-                except LearnerLostError:
-                    _logger.info("the learner went away; looking for it again")
+                except LearnerLostError as error:
+                    _logger.info("%s", error)
         except RunOverError as error:
             _logger.info("%s", error)
+            return error.finished
         finally:
             self._collector.close()
 
@@ -101,17 +105,18 @@ class ActorService:
     # ---------------------------------------------------------------------------------------------- joining
 
     def _find_learner(self) -> Welcome:
-        welcome = self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._stop)
+        welcome = self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._end)
         self._presence.joined()
         return welcome
 
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
+        self._end.follow(welcome.run, welcome.learner_epoch)
         spaces, count = self._collector.prepare(welcome.spec)
         self._feed.begin(welcome)
         self._declare_presence(welcome.run)
         join = replace(self._join, spaces=spaces, environments=count)
-        confirmed = self._queries.join_learner(welcome.run, join, self._config.timeout, self._stop)
+        confirmed = self._queries.join_learner(welcome.run, join, self._config.timeout, self._end)
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         if welcome.learner_epoch == self._learner_epoch:  # the network failed, not the learner
@@ -206,7 +211,7 @@ class ActorService:
             sequence=self._sequence,
             learner_epoch=learner_epoch,
         )
-        while (rollout := self._collector.collect(identity)) is None:
+        while (rollout := self._collector.collect(identity, self._end.check)) is None:
             if not self._monitor.wait(self._collector.has_rollout, _REFRESH_SECONDS):
                 self._load(self._newest_snapshot())
         return rollout

@@ -4,7 +4,8 @@ import time
 from collections.abc import Callable
 
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
-from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries, RunOverError
+from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Message, RunEnded, Snapshot, Welcome
 from daedalus.transport.interface import Inbox, Transport
@@ -18,8 +19,16 @@ class SnapshotFeed:
     `on_news` is called on the transport's threads when `read` may have something new.
     """
 
-    def __init__(self, transport: Transport, queries: LearnerQueries, actor: str, on_news: Callable[[], None]) -> None:
-        self._transport, self._queries, self._actor, self._on_news = transport, queries, actor, on_news
+    def __init__(
+        self,
+        transport: Transport,
+        queries: LearnerQueries,
+        end: RunEndWatch,
+        actor: str,
+        on_news: Callable[[], None],
+    ) -> None:
+        self._transport, self._queries, self._end, self._actor = transport, queries, end, actor
+        self._on_news = on_news
         self._inboxes: dict[str, Inbox] = {}  # by run
         self._fetcher: CompactSnapshotFetcher | None = None  # set on a slow link
         self._run, self._learner_epoch = "", -1
@@ -51,7 +60,7 @@ class SnapshotFeed:
     def read(self) -> None:
         """Decode what has come, and update `newest`. May take long: hold no lock meanwhile.
 
-        Raises RunOverError if the run ended, LearnerLostError if the message is from another learner epoch.
+        Raises RunOverError if the run finished, LearnerLostError if the message is from another learner epoch.
         """
         if self._fetcher is not None:
             message = self._fetcher.take()
@@ -78,8 +87,8 @@ class SnapshotFeed:
             self.request_newest()
 
     def _apply(self, message: Message) -> None:
-        if isinstance(message, RunEnded) and message.learner_epoch == self._learner_epoch:
-            raise RunOverError(f"the run is over: {message.reason}")
+        if isinstance(message, RunEnded):
+            self._end.apply(message)
         if not isinstance(message, Snapshot):
             return
         if message.learner_epoch != self._learner_epoch:

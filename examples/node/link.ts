@@ -8,6 +8,7 @@ export interface EnvironmentSpec {
   id: string;
   kwargs: Record<string, unknown>;
   max_episode_steps: number | null;
+  wrap: string | null;
   action_table: unknown;
   action_repeat: number;
   no_reward_limit: number | null;
@@ -56,6 +57,7 @@ export async function join(bridge: Bridge, run: string, fields: Message["fields"
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
   const refusal = answers.find((answer) => answer.kind === "Refusal")?.fields;
   if (refusal?.code === "finished") throw new RunOverError("the run is over");
+  if (refusal?.code === "not_ready") throw new LearnerLostError(String(refusal.reason));
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);
   throw new LearnerLostError("no learner answers: check that the learner runs and that the bridge connects to it");

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page, totals
@@ -13,6 +14,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+_LONG_EPISODE = 10_000  # env_steps in each environment without the end of an episode: give a hint
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -95,6 +97,24 @@ class RateMeter:
         return self.rates
 
 
+class EpisodeHint:
+    """Hint that no episode has ended after many steps, given once."""
+
+    def __init__(self) -> None:
+        self._given = False
+
+    def take(self, counters: RunCounters, fleet: Fleet) -> str:
+        """Return the hint if it is due, else an empty string."""
+        environments = sum(fleet.actors[name].environments for name in fleet.live)
+        if self._given or counters.episodes or counters.env_steps < max(environments, 1) * _LONG_EPISODE:
+            return ""
+        self._given = True
+        return (
+            f"no episode has ended after {_LONG_EPISODE:,} env_steps in each environment: "
+            "if the environment never ends them, set environment.max_episode_steps"
+        )
+
+
 def episode_statistics(counters: RunCounters) -> dict[str, float]:
     """Return statistics of the newest training episodes; empty before the first episode."""
     if not counters.returns:
@@ -116,7 +136,7 @@ def metrics_row(
     learning: dict[str, float],
     wall_seconds: float,
 ) -> dict[str, float]:
-    """Return one metrics row, with columns of learner/reporting/metrics.py.
+    """Return one metrics row, with columns of learner/reporting/metrics.py and the scalars of the environment.
 
     Args:
       counters: counters of the run.
@@ -138,6 +158,7 @@ def metrics_row(
         "rollouts_rejected": counters.rollouts_rejected.total(),
         "updates_skipped": counters.updates_skipped,
         **learning,
+        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
     }
 
 

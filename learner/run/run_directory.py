@@ -4,6 +4,7 @@ config.toml      all settings; reproduces the run      metrics.csv   one row for
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
 heartbeat        its age shows that the learner works (heartbeat.py)
+output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 """
 
 import json
@@ -20,6 +21,7 @@ from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
+OUTPUT = "output.log"
 _PACKAGES = (
     "daedalus-rl",
     "torch",

@@ -8,6 +8,7 @@
 The learner's thread takes batches and publishes snapshots. Network threads never wait for an update.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -30,13 +31,16 @@ from daedalus.protocol.limits import (
     STATUS_REQUEST_LIMITS,
     Limits,
 )
-from daedalus.protocol.messages import ActorsReport, ActorsRequest, Message, Refusal, StatusReport
+from daedalus.protocol.messages import ActorsReport, ActorsRequest, Message, Refusal, RunEnded, StatusReport
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
+_LEAVE_SECONDS = 5.0  # after the end of the run, for the actors to leave
+_ASK_SECONDS = 2.0  # in which an actor asks again that was refused because its name is in use
+_REPEAT_SECONDS = 0.5  # between repetitions of the message that the run is over
 _HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
 _logger = logging.getLogger(__name__)
@@ -71,7 +75,8 @@ class ActorServer:
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
         self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
-        self._closed = False
+        self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
+        self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
@@ -115,18 +120,52 @@ class ActorServer:
 
         self._transport.serve(key, handle)
 
-    def close(self, reason: str) -> None:
-        """Publish the end of the run with `reason`, and stop to serve. Idempotent."""
+    def close(self, reason: str, *, finished: bool = False) -> None:
+        """Publish that the learner ends, and stop the threads. The first call decides.
+
+        Until the transport is closed, every query is still answered: that the run is over, or that the learner stops.
+        """
         with self.lock:
-            if self._closed:
+            if self._ended:
                 return
-            self._closed = True
-            self.rollouts.end()
+            outcome = "finished" if finished else "stopped"
+            self._ended = encode(RunEnded(learner_epoch=self._epoch, outcome=outcome, reason=reason))
+            self._ended_at = time.monotonic()
+            self._were_cut_off = any(
+                self._ended_at < actor.last_seen + _LEAVE_SECONDS and not self.fleet.is_present(actor)
+                for actor in self.fleet.actors.values()
+            )
+        self._responses.end(self._ended, finished=finished)
+        self._publish_end()
+        with self.lock:
+            self.rollouts.end(finished=finished)
             self.lock.notify_all()
-        self.publisher.close(reason)
-        self.evaluations.close(reason)
+        self.publisher.close()
+        self.evaluations.end(reason, finished=finished)
         self._watchdog.close()
         self.rollouts.close()
+
+    def _publish_end(self) -> None:
+        with contextlib.suppress(TransportError):  # the session is being replaced; actors receive a repetition
+            self._transport.publish(keys.run_end(self._run), self._ended)
+
+    def await_departures(self, stop: threading.Event) -> None:
+        """Wait until all actors have left, at most 5 s, and repeat that the run is over. Call after `close`."""
+        repeat_at = self._ended_at + _REPEAT_SECONDS
+        while self._expects_actors(time.monotonic()) and not stop.is_set():
+            with self.lock:
+                self.lock.wait(HEARTBEAT_SECONDS)
+            if time.monotonic() >= repeat_at:
+                self._publish_end()
+                repeat_at += _REPEAT_SECONDS
+        self._publish_end()  # to whoever has just begun to join
+
+    def _expects_actors(self, now: float) -> bool:
+        """Return whether an actor may not know of the end yet: it is present, was cut off, or is about to ask again."""
+        if now > self._ended_at + _LEAVE_SECONDS:
+            return False
+        with self.lock:
+            return bool(self.fleet.live) or self._were_cut_off or now < self._responses.postponed_at + _ASK_SECONDS
 
     def await_spaces(self, stop: threading.Event, on_wait: Callable[[], None] = lambda: None) -> Spaces | None:
         """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first.

@@ -1,13 +1,12 @@
 """State of one actor: its current incarnation, counts and rates. No I/O, no threads."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.sequence_window import SequenceWindow
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
-_MAX_NON_FINITE = 3  # rollouts at fault for skipped updates, after which the incarnation is quarantined
+_MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
 _FINITE_AGAIN = 100  # rollouts in a row with finite gradients, after which those before no longer count
 
 
@@ -16,7 +15,6 @@ class Actor:
     """State of one actor; the counts are over all its incarnations."""
 
     name: str
-    on_quarantine: Callable[[], None] = lambda: None
     lives_before: int = 0  # a number that is different after an actor of this name was forgotten
     incarnation: int = -1  # the newest; -1 before the first Join
     incarnations: int = 0  # number of incarnations that joined
@@ -28,7 +26,7 @@ class Actor:
     busy: int = 0  # number of `busy` answers
     missed_earlier: int = 0  # rollouts of earlier incarnations that never arrived
     consecutive_unfit: int = 0  # rollouts that violate the specification
-    non_finite: int = 0  # rollouts at fault for skipped updates
+    non_finite: int = 0  # rollouts without a finite gradient
     finite_in_a_row: int = 0  # rollouts that were trained on since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
     env_steps: int = 0
@@ -57,13 +55,13 @@ class Actor:
         """
         self.consecutive_unfit += 1
         if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
-            self._quarantine(f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}")
+            self.quarantined = f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}"
 
     def count_trained(self, *, finite: bool) -> None:
-        """Count a rollout that was trained on. Quarantine the actor if several were at fault for skipped updates.
+        """Count a rollout that was trained on. Quarantine the actor if several had no finite gradient.
 
-        Unlike a rejected rollout, such a rollout costs the rollouts of other actors too. Therefore it takes many good
-        ones to make up for it.
+        Unlike a rejected rollout, such a rollout costs the learner much time. Therefore it takes many good ones to make
+        up for it.
         """
         if finite:
             self.finite_in_a_row += 1
@@ -73,16 +71,11 @@ class Actor:
         self.rejected["non_finite"] += 1
         self.non_finite, self.finite_in_a_row = self.non_finite + 1, 0
         if self.non_finite >= _MAX_NON_FINITE:
-            self._quarantine(
-                f"updates with {self.non_finite} of its rollouts had no finite gradient: its observations or rewards "
-                "are too large"
+            self.quarantined = (
+                f"{self.non_finite} of its rollouts had no finite gradient: its observations or rewards are too large"
             )
 
-    def _quarantine(self, reason: str) -> None:
-        self.quarantined = reason
-        self.on_quarantine()
-
-    def start_incarnation(self, incarnation: int, next_sequence: int) -> None:
+    def start_incarnation(self, incarnation: int, next_sequence: int = 0) -> None:
         """Set the newest incarnation, without quarantine; its sequence numbers below `next_sequence` were received."""
         self.sequences.give_up()
         self.missed_earlier = self.missed

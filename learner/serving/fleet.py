@@ -72,7 +72,7 @@ class Fleet:
             reason = self._make_room(keys.owner(join.actor))
             if reason:
                 return Refusal(code="full", reason=reason)
-            self.actors[join.actor] = Actor(join.actor, self._changed, lives_before=self.forgotten)
+            self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten)
             self._of_owner[keys.owner(join.actor)] += 1
         self.spaces = join.spaces
         actor = self.actors[join.actor]
@@ -80,7 +80,7 @@ class Fleet:
         if actor.incarnation != join.incarnation:
             self._replace_incarnation(actor, join.incarnation)
         actor.environments = join.environments
-        self._changed()
+        self.changed()
         return None
 
     def _check_identity(self, join: Join) -> Refusal | None:
@@ -158,7 +158,7 @@ class Fleet:
         self.forgotten += 1
         self.forgotten_missed = min(self.forgotten_missed + actor.missed, 2**53)
         self.forgotten_busy += actor.busy
-        self._changed()
+        self.changed()
 
     # ------------------------------------------------------------------------------------------------ presence
 
@@ -168,7 +168,7 @@ class Fleet:
         actor = self.actors.get(name)
         if actor is not None and actor.incarnation == incarnation:
             actor.last_seen = now
-            self._changed()
+            self.changed()
 
     def is_present(self, actor: Actor) -> bool:
         """Return whether the newest incarnation of an actor is present."""
@@ -185,8 +185,8 @@ class Fleet:
             self._live = frozenset(actor.name for actor in self.actors.values() if self.is_live(actor))
         return self._live
 
-    def _changed(self) -> None:
-        """Note that the live actors may be others than before."""
+    def changed(self) -> None:
+        """Note that the live actors may be others than before, for example after a quarantine."""
         self._live = None
 
     # ------------------------------------------------------------------------------------------------ rollouts

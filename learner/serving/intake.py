@@ -13,12 +13,15 @@ import numpy as np
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
-_ROW_BYTES = 1 + 2 + 4 * 4 + 8  # per environment and row, without the observation, rounded up
+_ROW_BYTES = 27  # per environment and row, without the observation, rounded up
 _SLACK_BYTES = 64 << 10
+# Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
+# chooses its number, and zeros compress to nothing: the learner's memory must not depend on the actor.
+_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS = 64 << 20, 8
 _MAX_LOG_PROB = 1e-4  # 0, and rounding
 # Largest magnitudes. No healthy actor comes near them, and beyond them squares overflow float32: updates would have no
 # finite gradient. The state of a GRU lies between -1 and 1.
@@ -54,6 +57,7 @@ class Intake:
         self._spec = spec
         self._epoch = learner_epoch
         self._fleet = fleet
+        self._envs_per_actor = spec.collection.envs_per_actor
         # A synchronous algorithm accepts only rollouts of the newest version.
         self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
         self.state_size = 0  # size of the recurrent state; set before any actor has the program
@@ -68,7 +72,7 @@ class Intake:
             return None
         if spaces is None or actor is None or not actor.environments:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
-        plain, queue = self._limits(spaces, actor).message_bytes, self._spec.service.queue_bytes
+        plain, queue = self._limits(spaces, actor.environments).message_bytes, self._spec.service.queue_bytes
         if size > plain:
             reason = f"the message has {size:,} bytes, and a rollout of this actor at most {plain:,}"
             return Rejected(verdict="rejected", cause="malformed", reason=reason)
@@ -91,8 +95,16 @@ class Intake:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
         if actor.quarantined:
             return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
+        limits = self._limits(spaces, actor.environments)
+        most = max(_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS * self._limits(spaces, self._envs_per_actor).max_bytes)
+        if limits.max_bytes > most:
+            reason = (
+                f"a rollout of {actor.environments} environments has {limits.max_bytes:,} bytes, at most {most:,} are "
+                "allowed: use fewer environments per actor (--envs)"
+            )
+            return Rejected(verdict="rejected", cause="unfit", reason=reason)
         try:
-            rollout = decode(data, self._limits(spaces, actor))
+            rollout = decode(data, limits)
         except ProtocolError as error:
             return Rejected(verdict="rejected", cause="malformed", reason=str(error))
         if not isinstance(rollout, Rollout):
@@ -125,6 +137,7 @@ class Intake:
             if isinstance(verdict, Rejected) and verdict.cause == "unfit":
                 actor.count_unfit(verdict.reason)
                 if actor.quarantined:
+                    self._fleet.changed()
                     verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 
@@ -158,13 +171,13 @@ class Intake:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=reason)
         return None
 
-    def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
-        """Return the size limits of a rollout, from the specification and the number of environments of the actor."""
+    def _limits(self, spaces: Spaces, environments: int) -> Limits:
+        """Return the size limits of a rollout, from the specification and the actor's number of environments."""
         frame = math.prod(spaces.observation.shape) * np.dtype(spaces.observation.dtype).itemsize
         rows = self._spec.collection.rollout_length + spaces.observation.frames
-        row_bytes = actor.environments * (frame + _ROW_BYTES)
-        state_bytes = 4 * actor.environments * self.state_size
-        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16)
+        row_bytes = environments * (frame + _ROW_BYTES)
+        state_bytes = 4 * environments * self.state_size
+        return Limits(max_bytes=rows * row_bytes + state_bytes + _SLACK_BYTES, max_arrays=16 + MAX_INFO_NAMES)
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
@@ -215,6 +228,9 @@ def _number_violation(rollout: Rollout) -> str:
             return f"{name} has a value that is not finite"
         if max(-low, high) > largest:
             return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
+    for name, values in rollout.episode_info.items():
+        if not np.isfinite(values).all():
+            return f"episode_info {name!r} has a value that is not finite"
     return ""
 
 

@@ -3,6 +3,7 @@
 State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
 
+import math
 import threading
 
 from daedalus.learner.serving.fleet import Fleet
@@ -33,7 +34,8 @@ class QueryResponses:
         self._snapshot = encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
         self._program: Program | None = None
         self._encoded_program = b""
-        self._closed = False
+        self._ending: Refusal | None = None  # of joins after the end
+        self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
 
     def join(self, name: str, data: bytes, now: float) -> bytes:
         """Return the answer to a Join: a Welcome, or a Refusal with the reason. Notifies the lock after a Welcome.
@@ -52,11 +54,13 @@ class QueryResponses:
         if message.actor != name:
             reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
             return encode(Refusal(code="malformed", reason=reason))
-        if self._closed:
-            return encode(Refusal(code="finished", reason="the run is over"))
+        if self._ending is not None:
+            return encode(self._ending)
         with self._lock:
             refusal = self._fleet.join(message, now)
             if refusal is not None:
+                if refusal.code == "name_taken":
+                    self.postponed_at = now
                 return encode(refusal)
             seed = self._fleet.seed_for(message.actor, self._start_version)
             self._lock.notify_all()
@@ -76,10 +80,13 @@ class QueryResponses:
         """Set the newest snapshot, as the bytes that were published."""
         self._snapshot = encoded
 
-    def close(self, run_ended: bytes) -> None:
+    def end(self, run_ended: bytes, *, finished: bool) -> None:
         """Refuse later joins, and answer queries for snapshots with `run_ended`, an encoded RunEnded."""
-        self._closed = True
         self._snapshot = run_ended
+        if finished:
+            self._ending = Refusal(code="finished", reason="the run is over")
+        else:
+            self._ending = Refusal(code="not_ready", reason="the learner is stopping")
 
     def snapshot(self) -> bytes:
         """Return the answer to a query for the newest snapshot."""

@@ -12,7 +12,7 @@ from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Program, RunEnded, Snapshot
+from daedalus.protocol.messages import Program, Snapshot
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
 
@@ -61,11 +61,8 @@ class SnapshotPublisher:
         """Start to answer requests for compact snapshots."""
         self._compact.open()
 
-    def close(self, reason: str) -> None:
-        """Publish RunEnded with `reason` in place of snapshots, and stop."""
-        ended = encode(RunEnded(learner_epoch=self._epoch, reason=reason))
-        self._responses.close(ended)
-        self._push(ended)
+    def close(self) -> None:
+        """Stop to answer requests for compact snapshots."""
         self._compact.close()
 
     def answer(self, request: Request) -> None:

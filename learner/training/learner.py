@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import BatchAssembler
+from daedalus.algorithms.diagnostics import diagnostics
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
@@ -16,6 +17,8 @@ from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -24,8 +27,12 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 class Learner:
     """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
-    def __init__(self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces) -> None:
+    def __init__(
+        self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES
+    ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
+
+        `modules` may be imported for the policy.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces.
         """
@@ -38,7 +45,7 @@ class Learner:
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
         self._device = torch.device(spec.device)
-        self._network = ActorCritic(policy, spaces).to(self._device)
+        self._network = ActorCritic(policy, spaces, modules).to(self._device)
         self._gradients = GradientComputer(spec, self._network)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
@@ -73,11 +80,12 @@ class Learner:
     def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:
         """Take one optimiser step with the gradients that were computed last."""
         norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
+        size = float(norm)
+        if not math.isfinite(size):  # such a step would set all parameters to nan for the rest of the run
             self.updates_skipped += 1
             return
         self._optimizer.step(self._flat.values, self._flat.gradients, learning_rate)
-        self.metrics.add_update(terms, norm)
+        self.metrics.add_update(terms, norm, clipped=size > self._spec.max_gradient_norm)
 
     def learning_rate(self, progress: float) -> float:
         """Return the learning rate at a share of the budget."""
@@ -86,6 +94,12 @@ class Learner:
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy in the loss at a share of the budget."""
         return _annealed(self._spec.entropy_bonus, self._spec.entropy_bonus_final, progress)
+
+    def take_diagnostics(self) -> dict[str, float]:
+        """Return the diagnostics of the newest batch (algorithms/diagnostics.py), once; empty without a new batch."""
+        first_pass = self._gradients.take_first_pass()
+        rho_clip = self._spec.rho_clip if ALGORITHMS[self._spec.algorithm].corrected else None
+        return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
     # ----------------------------------------------------------------------------- for actors and checkpoints
 

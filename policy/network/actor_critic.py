@@ -7,6 +7,7 @@ from daedalus.policy.network.distributions import distribution_for
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -19,11 +20,11 @@ class ActorCritic(nn.Module):
     Learning calls `forward`; acting needs only `act`, which is what the exported program computes.
     """
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise NetworkError if the encoder does not accept observations of this space."""
+    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+        """Raise NetworkError if the encoder does not accept observations of this space, or may not be imported."""
         super().__init__()
         self.distribution = distribution_for(spaces.action)
-        self.encoder = build_encoder(spec, spaces.observation)
+        self.encoder = build_encoder(spec, spaces.observation, modules)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)

@@ -4,26 +4,25 @@ The class is constructed with one argument, the shape of an observation, frame s
 observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32.
 """
 
-import importlib
-import os
-import sys
-
 import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace
 
 
 class CustomEncoder(nn.Module):
     """The user's module, imported, constructed and checked."""
 
-    def __init__(self, name: str, space: ArraySpace) -> None:
-        """Raise NetworkError, naming the encoder, if it cannot be imported, constructed or called."""
+    def __init__(self, name: str, space: ArraySpace, modules: UserModules) -> None:
+        """Raise NetworkError, naming the encoder, if it may not be imported, or cannot be constructed or called."""
         super().__init__()
         try:
-            self.module = _find(name)(space.stacked_shape)
+            self.module = _find(name, modules)(space.stacked_shape)
             self.features = _checked_features(self.module, space)
+        except UserModuleError as error:
+            raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
@@ -35,17 +34,10 @@ class CustomEncoder(nn.Module):
         return self.module(observations)
 
 
-def _find(name: str) -> type[nn.Module]:
-    module_name, class_name = name.split(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise NetworkError(f"{error}; install it, or run in the folder of {module_name}.py") from error
-    found = getattr(module, class_name, None)
+def _find(name: str, modules: UserModules) -> type[nn.Module]:
+    found = modules.attribute("policy.encoder", name)
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
-        raise NetworkError(f"{module.__file__} has no torch.nn.Module {class_name!r}; name one of its classes")
+        raise NetworkError("it is not a class of torch.nn.Module: name a class of your module")
     return found
 
 

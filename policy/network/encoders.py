@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.layers import orthogonal
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec
 
@@ -46,10 +47,11 @@ class MultilayerPerceptron(nn.Module):
 Encoder = MultilayerPerceptron | ImageEncoder | CustomEncoder
 
 
-def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
+def build_encoder(spec: PolicySpec, space: ArraySpace, modules: UserModules = NO_MODULES) -> Encoder:
     """Return the encoder that the specification names, for observations of the space.
 
-    Raises NetworkError if a custom encoder cannot be imported, or the encoder does not accept such observations.
+    Raises NetworkError if a custom encoder may not or cannot be imported, or the encoder does not accept the
+    observations.
     """
     match spec.encoder:
         case "mlp":
@@ -63,4 +65,4 @@ def build_encoder(spec: PolicySpec, space: ArraySpace) -> Encoder:
         case "article":
             return ArticleEncoder(space)
         case name:
-            return CustomEncoder(name, space)
+            return CustomEncoder(name, space, modules)

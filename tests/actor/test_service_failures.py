@@ -47,7 +47,9 @@ def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningA
     learner.publish(0)
     _, request = learner.receive()
     if how == "run_ended":
-        learner.transport.publish(keys.snapshots("r"), encode(RunEnded(learner_epoch=1, reason="solved")))
+        learner.transport.publish(
+            keys.run_end("r"), encode(RunEnded(learner_epoch=1, outcome="finished", reason="solved"))
+        )
         acknowledge(request, "accepted")
     else:
         acknowledge(request, "finished")

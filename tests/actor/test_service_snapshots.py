@@ -1,6 +1,7 @@
 """ActorService against a scripted learner, over the memory transport: which snapshots it collects with."""
 
 import threading
+from collections.abc import Callable
 
 import pytest
 from log_lines import LINES
@@ -9,6 +10,7 @@ from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session import learner_queries, service
+from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
@@ -17,6 +19,7 @@ from daedalus.protocol.messages import (
     RolloutIdentity,
     Snapshot,
 )
+from daedalus.transport.interface import Inbox
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
@@ -34,15 +37,21 @@ def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(networ
 def test_actor_never_subscribes_on_a_link_measured_as_slow(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    followed: list[object] = []
-    monkeypatch.setattr(MemoryTransport, "subscribe", lambda *arguments: followed.append(arguments))
+    followed: list[str] = []
+    subscribe = MemoryTransport.subscribe
+
+    def noted(transport: MemoryTransport, key: str, on_news: Callable[[], None]) -> Inbox:
+        followed.append(key)
+        return subscribe(transport, key, on_news)
+
+    monkeypatch.setattr(MemoryTransport, "subscribe", noted)
     monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
     learner = ScriptedLearner(network)
     learner.publish(3)
     actor = RunningActor(network)
     assert learner.receive()[0].policy_version == 3
     assert any(text.startswith("slow link: ") for text in LINES)
-    assert followed == []
+    assert followed == [keys.run_end("r")]
     actor.stop.set()
     actor.join()
 
@@ -76,8 +85,8 @@ class SlowClient(EnvironmentCollector):
     def has_rollout(self) -> bool:
         return self._policy_version >= 1
 
-    def collect(self, identity: RolloutIdentity) -> Rollout | None:  # type: ignore[override] - as Collector has it
-        return super().collect(identity) if self.has_rollout() else None
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:  # type: ignore[override] - as Collector has it
+        return super().collect(identity, on_row) if self.has_rollout() else None
 
 
 def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:

@@ -25,6 +25,11 @@ from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 MANY = 905
 
 
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daedalus.cli.status_query._PAGES_SECONDS", 100.0)
+
+
 @pytest.fixture
 def operator() -> MemoryTransport:
     return MemoryTransport(MemoryNetwork())

@@ -35,7 +35,11 @@ def test_each_alert_uses_metrics_that_are_exported(rule: dict) -> None:
 def test_the_text_of_each_alert_uses_labels_of_its_metric(rule: dict) -> None:
     (metric,) = set(re.findall(r"\bup\b|daedalus_\w+", rule["expr"]))
     labels = {"up": ["instance"], "daedalus_up": ["instance"]}
-    labels |= {family.name: family._labelnames for family in metrics([]) if family.name not in labels}
+    labels |= {
+        family.name: family._labelnames  # pyright: ignore[reportAttributeAccessIssue]
+        for family in metrics([])
+        if family.name not in labels
+    }
     assert set(re.findall(r"\$labels\.(\w+)", rule["annotations"]["summary"])) <= set(labels[metric])
 
 

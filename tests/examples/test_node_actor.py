@@ -132,7 +132,7 @@ def test_every_row_agrees_with_the_program_and_with_gymnasium(
 
 def acted(runtime: OnnxRuntime, observations: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Run the program and return logits and next state."""
-    outputs = runtime._session.run(None, {**runtime._feed, "observations": observations, "state": state})
+    outputs = runtime._session.run({**runtime._feed, "observations": observations, "state": state})
     return np.asarray(outputs[0]), np.asarray(outputs[1])
 
 

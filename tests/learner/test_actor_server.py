@@ -119,6 +119,20 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
         server.close("the test is over")
 
 
+def test_rows_that_only_reset_are_not_counted_for_their_actor(network: MemoryNetwork) -> None:
+    server = open_server(network, run_spec(actors=1, algorithm="impala"), RunCounters(10))
+    actor = MemoryTransport(network)
+    join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
+    try:
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
+        rollout = make_rollout(identity("a"))
+        actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
+        server.rollouts.count_trained(server.rollouts.take_batch(0), [])
+        assert server.fleet.actors["a"].env_steps == np.count_nonzero(rollout.valid) < rollout.valid.size
+    finally:
+        server.close("the test is over")
+
+
 class FakeEvaluator:
     """Evaluator that sends without waiting and keeps the answers."""
 
@@ -206,7 +220,7 @@ def test_full_evaluation_queue_makes_room_by_dropping_messages_of_the_owner_with
     [
         b"",
         b"\xff" * 100,
-        encode(RunEnded(learner_epoch=EPOCH, reason="")),
+        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
         encode(EvaluationRequest(evaluator="f")),
         encode(EvaluationRequest(evaluator="")),
     ],
@@ -238,14 +252,15 @@ def test_oversized_evaluation_report_is_refused_as_malformed(server: ActorServer
     assert codes(evaluator) == ["malformed"]
 
 
-def test_waiting_and_later_evaluator_messages_are_refused_as_finished_after_close(
-    server: ActorServer, evaluator: FakeEvaluator
+@pytest.mark.parametrize("finished", [True, False])
+def test_waiting_and_later_evaluator_messages_are_refused_after_close(
+    server: ActorServer, evaluator: FakeEvaluator, finished: bool
 ) -> None:
     offer_policy(server)
     evaluator.send(encode(EvaluationRequest(evaluator="e")))
-    server.close("solved")
+    server.close("solved", finished=finished)
     evaluator.send(encode(REPORT))
-    assert codes(evaluator) == ["finished", "finished"]
+    assert codes(evaluator) == ["finished" if finished else "not_ready"] * 2
 
 
 def test_concurrent_evaluation_requests_are_all_queued(server: ActorServer, network: MemoryNetwork) -> None:

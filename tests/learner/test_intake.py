@@ -13,6 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
+from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Rollout, RunEnded
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
@@ -113,7 +114,10 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
     assert_rejected(
-        harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "the message is not a rollout"
+        harness,
+        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
+        "malformed",
+        "the message is not a rollout",
     )
 
 
@@ -172,12 +176,27 @@ def test_value_that_is_not_finite_is_rejected_with_its_array_named(harness: Harn
     assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_episode_info_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
+    info = {"distance": np.full(1, value, np.float32)}
+    assert_rejected(harness, encode(good(episode_info=info)), "unfit", "episode_info 'distance'")
+
+
+def test_all_the_episode_info_that_a_rollout_may_have_is_accepted(harness: Harness) -> None:
+    most = len(good().episode_returns)
+    info = {f"{number:064}": np.full(most, 1.0, np.float32) for number in range(16)}
+    accepted = harness.receive(encode(good(episode_info=info)))
+    assert isinstance(accepted, Rollout)
+    assert accepted.episode_info.keys() == info.keys()
+
+
 def test_log_probability_above_0_is_rejected_as_unfit(harness: Harness) -> None:
     assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 
 
 def test_log_probability_above_0_by_rounding_is_accepted(harness: Harness) -> None:
-    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
+    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 0.99e-4))), Rollout)
+    assert isinstance(Harness().receive(encode(with_value("behaviour_log_probs", 1.01e-4))), Rejected)
 
 
 def test_rollout_with_a_future_policy_version_is_rejected_as_unfit(harness: Harness) -> None:
@@ -278,6 +297,38 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
     verdict = stacked_harness().receive(encode(too_many))
     assert isinstance(verdict, Rejected)
     assert "the limit is" in verdict.reason
+
+
+def test_size_limit_is_the_documented_one() -> None:
+    """(T + k) E (frame bytes + 27) + 4 E S + 64 KiB, and the header: docs/wire.md."""
+    harness = stacked_harness(state_size=7)
+    limit = (ROWS + 4) * ENVIRONMENTS * (60 * 80 * 3 + 27) + 4 * ENVIRONMENTS * 7 + (64 << 10)
+    message = Limits(max_bytes=limit).message_bytes
+    assert harness.intake.refuse_size("a", message) is None
+    refused = harness.intake.refuse_size("a", message + 1)
+    assert refused is not None
+    assert refused.reason == f"the message has {message + 1:,} bytes, and a rollout of this actor at most {message:,}"
+
+
+@pytest.mark.parametrize(
+    ("shape", "environments", "refused"),
+    [
+        ((60, 80, 3), 400, False),  # 57.6 MB
+        ((60, 80, 3), 500, True),  # 72 MB
+        ((1000, 1000, 3), 8 * ENVIRONMENTS, False),  # the run's own rollouts have 90 MB
+        ((1000, 1000, 3), 8 * ENVIRONMENTS + 2, True),
+    ],
+)
+def test_rollouts_of_too_many_environments_are_refused_before_they_are_decoded(
+    shape: tuple[int, ...], environments: int, refused: bool
+) -> None:
+    """4,096 environments of zeros compress to nothing, and would take gigabytes."""
+    spaces = SPACES.model_copy(update={"observation": STACKED.model_copy(update={"shape": shape})})
+    intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=environments, spaces=spaces))
+    verdict = intake.read("a", b"no message")
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == ("unfit" if refused else "malformed")
+    assert ("use fewer environments per actor (--envs)" in verdict.reason) == refused
 
 
 @given(st.data())

@@ -34,7 +34,10 @@ def test_welcome_contains_run_epoch_specification_and_seed() -> None:
 
 def test_message_that_is_not_a_join_is_refused() -> None:
     responses, fleet = make_responses()
-    for data, code in ((b"\xff", "mismatch"), (encode(RunEnded(learner_epoch=1, reason="")), "malformed")):
+    for data, code in (
+        (b"\xff", "mismatch"),
+        (encode(RunEnded(learner_epoch=1, outcome="finished", reason="")), "malformed"),
+    ):
         answer = read(responses.join("a", data, 0.0))
         assert isinstance(answer, Refusal)
         assert answer.code == code
@@ -70,7 +73,7 @@ def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     assert first.code == "not_ready"
     responses.offer_snapshot(b"newest")
     assert responses.snapshot() == b"newest"
-    responses.close(b"run_ended")
+    responses.end(b"run_ended", finished=True)
     assert responses.snapshot() == b"run_ended"
     late = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)

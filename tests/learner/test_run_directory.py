@@ -33,7 +33,7 @@ def specs(draw: st.DrawFn) -> RunSpec:
     return RunSpec.model_validate(
         {
             "environment": {
-                "id": draw(st.text(min_size=1, max_size=9)),
+                "id": draw(st.from_regex(r"[^\W:]{1,9}|[^\W\d]{1,5}:[\w' -]{1,5}", fullmatch=True)),
                 **some(
                     kwargs=st.dictionaries(st.text(max_size=5), JSON, max_size=3),
                     max_episode_steps=st.integers(1, 10**9),

@@ -142,6 +142,7 @@ def test_shortest_wait_is_two_rollouts_long() -> None:
         barrier.wait(9.0)
         barrier.deliver("abc")
         barrier.wait_for_batch()
+    waited = 0.0
     for _ in range(8):
         barrier.deliver("ab")
         waited = barrier.wait_for_batch()

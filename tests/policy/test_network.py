@@ -259,7 +259,8 @@ def test_smallest_accepted_images() -> None:
     assert encoder_of("article", (2, 2)).features == 32
 
 
-def test_values_near_100_that_differ_by_a_tenth_stay_distinct_under_autocast() -> None:
+@pytest.mark.parametrize("mixed", [False, True])
+def test_values_near_100_that_differ_by_a_tenth_stay_distinct(mixed: bool) -> None:
     """A head that ran in bfloat16 would keep 8 bits: steps of 0.5 between 64 and 128."""
     spaces = Spaces(observation=ArraySpace(shape=(1,), dtype="float32"), action=DiscreteSpace(count=2))
     network = ActorCritic(PolicySpec(hidden=()), spaces)
@@ -268,7 +269,7 @@ def test_values_near_100_that_differ_by_a_tenth_stay_distinct_under_autocast() -
             head.weight.fill_(1.0)
     seen = (100.0 + torch.arange(10) / 10).reshape(1, 10, 1)
     state, starts = torch.zeros(10, 0), torch.zeros(1, 10, dtype=torch.bool)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=mixed):
         logits, values = network(seen, state, starts)
     assert torch.equal(values[0], seen[0, :, 0])
     assert torch.equal(logits[0, :, 0], seen[0, :, 0])

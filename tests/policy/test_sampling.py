@@ -26,7 +26,7 @@ class Uniforms(np.random.Generator):
         super().__init__(np.random.PCG64(0))
         self._value = value
 
-    def random(self, size, dtype=np.float64, out=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def random(self, size: int, dtype: type[np.float32]) -> np.ndarray:
         return np.full(size, self._value, dtype)
 
 

@@ -54,6 +54,7 @@ def _rollout(frames: np.ndarray) -> Rollout:
         valid=cells != 4,
         episode_returns=np.array([1.5, -2.0], np.float32),
         episode_lengths=np.array([12, 9], np.int32),
+        episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
     )
 
 
@@ -124,7 +125,7 @@ MESSAGES: dict[str, Message] = {
         returns=np.array([1.0, 2.5], np.float32),
         lengths=np.array([10, 20], np.int32),
     ),
-    "run_ended": RunEnded(learner_epoch=9, reason="the learner has finished"),
+    "run_ended": RunEnded(learner_epoch=9, outcome="finished", reason="the learner has finished"),
     "status_report": StatusReport(
         status=RunStatus(
             run="r",

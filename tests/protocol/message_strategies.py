@@ -61,7 +61,8 @@ run_specs = st.builds(
     RunSpec,
     environment=st.builds(
         EnvironmentSpec,
-        id=st.text(min_size=1, max_size=20),
+        id=st.sampled_from(["Any-v0", "ALE/Pong-v5", "my.module:Mine-v0", "ä"]),
+        wrap=st.none() | st.just("my.module:wrap"),
         kwargs=st.dictionaries(text, json_values, max_size=3),
         max_episode_steps=st.none() | positive,
         action_table=st.none() | st.lists(st.tuples(floats, floats), min_size=2, max_size=3).map(tuple),
@@ -144,6 +145,12 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+        episode_info={
+            name: bits(random, "<f4", (draw(st.integers(1, episodes)),))
+            for name in (
+                draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
+            )
+        },
     )
 
 
@@ -215,7 +222,9 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
-    RunEnded: st.builds(RunEnded, learner_epoch=counters, reason=text),
+    RunEnded: st.builds(
+        RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
+    ),
     StatusReport: st.builds(StatusReport, status=statuses),
     ActorsRequest: st.builds(ActorsRequest, after=text),
     ActorsReport: st.builds(

@@ -76,6 +76,9 @@ class Films:
     def reset(self, seed: int) -> np.ndarray:
         return self.played.reset(seed=seed)[0]
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
+
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self.played.step(actions)[:4]
 

@@ -228,3 +228,9 @@ def test_observations_too_large_for_memory_are_refused(shape: tuple[int, ...], f
     with pytest.raises(ValidationError, match="use at most 67,108,864"):
         ArraySpace(shape=shape, dtype="float32", frames=frames)
     ArraySpace(shape=(2048, 2048, 3), dtype="uint8", frames=4)
+
+
+def test_evaluations_are_not_cut_by_the_no_reward_limit() -> None:
+    trained = EnvironmentSpec(id="A-v0", no_reward_limit=5, action_repeat=2)
+    assert trained.as_evaluated() == EnvironmentSpec(id="A-v0", action_repeat=2)
+    assert trained.as_evaluated("envpool") == EnvironmentSpec(id="A-v0", action_repeat=2, backend="envpool")

@@ -29,7 +29,7 @@ _KEPT = 2  # rollouts that a client keeps while it cannot send
 class Runtime:
     """In place of OnnxRuntime: a policy that is never run."""
 
-    def __init__(self, model: bytes) -> None:
+    def __init__(self, model: bytes, *_: object) -> None:
         assert model
 
 
@@ -166,13 +166,15 @@ class ActorProcess:
     def _main(self) -> None:
         """Do what `daedalus actor` does."""
         try:
-            self.service.run()
-            outcome = "stopped" if self.stop.is_set() else "run over"
+            finished = self.service.run()
+            outcome = "run over" if finished else "stopped"
+            is_right = self.ledger.is_finished if finished else self.stop.is_set()
+            self.ledger.require(is_right, self.process.name, "ends, but was not stopped, and the run is not over")
         except NameInUseError:
             outcome = "name in use"
         except ActorError as error:
             outcome = f"error: {error}"
-            self.ledger.require(False, f"{self.process.name} gives up: {error}")
+            self.ledger.require(False, self.process.name, "gives up:", error)
         self.link.close()
         self.process.kill()  # the user's thread of a client
         self._end(outcome)

@@ -38,31 +38,24 @@ class Life:
         return identity in self.judged or bool(self.answers.get(identity, Counter()).keys() - {"busy"})
 
 
-@dataclass(frozen=True, slots=True)
-class Collected:
-    """A rollout that an actor has made."""
-
-    identity: RolloutIdentity
-    at: float
-
-
 class Ledger:
     """Record of one simulation."""
 
     def __init__(self, kernel: Kernel, spec: RunSpec) -> None:
         self._kernel, self._spec = kernel, spec
+        self.is_finished = False  # whether the budget of the run is used up
         self.lives: list[Life] = []
-        self.collected: list[Collected] = []  # by the number that each rollout carries
+        self.collected: list[RolloutIdentity] = []  # by the number that each rollout carries
         self._numbers: dict[RolloutIdentity, int] = {}
         self.freshest: dict[
             str, float
         ] = {}  # by actor: when the newest policy was published that it was trained on with
 
-    def require(self, holds: bool, text: str) -> None:
-        """Raise Violation, and end the simulation, unless something holds."""
+    def require(self, holds: bool, *facts: object) -> None:
+        """Raise Violation with these facts, and end the simulation, unless something holds."""
         if not holds:
-            error = Violation(text)
-            self._kernel.log("VIOLATION", text)
+            error = Violation(" ".join(map(str, facts)))
+            self._kernel.log("VIOLATION", *facts)
             self._kernel.fail(error)
             raise error
 
@@ -84,21 +77,26 @@ class Ledger:
         """Check a snapshot that an actor collects with in its session with a learner of an epoch."""
         self.require(snapshot.learner_epoch == epoch, "an actor loads a snapshot of another learner epoch")
         life = next(life for life in self.lives if life.epoch == epoch)
-        weights = snapshot.weights["w"].tolist()
-        self.require(
-            weights == self.token(life.number, snapshot.policy_version),
-            f"snapshot of version {snapshot.policy_version} of life {life.number} carries the weights {weights}",
-        )
+        weights, version = snapshot.weights["w"].tolist(), snapshot.policy_version
+        self.require(weights == self.token(life.number, version), "version", version, "has the weights", weights)
 
     def collect(self, identity: RolloutIdentity) -> int:
         """Note a new rollout, and return the number that it carries."""
-        self.require(identity not in self._numbers, f"two rollouts have the identity {identity}")
+        self.require(identity not in self._numbers, "two rollouts have one identity:", identity)
         self._numbers[identity] = len(self.collected)
-        self.collected.append(Collected(identity, self._kernel.now))
+        self.collected.append(identity)
         self._kernel.log("collect", identity.actor, identity.incarnation, identity.sequence)
         return self._numbers[identity]
 
     # ------------------------------------------------------------------------------------------------ learner
+
+    def judged(self, life: Life, rollout: Rollout, verdict: Rollout | Rejected, incarnation: int) -> None:
+        """Check the verdict on a rollout; `incarnation` is the newest of its actor that has joined."""
+        identity = rollout.identity
+        if verdict is rollout:
+            is_current = identity.incarnation == incarnation
+            self.require(is_current, "a rollout of an earlier incarnation is accepted:", identity)
+        life.judged[identity] = None
 
     def answered(self, life: Life, identity: RolloutIdentity, answer: Acknowledgement) -> None:
         """Check an answer on its way to an actor."""
@@ -106,72 +104,54 @@ class Ledger:
         verdicts[answer.verdict] += 1
         self._kernel.log("answer", identity.actor, identity.sequence, answer.verdict, answer.reason)
         if answer.verdict == "accepted":
-            self.require(identity in life.added, f"{identity} was answered accepted, but is not in the buffer")
-            self.require(verdicts["accepted"] == 1, f"{identity} was accepted twice")
-        self.require(answer.verdict != "quarantined", f"an honest actor is quarantined: {answer.reason}")
-        self.require(
-            answer.policy_version == 0 or answer.policy_version in life.published,
-            f"an answer mentions version {answer.policy_version}, which was not published",
-        )
-
-    def judged(self, life: Life, rollout: Rollout, verdict: Rollout | Rejected, incarnation: int) -> None:
-        """Check the verdict on a rollout; `incarnation` is the newest of its actor that has joined."""
-        identity = rollout.identity
-        if verdict is rollout:
-            text = f"a rollout of an earlier incarnation is accepted: {identity}"
-            self.require(identity.incarnation == incarnation, text)
-        life.judged[identity] = None
+            self.require(identity in life.added, "answered accepted, but not in the buffer:", identity)
+            self.require(verdicts["accepted"] == 1, "accepted twice:", identity)
+        self.require(answer.verdict != "quarantined", "an honest actor is quarantined:", answer.reason)
+        is_known = answer.policy_version == 0 or answer.policy_version in life.published
+        self.require(is_known, "an answer mentions a version that was not published:", answer.policy_version)
 
     def added(self, life: Life, rollout: Rollout) -> None:
         """Check a rollout that is put into the buffer."""
         identity = rollout.identity
-        self.require(identity not in life.added, f"{identity} is put into the buffer twice")
+        self.require(identity not in life.added, "put into the buffer twice:", identity)
         life.added[identity] = None
         self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
-        self.require(
-            identity.learner_epoch == life.epoch, f"a rollout of another learner epoch is accepted: {identity}"
-        )
-        life_number, high, low, number = rollout.frames[0, 0].tolist()
-        self.require(
-            [life_number, high, low] == self.token(life.number, rollout.policy_version),
-            f"{identity} claims version {rollout.policy_version}, but its weights were {life_number, high, low}",
-        )
-        self.require(self._numbers.get(identity) == int(number), f"{identity} carries another rollout's content")
+        self.require(identity.learner_epoch == life.epoch, "a rollout of another epoch is accepted:", identity)
+        *weights, number = rollout.frames[0, 0].tolist()
+        is_right = weights == self.token(life.number, rollout.policy_version)
+        self.require(is_right, identity, "claims version", rollout.policy_version, "but its weights were", weights)
+        self.require(self._numbers.get(identity) == int(number), "carries another rollout's content:", identity)
 
-    def took(self, life: Life, taken: TakenRollouts, version: int, live: Set[str]) -> None:
-        """Check what is taken out of the buffer."""
+    def took(self, life: Life, taken: TakenRollouts, version: int, awaited: Set[str]) -> None:
+        """Check what is taken out of the buffer; a synchronous batch waits for the `awaited` actors."""
         for rollout in taken.stale:
-            self.require(rollout.identity not in life.stale, f"{rollout.identity} is stale twice")
+            self.require(rollout.identity not in life.stale, "stale twice:", rollout.identity)
             life.stale[rollout.identity] = None
+        if not taken.rollouts:
+            return
         synchronous = self._spec.algorithm.synchronous
         bound = 0 if synchronous else self._spec.training.policy_lag_bound
         for rollout in taken.rollouts:
-            identity = rollout.identity
-            self.require(identity not in life.trained, f"{identity} is trained twice")
-            self.require(identity in life.added and identity not in life.stale, f"{identity} was not accepted")
+            identity, lag = rollout.identity, version - rollout.policy_version
+            self.require(identity not in life.trained, "trained twice:", identity)
+            self.require(identity in life.added and identity not in life.stale, "was not accepted:", identity)
+            self.require(0 <= lag <= bound, identity, "has a policy lag of", lag, "and the bound is", bound)
             life.trained[identity] = None
-            lag = version - rollout.policy_version
-            self.require(0 <= lag <= bound, f"{identity} has a policy lag of {lag}, the bound is {bound}")
             published = life.published[rollout.policy_version]
             self.freshest[identity.actor] = max(published, self.freshest.get(identity.actor, 0.0))
-        if taken.rollouts:
-            names = [rollout.identity.actor for rollout in taken.rollouts]
-            self._kernel.log("train", version, *names)
-            if synchronous:
-                self.require(len(set(names)) == len(names), f"a batch has two rollouts of one actor: {names}")
-                self.require(live <= set(names), f"a batch misses a live actor: {names} of {sorted(live)}")
+        names = [rollout.identity.actor for rollout in taken.rollouts]
+        self._kernel.log("train", version, *names)
+        if synchronous:
+            self.require(len(set(names)) == len(names), "a batch has two rollouts of one actor:", names)
+            self.require(awaited <= set(names), "a batch misses a live actor:", names, "of", sorted(awaited))
 
     def check_counts(self, life: Life, accepted: int, trained: int, waiting: int) -> None:
-        """Check that accepted = trained + stale + waiting in the buffer, and the learner's counters."""
-        balance = (
-            f"{accepted} accepted ({len(life.added)} put into the buffer), {trained} trained "
-            f"({len(life.trained)} taken), {len(life.stale)} stale, {waiting} waiting"
-        )
-        self.require(accepted == len(life.added), f"the counter of accepted rollouts is wrong: {balance}")
-        self.require(trained == len(life.trained), f"the counter of trained rollouts is wrong: {balance}")
-        self.require(
-            accepted == trained + len(life.stale) + waiting, f"accepted is not trained + stale + waiting: {balance}"
-        )
+        """Check the learner's counters, and that accepted = trained + stale + waiting in the buffer."""
+        added, taken, stale = len(life.added), len(life.trained), len(life.stale)
+        balance = accepted, "accepted,", added, "put into the buffer,", trained, "trained,", taken, "taken"
+        self.require((accepted, trained) == (added, taken), "a counter is wrong:", *balance)
+        balance = *balance, stale, "stale,", waiting, "waiting"
+        self.require(accepted == trained + stale + waiting, "accepted is not trained + stale + waiting:", *balance)
 
 
 def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
@@ -189,9 +169,9 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
         ledger.added(life, rollout)
         add(rollout)
 
-    def noted_take(live: Set[str], policy_version: int) -> TakenRollouts:
-        taken = take(live, policy_version)
-        ledger.took(life, taken, policy_version, live)
+    def noted_take(live: Set[str], policy_version: int, now: float) -> TakenRollouts:
+        taken = take(live, policy_version, now)
+        ledger.took(life, taken, policy_version, live - buffer.left_out)
         return taken
 
     intake.judge = noted_judge  # type: ignore[method-assign]

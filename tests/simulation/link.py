@@ -34,6 +34,10 @@ class Link:
         return self.alive and not (self.cut or self.dead or self.network.cut)
 
     @property
+    def _keeps_alive(self) -> bool:
+        return self.passes() and not self.process.frozen
+
+    @property
     def seconds_to_send(self) -> float:
         """How long the messages under way need."""
         return max(self._sent_until - self.network.kernel.now, 0.0)
@@ -46,7 +50,7 @@ class Link:
 
     def reachability_changed(self) -> None:
         """Lose presence after the lease, or get it back."""
-        if self.passes():
+        if self._keeps_alive:
             if self.expired:
                 self.expired = False
                 self._presence_changed()
@@ -72,7 +76,7 @@ class Link:
                         watch.forget(key)
 
     def _expire(self, session: int) -> None:
-        if not self.passes() and self.session == session and not self.expired:
+        if not self._keeps_alive and self.session == session and not self.expired:
             self.expired = True
             self._presence_changed()
 

@@ -43,7 +43,6 @@ class Lock:
         self._depth -= 1
         if self._depth == 0:
             self._free(task)
-            self._kernel.preempt()
 
     def _free(self, task: Task) -> None:
         self._owner = None

@@ -45,13 +45,16 @@ class Settings:
     checkpoint_seconds: float
     ends_by: str  # finish or stop
     real_codec: bool  # whether messages are encoded
+    heartbeat_seconds: float  # how soon a waiting thread notices what nobody tells it
+    patience_seconds: float  # after which a synchronous batch no longer waits for an actor
     fine: bool  # whether threads are interrupted at any line
 
 
 def draw(seed: int) -> Settings:
     """Return the settings of a seed."""
     random = Random(seed)
-    spec = _spec(random)
+    real_codec = random.random() < 0.05
+    spec = _spec(random, small_queue=0.004 if real_codec else 0.0002)
     faulty = random.uniform(1.0, 12.0)
     collect = random.choice((0.1, 0.3, 1.0))
     return Settings(
@@ -65,7 +68,9 @@ def draw(seed: int) -> Settings:
         train_seconds=random.choice((0.0, 0.01, 0.1, 0.5)),
         checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
-        real_codec=random.random() < 0.05,
+        real_codec=real_codec,
+        heartbeat_seconds=random.choice((0.2, 2.0, 2.0)),  # a long one shows a thread that should have been told
+        patience_seconds=random.choice((60.0, 3.0)),
         fine=random.random() < 0.03,
     )
 
@@ -80,7 +85,7 @@ def _actor(random: Random, spec: RunSpec, seconds: float) -> ActorSettings:
     )
 
 
-def _spec(random: Random) -> RunSpec:
+def _spec(random: Random, small_queue: float) -> RunSpec:
     actors = random.choice((1, 2, 2, 3))
     algorithm = random.choice(("a2c", "a2c", "a3c", "impala", "appo"))
     window = random.randint(1, 4)
@@ -88,13 +93,13 @@ def _spec(random: Random) -> RunSpec:
     if algorithm in ("impala", "appo"):
         training["batch_rollouts"] = random.choice((None, 1, 2, 3))
     if algorithm != "a2c" and random.random() < 0.5:
-        training["max_policy_lag"] = random.choice((2, 4 * actors * window))
+        training["max_policy_lag"] = random.choice((2, 4)) * actors * window
     return RunSpec.model_validate(
         {
             "environment": {"id": "simulated"},
             "collection": {"actors": actors, "envs_per_actor": 1, "rollout_length": 1, "window": window},
             "training": training,
-            "service": {"queue_megabytes": random.choice((64.0, 0.0002))},
+            "service": {"queue_megabytes": random.choice((64.0, small_queue))},
         }
     )
 
@@ -120,7 +125,7 @@ def _weather(random: Random) -> Weather:
 def _faults(random: Random, seconds: float) -> tuple[tuple[float, str, float], ...]:
     kinds = random.sample(FAULTS, random.randint(1, 4))
     if random.random() < 0.4:
-        kinds.append(random.choice(("kill learner", "stop learner")))
+        kinds.append(random.choice(("kill learner", "stop learner", "twin")))
     count = random.choice((0, 1, 2, 4, 8))
     drawn = [
         (random.uniform(0.0, seconds), random.choice(kinds), random.choice((0.1, 1.0, 5.0, 12.0))) for _ in range(count)

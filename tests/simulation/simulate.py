@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
+from types import ModuleType
 from typing import Any
 
 from daedalus.actor.session import service
@@ -17,7 +18,7 @@ from daedalus.protocol import codec as real_codec
 from . import codec, faults, primitives
 from .actors import Runtime
 from .kernel import Kernel
-from .settings import draw
+from .settings import Settings, draw
 from .world import World
 
 _PATCHED = ("daedalus.actor.session.", "daedalus.learner.serving.")
@@ -49,7 +50,7 @@ def simulate(seed: int) -> Result:
     kernel = Kernel(Random(seed + 2**32), settings.preemption, _fine_files() if settings.fine else frozenset())
     world = World(kernel, settings)
     seconds_to_progress = 0.0
-    with _patched(kernel, objects=not settings.real_codec):
+    with _patched(kernel, settings):
         try:
             _faulty_phase(world)
             seconds_to_progress = _await_progress(world)
@@ -70,17 +71,24 @@ def simulate(seed: int) -> Result:
     )
 
 
-def _services() -> list[Any]:
+def services() -> list[ModuleType]:
+    """Return the modules of the services, whose threads and time are simulated."""
     return [module for name, module in list(sys.modules.items()) if name.startswith(_PATCHED)]
 
 
 def _fine_files() -> frozenset[str]:
-    return frozenset(str(module.__file__) for module in _services())
+    return frozenset(str(module.__file__) for module in services())
 
 
 @contextlib.contextmanager
-def _patched(kernel: Kernel, *, objects: bool) -> Iterator[None]:
+def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     """Give the services the kernel's threads and time, and a policy that is never run."""
+    constants = {
+        "_HEARTBEAT_SECONDS": settings.heartbeat_seconds,
+        "HEARTBEAT_SECONDS": settings.heartbeat_seconds,
+        "_PATIENCE_SECONDS": settings.patience_seconds,
+        "PART_BYTES": 64,  # so that a compact snapshot has several parts
+    }
     replaced: list[tuple[Any, str, Any]] = []
     fakes = primitives.modules(kernel)
     replacements: dict[int, Any] = {
@@ -89,13 +97,13 @@ def _patched(kernel: Kernel, *, objects: bool) -> Iterator[None]:
         id(queue): fakes["queue"],
         id(service.OnnxRuntime): Runtime,
     }
-    if objects:
+    if not settings.real_codec:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
-    for module in _services():
+    for module in services():
         for attribute, value in list(vars(module).items()):
-            if id(value) in replacements:
+            if id(value) in replacements or attribute in constants:
                 replaced.append((module, attribute, value))
-                setattr(module, attribute, replacements[id(value)])
+                setattr(module, attribute, constants.get(attribute, replacements.get(id(value))))
     try:
         yield
     finally:
@@ -126,8 +134,7 @@ def _await_progress(world: World) -> float:
         if not late and live == world.actors.keys():
             return taken
         world.ledger.require(
-            taken < _PROGRESS_SECONDS,
-            f"{taken:g} s without faults: no progress of {late}, live are {sorted(live)}",
+            taken < _PROGRESS_SECONDS, f"{taken:g} s without faults: no progress of", late, "live are", sorted(live)
         )
         kernel.sleep(0.5)
 
@@ -137,11 +144,10 @@ def _require_no_loss(world: World) -> None:
     learner = world.learner
     for actor in world.running:
         uploads = actor.service._uploads.in_flight.rollouts
-        for collected in world.ledger.collected:
-            identity = collected.identity
+        for identity in world.ledger.collected:
             if (identity.incarnation, identity.learner_epoch) == (actor.incarnation, learner.epoch):
                 is_waiting = identity.sequence in uploads or identity.sequence >= actor.service._sequence
-                world.ledger.require(is_waiting or learner.life.has_verdict(identity), f"{identity} was lost")
+                world.ledger.require(is_waiting or learner.life.has_verdict(identity), "lost:", identity)
 
 
 def _end(world: World) -> None:
@@ -149,11 +155,12 @@ def _end(world: World) -> None:
     kernel, learner = world.kernel, world.learner
     world.supervised = False
     if world.settings.ends_by == "finish":
-        learner.is_finished = True
+        fleet = {} if learner.server is None else learner.server.fleet.actors
+        joined = [actor for actor in world.running if fleet[actor.name].incarnation == actor.incarnation]
+        learner.is_finished = world.ledger.is_finished = True
         end = kernel.now + _END_SECONDS
-        while world.running:
-            left = ", ".join(actor.process.name for actor in world.running)
-            world.ledger.require(kernel.now < end, f"{left} did not end {_END_SECONDS:g} s after the end of the run")
+        while left := [actor.process.name for actor in joined if not actor.outcome]:
+            world.ledger.require(kernel.now < end, left, f"did not end {_END_SECONDS:g} s after the end of the run")
             kernel.sleep(0.1)
     for actor in world.running:
         actor.is_disturbed = False
@@ -161,7 +168,7 @@ def _end(world: World) -> None:
     while world.running:
         kernel.sleep(0.1)
     learner.stop.set()
-    end = kernel.now + 5.0
+    end = kernel.now + 5.0 + world.settings.heartbeat_seconds
     while not learner.done:
         world.ledger.require(kernel.now < end, "the learner does not end")
         kernel.sleep(0.1)

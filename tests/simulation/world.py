@@ -12,7 +12,7 @@ from .network import Network
 from .settings import Settings
 from .traffic import LinkRequest
 
-STOP_SECONDS = 11.0  # in which a process ends that is asked to stop: two queries of 5 s may have no answer
+_STOP_SECONDS = 11.0  # in which a process ends that is asked to stop: two queries of 5 s may have no answer
 
 
 class World:
@@ -46,7 +46,9 @@ class World:
     # ----------------------------------------------------------------------------------------------- learner
 
     def start_learner(self) -> None:
-        """Start a learner. There must be none."""
+        """Start a learner, unless the simulation ends. There must be none."""
+        if not self.supervised:
+            return
         self._lives += 1
         self.network.cut = False
         self.learner = LearnerProcess(
@@ -77,7 +79,9 @@ class World:
     # ------------------------------------------------------------------------------------------------ actors
 
     def start_actor(self, name: str) -> None:
-        """Start an incarnation of an actor."""
+        """Start an incarnation of an actor, unless the simulation ends."""
+        if not self.supervised:
+            return
         self._incarnations += 1
         actor = ActorProcess(
             self.kernel,
@@ -100,7 +104,8 @@ class World:
         """Ask an actor to stop, as SIGTERM does."""
         self.kernel.log("stop", actor.process.name)
         actor.stop.set()
-        self.kernel.after(STOP_SECONDS, self._require_end, actor)
+        seconds = _STOP_SECONDS + self.settings.heartbeat_seconds
+        self.kernel.after(seconds, self._require_end, actor, seconds)
         self.kernel.after(0.0, self._time_stop, actor, self.kernel.now)
 
     def _time_stop(self, actor: ActorProcess, since: float) -> None:
@@ -108,11 +113,10 @@ class World:
         if not actor.outcome:
             self.kernel.after(0.1, self._time_stop, actor, since)
 
-    def _require_end(self, actor: ActorProcess) -> None:
+    def _require_end(self, actor: ActorProcess, seconds: float) -> None:
         excused = actor.process.frozen or actor.is_disturbed
-        self.ledger.require(
-            bool(actor.outcome) or excused, f"{actor.process.name} did not end {STOP_SECONDS} s after its stop"
-        )
+        ended = bool(actor.outcome) or excused
+        self.ledger.require(ended, actor.process.name, f"did not end {seconds:g} s after its stop")
 
     def _on_actor_end(self, actor: ActorProcess) -> None:
         del self._running[actor]

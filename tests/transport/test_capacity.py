@@ -12,18 +12,18 @@ from daedalus.protocol import keys
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.transport import zenoh_settings
 from daedalus.transport.interface import AddressInUseError, Request, Transport
-from daedalus.transport.zenoh_settings import Capacity
+from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES, Capacity
 from daedalus.transport.zenoh_transport import connect, listen
 
 MIB = 1 << 20
 NO_ANSWER_SECONDS = 2.0
 
 
-def listen_somewhere(**options: int) -> tuple[str, Transport]:
+def listen_somewhere(max_message_bytes: int = MAX_MESSAGE_BYTES) -> tuple[str, Transport]:
     while True:
         endpoint = free_endpoint()
         try:
-            return endpoint, listen([endpoint], **options)
+            return endpoint, listen([endpoint], max_message_bytes=max_message_bytes)
         except AddressInUseError:
             continue
 
