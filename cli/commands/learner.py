@@ -29,6 +29,7 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -77,6 +78,7 @@ def main() -> int:
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
+    Heartbeat(run.directory).clear()  # before a router is waited for
     progress = Progress(sys.stdout, run.spec.training.env_steps)
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:

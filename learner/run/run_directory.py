@@ -4,6 +4,7 @@ config.toml      all settings; reproduces the run      metrics.csv   one row for
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
 learner.lock     locked by the learner that runs
+heartbeat        its age shows that the learner works (heartbeat.py)
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 """
 

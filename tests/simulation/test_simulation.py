@@ -14,9 +14,10 @@ import pytest
 from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.fleet import Actor, Fleet, SequenceWindow
+from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.intake import Intake
 from daedalus.learner.serving.rollout_buffer import StreamBuffer
+from daedalus.learner.serving.sequence_window import SequenceWindow
 from daedalus.protocol.messages import Acknowledgement, Rollout
 
 from .settings import draw

@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> CertificateFolder:
 def address(folder: CertificateFolder) -> Iterator[str]:
     """Run a router that answers joins itself."""
     where, router = listen_somewhere(folder.directory / "router")
-    router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
+    router.serve(keys.join("r", "arm"), lambda request: request.reply(b"welcome"))
     with closing(router):
         yield where
 
@@ -50,7 +50,7 @@ def client(address: str, folder: CertificateFolder, identity: Identity) -> Trans
 
 
 def answered(end: Transport) -> bool:
-    return end.query(keys.join("r"), timeout=LIMIT) == [b"welcome"]
+    return end.query(keys.join("r", "arm"), timeout=LIMIT) == [b"welcome"]
 
 
 def test_revoked_certificate_loses_its_session_and_gets_no_other(address: str, folder: CertificateFolder) -> None:
@@ -122,12 +122,13 @@ def test_requests_that_wait_while_the_session_is_renewed_do_no_harm(folder: Cert
     waiting: list[Request] = []
     renewed = threading.Event()
     with closing(router), closing(client(address, folder, ARM)) as arm:
-        router.serve(keys.join("r"), lambda request: request.reply(b"welcome") if renewed.is_set() else hold(request))
+        key = keys.join("r", "arm")
+        router.serve(key, lambda request: request.reply(b"welcome") if renewed.is_set() else hold(request))
 
         def hold(request: Request) -> None:
             waiting.append(request)
 
-        arm.query_async(keys.join("r"), b"payload", timeout=LIMIT, on_answer=lambda _: None)
+        arm.query_async(keys.join("r", "arm"), b"payload", timeout=LIMIT, on_answer=lambda _: None)
         until(lambda: waiting)
         folder.revoke([BOX])
         until(lambda: any("connections are renewed" in line for line in LINES))
