@@ -15,10 +15,9 @@ from collections import deque
 from running import machine, table
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.cli.settings_arguments import chosen_settings
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.run.settings import run_spec
+from daedalus.learner.run.settings import choose_algorithm, read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -52,7 +51,10 @@ def train(spec: RunSpec, lag: int) -> RunCounters:
 
 def specification(parsed: argparse.Namespace, seed: int) -> RunSpec:
     """Return the specification of the runs with a seed."""
-    settings = chosen_settings(parsed.preset, None, parsed.algorithm, seed=seed, env_steps=parsed.env_steps, actors=1)
+    settings = read_preset(parsed.preset)
+    choose_algorithm(settings, parsed.algorithm)
+    settings["training"]["seed"] = seed
+    settings["training"].update({} if parsed.env_steps is None else {"env_steps": parsed.env_steps})
     return run_spec(settings)
 
 

@@ -232,6 +232,7 @@ def summary(
         "episode_return_mean": counters.episode_return_mean,
         "evaluation_return_mean": None,
         "evaluation_return_std": None,
+        "confirmation_return_mean": None,
         "policy_lag_mean": counters.policy_lag_mean,
         "policy_lag_max": counters.policy_lag_max,
         "rollouts_accepted": counters.rollouts_accepted,
