@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
-from daedalus.cli.settings_arguments import chosen_settings, named_directory
+from daedalus.cli.settings_arguments import check_environment, chosen_settings, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign, run_spec
 
@@ -84,6 +84,7 @@ def train(
             assign(chosen, path, value)
         except SettingsError as error:
             raise SettingsError(f"settings {path!r}: {error}") from None
+    check_environment(env, chosen)
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
