@@ -48,6 +48,7 @@ class LocalRun:
     directory: Path
     spec: RunSpec
     started: float  # on the monotonic clock; the seconds of the run count from this time
+    lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
@@ -159,7 +160,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:
-            return start("daedalus.cli.commands.learner", *arguments, streams=streams)
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=run.lock)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 

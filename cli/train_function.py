@@ -85,9 +85,9 @@ def train(
             raise SettingsError(f"settings {path!r}: {error}") from None
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    run_directory.create(directory, spec)
-    end = _run(LocalRun(directory=directory, spec=spec, started=started), quiet)
-    return _result(directory, end)
+    with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
+        end = _run(LocalRun(directory=lock.directory, spec=spec, started=started, lock=lock.inheritable), quiet)
+    return _result(lock.directory, end)
 
 
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
@@ -109,11 +109,14 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
 
     failure: RunFailedError | None = None
     log, records = run.directory / run_directory.OUTPUT, logging.NullHandler() if quiet else logging.StreamHandler(out)
+    output = ChildOutput(log, lambda line: write(line, out), write_error)
     try:
-        with _records_to(records), ChildOutput(log, lambda line: write(line, out), write_error) as output:
+        with _records_to(records), output:
             return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
+    if not output.withheld:
+        run_directory.remove_failed(run.directory)
     # A restarted process fails with the same message.
     reasons = dict.fromkeys([*errors, *str(failure).splitlines()])
     raise TrainingError("\n".join(filter(None, reasons)) or f"the learner ended with status {failure.status}")

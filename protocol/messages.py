@@ -177,16 +177,19 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotRequest:
-    """Request of an actor on a slow link for one part of a CompactSnapshot. Actor -> learner, on `snapshots`.
+    """Request of an actor for the newest snapshot. Actor -> learner, on `snapshots`.
 
-    The request for part 0 makes the learner encode its newest snapshot as differences to `held_version`; the requests
-    for the other parts give the policy version of that snapshot.
+    If `compact` is false, the answer is the newest Snapshot, or a Refusal `not_ready` if the actor holds it.
+    If `compact` is true, the answer is one part of a CompactSnapshot, for a slow link. The request for part 0 makes the
+    learner encode its newest snapshot as differences to `held_version`; the requests for the other parts give the
+    policy version of that snapshot.
     """
 
     actor: str
     held_version: int | None  # the version that the actor holds; None: no version
     policy_version: int | None = None  # of the snapshot; None: the newest
     part: int = 0
+    compact: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -104,6 +104,7 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
     lines = str(failed.value).splitlines()
     assert lines[0].startswith("daedalus actor: unknown environment 'CartPole-v9'")
     assert len(lines) == len(set(lines))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ class RateMeter:
             totals = actor.env_steps, actor.received_bytes, actor.answered_bytes
             env_steps, received, answered = np.subtract(totals, self._actors.get(actor.name, (0, 0, 0))) / seconds
             self._actors[actor.name] = totals
-            subscribed = 0.0 if actor.compact_snapshots or not fleet.is_live(actor) else pushed / seconds
+            subscribed = 0.0 if actor.fetches or not fleet.is_live(actor) else pushed / seconds
             actor.env_steps_per_second = float(env_steps)
             actor.bytes_up_per_hour = 3600 * float(received)
             actor.bytes_down_per_hour = 3600 * float(answered + subscribed)

@@ -67,9 +67,10 @@ class Actor:
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of the newest rollout
-    compact_snapshots: bool = False  # whether the actor fetches compact snapshots instead of subscribing
+    fetches: bool = False  # whether the actor requests its snapshots instead of subscribing
+    compact_snapshots: bool = False  # whether it requests compact snapshots
     received_bytes: int = 0  # rollouts, accepted or not
-    answered_bytes: int = 0  # compact snapshots
+    answered_bytes: int = 0  # requested snapshots
     bytes_up_per_hour: float = 0.0
     bytes_down_per_hour: float = 0.0
 
@@ -118,7 +119,7 @@ class Actor:
         self.incarnation = incarnation
         self.incarnations += 1
         self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
-        self.quarantined, self.compact_snapshots = "", False
+        self.quarantined, self.fetches, self.compact_snapshots = "", False, False
         self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
         while len(self.windows) > _MAX_WINDOWS:
             del self.windows[next(iter(self.windows))]

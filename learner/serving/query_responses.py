@@ -31,7 +31,9 @@ class QueryResponses:
         self._start_version = start_version
         self._fleet = fleet
         self._lock = lock
-        self._snapshot = encode(Refusal(code="not_ready", reason="the learner has no policy yet"))
+        # The answer to queries for the newest snapshot, and its version if it is a snapshot.
+        self._snapshot: tuple[bytes, int | None] = (_refuse("the learner has no policy yet"), None)
+        self._unchanged = _refuse("the actor holds the newest snapshot")
         self._program: Program | None = None
         self._encoded_program = b""
         self._ending: Refusal | None = None  # of joins after the end
@@ -67,18 +69,23 @@ class QueryResponses:
             return encode(Refusal(code="unknown", reason=f"no program with hash {program_hash[:64]!r}"))
         return self._encoded_program
 
-    def offer_snapshot(self, encoded: bytes) -> None:
+    def offer_snapshot(self, encoded: bytes, policy_version: int) -> None:
         """Set the newest snapshot, as the bytes that were published."""
-        self._snapshot = encoded
+        self._snapshot = encoded, policy_version
 
     def end(self, run_ended: bytes, *, finished: bool) -> None:
         """Refuse later joins, and answer queries for snapshots with `run_ended`, an encoded RunEnded."""
-        self._snapshot = run_ended
+        self._snapshot = run_ended, None
         if finished:
             self._ending = Refusal(code="finished", reason="the run is over")
         else:
             self._ending = Refusal(code="not_ready", reason="the learner is stopping")
 
-    def snapshot(self) -> bytes:
-        """Return the answer to a query for the newest snapshot."""
-        return self._snapshot
+    def snapshot(self, held_version: int | None = None) -> bytes:
+        """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""
+        encoded, version = self._snapshot
+        return self._unchanged if version is not None and version == held_version else encoded
+
+
+def _refuse(reason: str) -> bytes:
+    return encode(Refusal(code="not_ready", reason=reason))

@@ -62,7 +62,7 @@ def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: Ru
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
-    learner.transport.publish(keys.snapshots("r"), b"\xff" * 100)
+    learner.snapshot = b"\xff" * 100
     acknowledge(request, "accepted")
     _, request = learner.receive()
     acknowledge(request, "accepted")

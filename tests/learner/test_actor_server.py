@@ -25,6 +25,7 @@ from daedalus.protocol.messages import (
     Refusal,
     RunEnded,
     Snapshot,
+    SnapshotRequest,
 )
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.status import RunStatus
@@ -409,6 +410,39 @@ def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(
         server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
         published.add(server.publisher.version)
     assert published == {0, 8, 16, 24, 32, 40}
+
+
+def test_requested_snapshot_is_sent_unless_the_actor_holds_it_and_counts_for_the_actor(
+    network: MemoryNetwork, server: ActorServer
+) -> None:
+    actors = with_fleet(network, server, 1)
+    weights = {"w": np.zeros(2, np.float32)}
+
+    def request(held: int | None) -> bytes:
+        payload = encode(SnapshotRequest(actor="a0", held_version=held, compact=False))
+        return actors.query(keys.snapshots("r"), payload, timeout=LIMIT)[0]
+
+    assert isinstance(decode(request(None), Limits()), Refusal)
+    server.publisher.publish(3, weights)
+    answers = [request(held) for held in (None, 2, 3)]
+    whole = server.publisher.newest()
+    assert answers[:2] == [whole, whole]
+    unchanged = decode(answers[2], Limits())
+    assert isinstance(unchanged, Refusal)
+    assert unchanged.code == "not_ready"
+    actor = server.fleet.actors["a0"]
+    assert (actor.fetches, actor.compact_snapshots) == (True, False)
+    assert actor.answered_bytes > 2 * len(whole)
+    server.close("solved", finished=True)
+    assert isinstance(decode(request(3), Limits()), RunEnded)
+
+
+def test_invalid_request_for_a_snapshot_is_refused_as_malformed(network: MemoryNetwork, server: ActorServer) -> None:
+    for payload in (b"\xff" * 20, encode(EvaluationRequest(evaluator="e"))):
+        (answer,) = MemoryTransport(network).query(keys.snapshots("r"), payload, timeout=LIMIT)
+        refusal = decode(answer, Limits())
+        assert isinstance(refusal, Refusal)
+        assert refusal.code == "malformed"
 
 
 def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -> None:

@@ -113,9 +113,9 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 
 def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
-    weights = {str(number): np.zeros(1, np.float32) for number in range(17)}
+    weights = {str(number): np.zeros(1, np.float32) for number in range(33)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    assert_rejected(harness, data, "malformed", "17 arrays, the limit is 16")
+    assert_rejected(harness, data, "malformed", "33 arrays, the limit is 32")
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -508,7 +508,8 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
 
 def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
     lengths = np.zeros_like(good().episode_lengths)
-    assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit", "episode_lengths")
+    verdict = assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit")
+    assert verdict.reason == "episode_lengths has a value below 1"
 
 
 def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Harness) -> None:

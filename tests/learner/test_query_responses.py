@@ -71,10 +71,13 @@ def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     first = read(responses.snapshot())
     assert isinstance(first, Refusal)
     assert first.code == "not_ready"
-    responses.offer_snapshot(b"newest")
-    assert responses.snapshot() == b"newest"
+    responses.offer_snapshot(b"newest", 4)
+    assert responses.snapshot() == responses.snapshot(3) == b"newest"
+    unchanged = read(responses.snapshot(4))
+    assert isinstance(unchanged, Refusal)
+    assert unchanged.code == "not_ready"
     responses.end(b"run_ended", finished=True)
-    assert responses.snapshot() == b"run_ended"
+    assert responses.snapshot() == responses.snapshot(4) == b"run_ended"
     late = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"

@@ -83,6 +83,7 @@ MESSAGES: dict[str, Message] = {
     ),
     "snapshot_request": SnapshotRequest(actor="wing-1", held_version=33, policy_version=41, part=2),
     "snapshot_request_first": SnapshotRequest(actor="wing-1", held_version=None),
+    "snapshot_request_whole": SnapshotRequest(actor="wing-1", held_version=40, compact=False),
     "snapshot_part": SnapshotPart(
         learner_epoch=9, policy_version=41, part=2, parts=3, data=np.arange(11, dtype=np.uint8)
     ),

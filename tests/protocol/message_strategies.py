@@ -214,6 +214,7 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         held_version=st.none() | counters,
         policy_version=st.none() | counters,
         part=counters,
+        compact=st.booleans(),
     ),
     SnapshotPart: snapshot_parts(),
     CompactSnapshot: compact_snapshots(),
