@@ -99,7 +99,7 @@ class Link:
     # ---------------------------------------------------------------------------------------------- Transport
 
     def _enter(self, operation: str) -> None:
-        self.network.kernel.preempt()
+        self.network.kernel.perhaps_preempt()
         if not self.alive:
             raise TransportError("the session is closed")
         if not self.passes() and self.network.chance(self.network.weather.refused):
