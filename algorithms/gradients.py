@@ -8,6 +8,7 @@ from torch import Tensor
 
 from daedalus.algorithms.algorithm import Losses
 from daedalus.algorithms.batch import Batch, Components
+from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.algorithms.losses import explained_variance, masked_mean, value_loss
 from daedalus.algorithms.precision import autocast
@@ -35,6 +36,7 @@ class GradientComputer:
         self._spec, self._network = spec, network
         self._algorithm = build_algorithm(spec, network.distribution)
         self.parameters = FlatParameters(network.learned_parameters())
+        self._first_pass: FirstPass | None = None  # of the newest batch
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
@@ -45,9 +47,18 @@ class GradientComputer:
             value_term = value_loss(losses.values, losses.targets, losses.valid, self._spec.value_loss)
             entropy = masked_mean(losses.entropies, losses.valid)
             loss = losses.policy_loss + self._spec.value_coefficient * value_term - entropy_bonus * entropy
+            self._first_pass = losses.first_pass
             self.parameters.gradients.zero_()
             loss.backward()
             yield _terms(losses, value_term, entropy)
+
+    def take_first_pass(self) -> FirstPass | None:
+        """Return the first pass of the newest batch, once; None without a batch since the last call.
+
+        It is valid until the memory of the batch is used for the next one.
+        """
+        first_pass, self._first_pass = self._first_pass, None
+        return first_pass
 
     def _forward(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
         with autocast(self._spec.precision, starts.device, self._network.convolutional):

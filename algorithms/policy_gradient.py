@@ -6,6 +6,7 @@ import torch
 
 from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import policy_gradient_loss, policy_weights
 from daedalus.algorithms.targets import TargetsFunction
 from daedalus.policy.network.distributions.joint import ActionDistribution
@@ -34,4 +35,7 @@ class PolicyGradient:
             advantages=targets.advantages,
             valid=batch.valid,
             clipped_fraction=torch.zeros((), device=values.device),
+            first_pass=FirstPass(
+                log_probs.detach(), batch.behaviour_log_probs, values[:-1].detach(), targets.values, batch.valid
+            ),
         )

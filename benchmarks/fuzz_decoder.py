@@ -1,7 +1,7 @@
 """Fuzz the decoder, guided by coverage. Every exception that it finds is a bug.
 
     pip install -c constraints.txt ".[fuzz]"
-    python benchmarks/fuzz_decoder.py CORPUS [-max_total_time=600] [-jobs=2] ...
+    python -m benchmarks.fuzz_decoder CORPUS tests/protocol/fuzz_corpus [-max_total_time=600] [-jobs=2] ...
 
 CORPUS is a folder: it starts with the golden messages of tests/protocol and grows with each input that reaches new
 code. The other options are those of libFuzzer. A decoded rollout is also checked against the specification of a run, as

@@ -1,7 +1,12 @@
-"""Shared parts of the command lines: the layout of help, and the options --connect, --tls and --insecure."""
+"""Shared parts of the command lines: the layout of help, and the options for addresses, security and modules."""
 
 import argparse
+import re
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
+
+from daedalus.policy.user_modules import ModuleNotAllowedError, allow_words
 
 
 def command_parser(name: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -14,9 +19,9 @@ def command_parser(name: str, description: str, examples: str) -> argparse.Argum
     )
 
 
-def add_connect(options: argparse._ActionsContainer, help: str) -> None:
-    """Add --connect, which is required and may be given several times."""
-    options.add_argument("--connect", required=True, action="append", metavar="tcp/HOST:PORT", help=help)
+def add_connect(options: argparse._ActionsContainer, help: str, *, required: bool = True) -> None:
+    """Add --connect, which may be given several times."""
+    options.add_argument("--connect", required=required, action="append", metavar="tcp/HOST:PORT", help=help)
 
 
 def add_tls(options: argparse._ActionsContainer) -> None:
@@ -37,3 +42,27 @@ def add_insecure(options: argparse._ActionsContainer) -> None:
         help="allow an address that other hosts can reach without TLS. Every host that reaches it may take part, and "
         "traffic is not encrypted",
     )
+
+
+def add_allow_module(options: argparse._ActionsContainer, source: str) -> None:
+    """Add --allow-module, which may be given several times; `source` says whose settings name modules."""
+    options.add_argument(
+        "--allow-module",
+        action="append",
+        default=[],
+        type=_module,
+        metavar="NAME",
+        help=f"module of your own that {source} may name and this command then imports. Importing a module runs it. "
+        "May be given several times",
+    )
+
+
+def allowing(error: ModuleNotAllowedError, command: Sequence[str]) -> str:
+    """Return a message with the command line to type, if the user trusts the modules."""
+    return f"{error.reason}; if you trust that code, type: {shlex.join([*command, *allow_words(error.modules)])}"
+
+
+def _module(name: str) -> str:
+    if re.fullmatch(r"\w+(\.\w+)*", name) is None:
+        raise argparse.ArgumentTypeError(f"{name!r} is not the name of a module: write my_module, without :NAME or .py")
+    return name

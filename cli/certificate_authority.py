@@ -79,6 +79,11 @@ class Issued:
     expires: datetime.datetime
     hosts: list[str]  # names and addresses for which it may listen
 
+    @property
+    def days_left(self) -> float:
+        """Days until it expires; negative if it has expired."""
+        return (self.expires - datetime.datetime.now(datetime.UTC)) / datetime.timedelta(days=1)
+
 
 def read_issued(path: Path) -> Issued:
     """Return what the certificate in a file states. Raises CredentialsError."""

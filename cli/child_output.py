@@ -1,12 +1,22 @@
-"""Output of child processes: written to this process's own streams, or passed on line by line."""
+"""Output of child processes: every line goes to a log file and, within a rate limit, to the screen.
+
+The environments of a user may print at every step: this must neither flood the terminal nor stop the processes.
+"""
 
 import os
 import threading
+import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Self
 
+_LONGEST_LINE = 1 << 16  # bytes; a longer line is split
+_LOG_BYTES = 8 << 20  # of the log file, and of the one before it
+_SHOWN_AT_ONCE = 40  # lines; afterwards one line in so many seconds
+_SECONDS_A_LINE = 5.0
 _KEPT_LINES = 40
 _CLOSE_SECONDS = 5.0
 
@@ -19,32 +29,162 @@ class Streams:
     stderr: int | None = None
 
 
-INHERITED = Streams()
+OpenStreams = Callable[[str], AbstractContextManager[Streams]]  # for one process of this name, started in the block
 
 
-class CollectedOutput:
-    """Pipe for the output of child processes. It passes each line to a function and keeps the newest lines.
+def inherited(_name: str) -> AbstractContextManager[Streams]:
+    """Return this process's own streams."""
+    return nullcontext(Streams())
 
-    A notebook shows only what its own process prints, so children cannot write to its streams themselves.
-    """
 
-    def __init__(self, pass_on: Callable[[str], None]) -> None:
-        """Start a thread that reads the pipe and calls `pass_on` with each line."""
-        reading, self.descriptor = os.pipe()
-        self._pass_on = pass_on
-        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
-        self._thread = threading.Thread(target=self._read, args=(reading,), name="child-output", daemon=True)
-        self._thread.start()
+class RateLimit:
+    """Token bucket: some lines at once, then one every few seconds. Times are on the monotonic clock, in seconds."""
 
-    def close(self) -> str:
-        """Wait until the children have closed their ends; return the newest lines. Call it once."""
-        os.close(self.descriptor)
-        self._thread.join(_CLOSE_SECONDS)
-        return "\n".join(self._lines)
+    def __init__(self, now: float) -> None:
+        self._tokens, self._then = float(_SHOWN_AT_ONCE), now
 
-    def _read(self, reading: int) -> None:
-        with open(reading, encoding="utf-8", errors="replace") as lines:
-            for line in lines:
-                self._lines.append(line.rstrip("\n"))
-                with suppress(OSError, ValueError):  # a closed stream: children must not block on a full pipe
-                    self._pass_on(line)
+    def take(self, count: int, now: float) -> int:
+        """Return how many of the next `count` lines may be shown."""
+        self._tokens = min(self._tokens + (now - self._then) / _SECONDS_A_LINE, float(_SHOWN_AT_ONCE))
+        self._then = now
+        taken = min(count, int(self._tokens))
+        self._tokens -= taken
+        return taken
+
+
+class OutputLog:
+    """Log file of bounded size: when it is full it becomes FILE.1, which is replaced. A full disk is ignored."""
+
+    def __init__(self, path: Path) -> None:
+        """Create no file before the first line."""
+        self._path, self._bytes = path, 0
+        self._file: BinaryIO | None = None
+
+    def write(self, lines: Sequence[bytes]) -> None:
+        """Append lines."""
+        with suppress(OSError):
+            if self._file is None:
+                self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+                self._bytes = self._file.tell()
+            data = b"".join(lines)
+            self._file.write(data)
+            self._bytes += len(data)
+            if self._bytes > _LOG_BYTES:
+                self.close()
+                os.replace(self._path, self._path.with_name(f"{self._path.name}.1"))
+
+    def close(self) -> None:
+        """Close the file; a further line opens it again."""
+        if self._file is not None:
+            self._file.close()
+        self._file = None
+
+
+class ChildOutput:
+    """Reader of the output of child processes, with a thread for each stream."""
+
+    def __init__(self, log: Path, write_out: Callable[[str], None], write_err: Callable[[str], None]) -> None:
+        """Construct the reader.
+
+        Args:
+          log: file for all lines.
+          write_out, write_err: show a line of standard output, or of standard error. Called by several threads in turn.
+        """
+        self._log, self._log_path = OutputLog(log), log
+        self._write = {"stdout": write_out, "stderr": write_err}
+        now = time.monotonic()
+        self._limits = {stream: RateLimit(now) for stream in self._write}
+        self._lock = threading.Lock()  # guards all but the threads
+        self.withheld = 0  # lines that should have been shown, and were not
+        self._unshown: dict[str, deque[str]] = {}  # newest lines of standard error that were not shown, by process
+        self._threads: dict[str, list[threading.Thread]] = {}
+
+    @contextmanager
+    def pipes(self, name: str, *, shown: bool = True) -> Iterator[Streams]:
+        """Return the streams for one process, which must be started in the block.
+
+        Args:
+          name: of the process.
+          shown: show its lines, within the limit; otherwise they only go to the log.
+        """
+        with self._reading(name, lambda stream, lines: self._take(name, stream, lines, shown)) as streams:
+            yield streams
+
+    @contextmanager
+    def unlimited_pipes(self, name: str) -> Iterator[Streams]:
+        """Return the streams for a process whose lines are all shown and not logged. See `pipes`."""
+        with self._reading(name, self._show) as streams:
+            yield streams
+
+    def unshown(self, name: str) -> list[str]:
+        """Return the newest error lines of a process that were not shown. Call it after the end of the process."""
+        self._join(self._threads.get(name, []))
+        with self._lock:
+            return list(self._unshown.get(name, ()))
+
+    def close(self) -> None:
+        """Wait until the child processes have closed their streams, and say how many lines were not shown."""
+        self._join([thread for threads in self._threads.values() for thread in threads])
+        with self._lock:
+            self._log.close()
+            if self.withheld:
+                self._show("stdout", [f"{self.withheld:,} lines of output were not shown; see {self._log_path}"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _reading(self, name: str, take: Callable[[str, list[str]], None]) -> Iterator[Streams]:
+        writing: dict[str, int] = {}
+        try:
+            for stream in self._write:
+                reading, writing[stream] = os.pipe()
+                thread = threading.Thread(
+                    target=_read, args=(reading, take, stream), name=f"output-of-{name}", daemon=True
+                )
+                self._threads.setdefault(name, []).append(thread)
+                thread.start()
+            yield Streams(**writing)
+        finally:
+            for descriptor in writing.values():
+                os.close(descriptor)
+        self._threads[name] = [thread for thread in self._threads[name] if thread.is_alive()]
+
+    def _take(self, name: str, stream: str, lines: list[str], shown: bool) -> None:
+        with self._lock:
+            self._log.write([f"[{name}] {line}\n".encode() for line in lines])
+            count = self._limits[stream].take(len(lines), time.monotonic()) if shown else 0
+            self._show(stream, lines[:count])
+            if stream == "stderr":
+                self._unshown.setdefault(name, deque(maxlen=_KEPT_LINES)).extend(lines[count:])
+            if shown and count < len(lines):
+                if not self.withheld:
+                    self._show("stdout", [f"more lines of output are in {self._log_path} only"])
+                self.withheld += len(lines) - count
+
+    def _show(self, stream: str, lines: Sequence[str]) -> None:
+        for line in lines:
+            with suppress(OSError, ValueError):  # a closed stream: children must not block on a full pipe
+                self._write[stream](line)
+
+    @staticmethod
+    def _join(threads: Sequence[threading.Thread]) -> None:
+        deadline = time.monotonic() + _CLOSE_SECONDS
+        for thread in threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
+
+
+def _read(reading: int, take: Callable[[str, list[str]], None], stream: str) -> None:
+    """Read a pipe to its end, and pass its lines on."""
+    rest = b""
+    with open(reading, "rb", buffering=0) as pipe:
+        while data := pipe.read(_LONGEST_LINE):
+            *lines, rest = (rest + data).replace(b"\r", b"\n").split(b"\n")  # progress bars rewrite their line
+            if len(rest) >= _LONGEST_LINE:
+                lines, rest = [*lines, rest], b""
+            take(stream, [line.decode(errors="replace") for line in lines])
+    if rest:
+        take(stream, [rest.decode(errors="replace")])

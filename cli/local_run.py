@@ -4,7 +4,6 @@
 """
 
 import logging
-import socket
 import subprocess
 import threading
 import time
@@ -12,11 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.child_output import INHERITED, Streams
+from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
+from daedalus.cli.confirmation import confirmation, confirmation_arguments
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
+from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
+from daedalus.transport.private_address import private_address
 
 _logger = logging.getLogger(__name__)
 
@@ -39,16 +41,19 @@ class RunStoppedError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalRun:
-    """Settings of one run on this machine. Its directory and config.toml exist already."""
+    """Settings of one run on this machine. Its directory and config.toml exist already.
+
+    The processes import the modules that the specification names: the caller has checked that the user allows them.
+    """
 
     directory: Path
     spec: RunSpec
     started: float  # on the monotonic clock; the seconds of the run count from this time
+    lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
-    listen: str | None = None  # address for actors of other hosts, in addition to a free port of this machine
+    listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False
-    wrap: str | None = None  # module:function that wraps each environment of this machine's actors
     log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
     log_json: bool = False
 
@@ -61,7 +66,9 @@ class RunEnd:
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 
-def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> RunEnd:
+def run_locally(
+    run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
+) -> RunEnd:
     """Train until the target or the end of the budget, then evaluate the best checkpoint.
 
     No child process is left when this returns or raises.
@@ -69,32 +76,42 @@ def run_locally(run: LocalRun, stopping: threading.Event, streams: Streams = INH
     Args:
       run: what to run.
       stopping: ends the run early when it is set.
-      streams: where the child processes write.
+      output: reads what the actors and the evaluations write.
+      learner_streams: where the learner writes its log and its progress.
 
     Raises RunFailedError or RunStoppedError.
     """
     try:
-        status = _train(run, stopping, streams)
+        status = _train(run, stopping, output, learner_streams)
         if stopping.is_set():
             raise RunStoppedError
         if status not in _FINISHED:
             raise RunFailedError(status=status)
-        return RunEnd(status=status, summary=evaluate_run(run, stopping, streams))
+        return RunEnd(status=status, summary=evaluate_run(run, stopping, output))
     except (FailedError, EvaluationFailedError) as error:
         if stopping.is_set():
             raise RunStoppedError from None
-        raise RunFailedError(str(error)) from None
+        unshown = output.unshown(error.name) if isinstance(error, FailedError) else []
+        raise RunFailedError("\n".join([*unshown, str(error)])) from None
 
 
-def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
+def _train(run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
+    with private_address() as address:
+        return _train_at(address, run, stopping, output, learner_streams)
+
+
+def _train_at(
+    address: str, run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams
+) -> int:
+    """Run the learner, and connect this machine's actors to it at an address."""
     spec, options = run.spec, _actor_options(run)
-    listening, address = _addresses(run)
-    learner = _supervised_learner(run, listening, streams)
+    listening = _listening(run, address)
+    learner = _supervised_learner(run, listening, learner_streams)
     actors: list[Supervised] = []
     try:
         names = [f"actor-{index}" for index in range(spec.collection.actors)]
-        actors += [supervised_actor(name, address, options, streams) for name in names]
+        actors += [supervised_actor(name, address, options, output.pipes) for name in names]
         training = spec.training
         _logger.info(
             "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
@@ -107,7 +124,7 @@ def _train(run: LocalRun, stopping: threading.Event, streams: Streams) -> int:
             run.directory,
         )
         if spec.evaluation.seconds is not None:
-            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), streams))
+            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
         return watch(learner, actors, spec, stopping)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
@@ -121,29 +138,30 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     """Return the options of this machine's actors and of the evaluator."""
     # The learner reports the progress of all actors: the records of each one are for debugging.
     level = "debug" if run.log_level == "debug" else "warning"
-    return *_logging_options(level, run.log_json), *(["--wrap", run.wrap] if run.wrap else [])
+    return *_logging_options(level, run.log_json), *allow_settings(run.spec.environment.user_modules)
 
 
-def _addresses(run: LocalRun) -> tuple[list[str], str]:
-    """Return the learner's options for listening, and the address for this machine's actors, which use no TLS."""
-    own = f"tcp/127.0.0.1:{_free_port()}" if run.listen is None or run.tls else run.listen
-    addresses = [own] if run.listen in (None, own) else [own, run.listen]
+def _listening(run: LocalRun, own: str) -> list[str]:
+    """Return the learner's options for listening, at its own address and at that for actors of other hosts."""
+    addresses = [own, run.listen] if run.listen else [own]
     listening = [word for address in addresses for word in ("--listen", address)]
     if run.tls:
         listening += ["--tls", str(run.tls)]
-    return [*listening, *(["--insecure"] if run.insecure else [])], own
+    return [*listening, *(["--insecure"] if run.insecure else [])]
 
 
-def _supervised_learner(run: LocalRun, listening: list[str], streams: Streams) -> Supervised:
+def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenStreams) -> Supervised:
     """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         since = run.started if first else time.monotonic()
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
         arguments += _logging_options(run.log_level, run.log_json)
+        arguments += allow_settings(run.spec.policy.user_modules)
         if run.resume or not first:
             arguments.append("--resume")
-        return start("daedalus.cli.commands.learner", *arguments, streams=streams)
+        with open_streams("learner") as streams:
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=run.lock)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 
@@ -179,25 +197,26 @@ def _warn(message: str | None) -> None:
         _logger.warning("%s", message)
 
 
-def evaluate_run(run: LocalRun, stopping: threading.Event, streams: Streams = INHERITED) -> dict[str, Any]:
+def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
-    Raises EvaluationFailedError.
+    If training stopped at its target, the policy of that moment also plays new sampled episodes. Raises
+    EvaluationFailedError.
     """
     began = time.monotonic()
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *_logging_options(run.log_level, run.log_json)]
-    options += ["--wrap", run.wrap] if run.wrap else []
-    chosen = select_best(run.directory, run.spec, options, stopping, streams)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, streams)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
+    common = [*_logging_options(run.log_level, run.log_json), *allow_settings(run.spec.environment.user_modules)]
+    options = ["--episodes", str(run.spec.evaluation.final_episodes), *common]
+    chosen = select_best(run.directory, run.spec, options, stopping, output)
+    evaluations = [options]
+    if summary.get("solved") and run.spec.training.stop_when_solved:
+        evaluations.append([*confirmation_arguments(run.spec), *common])
+    evaluation, *confirmations = play([[str(run.directory), *each] for each in evaluations], stopping, output)
+    for confirmed in confirmations:
+        summary["confirmation"] = confirmation(confirmed)
+        summary["confirmation_return_mean"] = confirmed["return_mean"]
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
     summary["evaluation"] = {**evaluation, "select_best": chosen, "seconds": time.monotonic() - began}
     run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
     return summary
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
-from daedalus.cli.child_output import INHERITED, Streams
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.supervisor import stop
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
@@ -33,7 +33,7 @@ def select_best(
     spec: RunSpec,
     options: list[str],
     stopping: threading.Event,
-    streams: Streams = INHERITED,
+    output: ChildOutput,
 ) -> list[dict[str, Any]]:
     """Re-evaluate the candidates, save their new scores, and return the scores, the best first.
 
@@ -42,7 +42,7 @@ def select_best(
       spec: the specification of the run.
       options: options for each `daedalus evaluate`.
       stopping: ends the evaluations early when it is set.
-      streams: where the first evaluation writes its progress.
+      output: reads what the evaluations write. It shows the progress of the first one.
 
     Returns: policy_version, return_mean and return_std of each candidate; empty if there are fewer than two.
     Raises EvaluationFailedError.
@@ -58,7 +58,7 @@ def select_best(
         backend,
     )
     options = [*options, "--backend", backend, "--seed", str(seed)]
-    results = play([[str(each.directory), *options] for each in finalists], stopping, streams)
+    results = play([[str(each.directory), *options] for each in finalists], stopping, output)
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
@@ -72,45 +72,38 @@ def select_best(
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
 
 
-def play(commands: list[list[str]], stopping: threading.Event, streams: Streams = INHERITED) -> list[dict[str, Any]]:
+def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutput) -> list[dict[str, Any]]:
     """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
 
     Raises EvaluationFailedError.
     """
     with ExitStack() as stack:
-        outputs = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
-        # The first evaluation shows its progress. The output of the others is shown if they fail.
-        others = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands[1:]]
-        processes: list[subprocess.Popen[bytes]] = []
+        files = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
+        processes: dict[str, subprocess.Popen[bytes]] = {}
         try:
-            for arguments, output, error in zip(commands, outputs, [streams.stderr, *others], strict=True):
-                processes.append(_start_evaluation(arguments, output, error))
-            while any(process.poll() is None for process in processes) and not stopping.wait(_POLL_SECONDS):
+            for arguments, file in zip(commands, files, strict=True):
+                name = f"evaluation-{len(processes)}"
+                with output.pipes(name, shown=not processes) as streams:
+                    processes[name] = _start_evaluation(arguments, file, streams.stderr)
+            while any(process.poll() is None for process in processes.values()) and not stopping.wait(_POLL_SECONDS):
                 pass
         finally:
-            stop(processes)
-        errors = [None, *others]
-        failed = [error for process, error in zip(processes, errors, strict=True) if process.returncode != 0]
+            stop(list(processes.values()))
+        failed = [name for name, process in processes.items() if process.returncode != 0]
         if failed:
-            printed = [] if stopping.is_set() else [_text(error) for error in failed if error is not None]
-            raise EvaluationFailedError("".join(printed))
-        for output in outputs:
-            output.seek(0)
-        results = [json.load(output) for output in outputs]
+            # The environment may have printed much: the error is at the end.
+            unshown = [] if stopping.is_set() else [line for name in failed for line in output.unshown(name)]
+            raise EvaluationFailedError("\n".join(unshown))
+        for file in files:
+            file.seek(0)
+        results = [json.load(file) for file in files]
     for result in results:
         for each_episode in ("returns", "lengths"):
             del result[each_episode]
     return results
 
 
-def _start_evaluation(
-    arguments: list[str], output: IO[bytes], error: IO[bytes] | int | None
-) -> subprocess.Popen[bytes]:
+def _start_evaluation(arguments: list[str], output: IO[bytes], error: int | None) -> subprocess.Popen[bytes]:
     program = [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate"]
     command = [*program, *arguments, "--json", "--exit-with-parent"]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=error)
-
-
-def _text(file: IO[bytes]) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")

@@ -1,13 +1,15 @@
 """Options of a run's settings, which `daedalus train` and `daedalus learner` share, and the options of the learner."""
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
+from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spec import RunSpec
 
@@ -26,8 +28,8 @@ examples:
   daedalus learner cartpole --connect tcp/router:7447
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
 
-exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped early, 2 bad usage"""
+exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage"""
 
 
 def add_settings(options: argparse.ArgumentParser) -> None:
@@ -54,6 +56,11 @@ def add_settings(options: argparse.ArgumentParser) -> None:
     )
     options.add_argument("--seed", type=int, metavar="S", help="seed of the network, the environments and the actions")
     options.add_argument("--env-steps", type=int, metavar="N", help="budget: environment steps of all actors together")
+    options.add_argument(
+        "--wrap",
+        metavar="MODULE:FUNCTION",
+        help="your function that takes each gymnasium environment and returns the one to play (environment.wrap)",
+    )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     options.add_argument(
         "--set",
@@ -73,8 +80,10 @@ def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
         seed=arguments.seed,
         env_steps=arguments.env_steps,
         actors=arguments.actors,
+        wrap=arguments.wrap,
     )
     override(settings, arguments.set)
+    check_environment(arguments.env, settings)
     spec = run_spec(settings)
     return spec, arguments.run_dir or named_directory(arguments.preset, spec)
 
@@ -87,40 +96,81 @@ def chosen_settings(
     seed: int | None,
     env_steps: int | None,
     actors: int | None,
+    wrap: str | None,
 ) -> dict[str, Any]:
     """Return the settings of a preset or an environment with the most used settings applied. Raises SettingsError."""
     if (preset is None) == (env is None):
         raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
     settings: dict[str, Any] = {"environment": {"id": env}} if preset is None else read_preset(preset)
     choose_algorithm(settings, algorithm)
-    shortcuts = {("training", "seed"): seed, ("training", "env_steps"): env_steps, ("collection", "actors"): actors}
+    shortcuts = {
+        ("training", "seed"): seed,
+        ("training", "env_steps"): env_steps,
+        ("collection", "actors"): actors,
+        ("environment", "wrap"): wrap,
+    }
     for (section, key), value in shortcuts.items():
         if value is not None:
             settings.setdefault(section, {})[key] = value
     return settings
 
 
+def check_environment(env: str | None, settings: dict[str, Any]) -> None:
+    """Check that other settings name no other environment than `env`. Raises SettingsError."""
+    chosen = settings["environment"].get("id")
+    if env is not None and chosen != env:
+        raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
+
+
 def named_directory(preset: str | None, spec: RunSpec) -> Path:
-    """Return the default run directory, named after the preset or the environment."""
-    return run_directory.default_directory(Path(preset).stem if preset else spec.environment.id, spec)
+    """Return the default run directory, named after the preset or file, or after the environment.
 
-
-def resolve_to_resume(arguments: argparse.Namespace) -> tuple[RunSpec, Path, bool]:
-    """Return specification, run directory and whether the run exists already, for `daedalus learner --resume`.
-
-    Raises SettingsError.
+    A repeated config.toml of another run has no name of its own.
     """
+    name = spec.environment.id if preset is None or Path(preset).name == run_directory.CONFIG else Path(preset).stem
+    return run_directory.default_directory(name, spec)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChosenRun:
+    """Run of a learner, as its command line defines it."""
+
+    spec: RunSpec
+    directory: Path
+    exists: bool  # whether the run directory was created before
+    modules: UserModules  # that the learner may import
+
+
+def choose_run(arguments: argparse.Namespace) -> ChosenRun:
+    """Return the run that the arguments of `daedalus learner` define.
+
+    Modules that the command line itself names are allowed; those that only an existing config.toml names need
+    --allow-module. Raises SettingsError or UserModuleError.
+    """
+    named = arguments.preset is not None or arguments.env is not None
+    directory = arguments.prepared or (_directory_to_resume(arguments) if arguments.resume else None)
+    if directory is None:
+        spec, directory = resolve(arguments)
+        run_directory.check_free(directory)
+    else:
+        spec = run_directory.read_config(directory)
+        if named and resolve(arguments)[0] != spec:
+            raise SettingsError(
+                f"the run in {directory} has other settings: leave out PRESET, --env and all settings to continue it, "
+                "or name another --run-dir"
+            )
+    own = modules_of(spec.user_modules) if named else []
+    modules = UserModules(frozenset({*arguments.allow_module, *own}), str(directory / run_directory.CONFIG))
+    modules.check(spec.policy.user_modules)  # the learner makes no environment
+    exists = (directory / run_directory.CONFIG).exists()
+    return ChosenRun(spec=spec, directory=directory, exists=exists, modules=modules)
+
+
+def _directory_to_resume(arguments: argparse.Namespace) -> Path | None:
+    """Return the directory of a run that exists, or None if the run has to be started. Raises SettingsError."""
     if arguments.run_dir is None:
         raise SettingsError("--resume needs --run-dir DIR: name the directory of the run to start or to continue")
-    if not (arguments.run_dir / run_directory.CONFIG).exists():
-        return *resolve(arguments), False
-    spec = run_directory.read_config(arguments.run_dir)
-    if (arguments.preset is not None or arguments.env is not None) and resolve(arguments)[0] != spec:
-        raise SettingsError(
-            f"the run in {arguments.run_dir} has other settings: leave out PRESET, --env and all "
-            "settings to continue it, or name another --run-dir"
-        )
-    return spec, arguments.run_dir, True
+    return arguments.run_dir if (arguments.run_dir / run_directory.CONFIG).exists() else None
 
 
 def learner_parser() -> argparse.ArgumentParser:
@@ -143,6 +193,7 @@ def learner_parser() -> argparse.ArgumentParser:
         help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
         "For a supervisor that repeats the same command",
     )
+    add_allow_module(options, "config.toml of an existing run")
     add_tls(options)
     add_insecure(options)
     add_logging(options)

@@ -8,7 +8,8 @@ from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from daedalus.cli.child_output import INHERITED, Streams
+from daedalus.cli.child_output import OpenStreams, Streams, inherited
+from daedalus.cli.processes import STOPPED
 
 _MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
 _SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
@@ -24,11 +25,18 @@ _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THR
 
 
 def start(
-    module: str, *arguments: str, one_thread: bool = False, streams: Streams = INHERITED
+    module: str, *arguments: str, streams: Streams, descriptors: tuple[int, ...] = (), one_thread: bool = False
 ) -> subprocess.Popen[bytes]:
     """Start `python -m module` with a pipe as its standard input.
 
     The pipe closes when this process ends for any reason, and the child process then ends by itself.
+
+    Args:
+      module: the module to run.
+      arguments: its command line.
+      streams: its standard output and standard error.
+      descriptors: file descriptors that it inherits.
+      one_thread: limit the thread pools of its libraries.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
@@ -36,11 +44,16 @@ def start(
         stdout=streams.stdout,
         stderr=streams.stderr,
         env={**os.environ, **_ONE_THREAD} if one_thread else None,
+        pass_fds=descriptors,
     )
 
 
 class FailedError(Exception):
     """Error of a process that failed too often."""
+
+    def __init__(self, name: str, failures: int) -> None:
+        super().__init__(f"{name} failed {failures} times; see the error above")
+        self.name = name
 
 
 @dataclass(slots=True)
@@ -69,7 +82,7 @@ class Supervised:
     def failed_at_once(self) -> bool:
         """Whether the first process failed soon after its start, so that a restart would not help."""
         status = self.process.poll()
-        failed = status is not None and status > 0 and status not in self.ended
+        failed = status is not None and status > 0 and status not in (STOPPED, *self.ended)
         return failed and self.restarts == 0 and time.monotonic() - self._started < _SOON_SECONDS
 
     def check(self) -> str | None:
@@ -87,25 +100,32 @@ class Supervised:
                 return None
             self._start(first=False)
             return f"{self.name} ended before the run; started again"
-        if status > 0:
+        if status > 0 and status != STOPPED:
             lived = now - self._started
             self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
         if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
-            raise FailedError(f"{self.name} failed {self.failures} times; see the error above")
+            raise FailedError(self.name, self.failures)
         self.restarts += 1
         self._start(first=False)
-        how = f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
-        return f"{self.name} {how}; started again"
+        return f"{self.name} {_describe(status)}; started again"
+
+
+def _describe(status: int) -> str:
+    """Return how a process ended that had more to do."""
+    if status == STOPPED:
+        return "was stopped by a signal"
+    return f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
 
 
 def supervised_actor(
-    name: str, connect: str, options: tuple[str, ...] = (), streams: Streams = INHERITED
+    name: str, connect: str, options: tuple[str, ...] = (), open_streams: OpenStreams = inherited
 ) -> Supervised:
     """Start an actor, or the evaluator, under supervision."""
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
         arguments = ["--connect", connect, "--name", name, *options]
-        process = start("daedalus.cli.commands.actor", *arguments, one_thread=True, streams=streams)
+        with open_streams(name) as streams:
+            process = start("daedalus.cli.commands.actor", *arguments, streams=streams, one_thread=True)
         with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
             niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
             os.setpriority(os.PRIO_PROCESS, process.pid, niceness)

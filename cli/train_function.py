@@ -4,17 +4,20 @@ import logging
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from daedalus.cli.child_output import CollectedOutput, Streams
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
-from daedalus.cli.settings_arguments import chosen_settings, named_directory
+from daedalus.cli.settings_arguments import check_environment, chosen_settings, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign, run_spec
+
+_KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
 
 class TrainingError(Exception):
@@ -35,6 +38,7 @@ class RunResult:
     episode_return_mean: float | None  # mean of the newest training episodes; None if none has ended
     evaluation_return_mean: float  # over evaluation.final_episodes episodes of the best policy
     evaluation_return_std: float
+    confirmation_return_mean: float | None  # over new sampled episodes; None unless training stopped at the target
     wall_seconds: float  # training, without the final evaluation
     seconds_to_target: float | None
     env_steps_per_second: float
@@ -74,43 +78,50 @@ def train(
     Raises SettingsError for invalid settings, TrainingError if a process failed.
     """
     started = time.monotonic()
-    chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors)
+    chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap)
     for path, value in (settings or {}).items():
         try:
             assign(chosen, path, value)
         except SettingsError as error:
             raise SettingsError(f"settings {path!r}: {error}") from None
+    check_environment(env, chosen)
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    run_directory.create(directory, spec)
-    end = _run(LocalRun(directory=directory, spec=spec, started=started, wrap=wrap), quiet)
-    return _result(directory, end)
+    with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
+        end = _run(LocalRun(directory=lock.directory, spec=spec, started=started, lock=lock.inheritable), quiet)
+    return _result(lock.directory, end)
 
 
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
-    """Run to the end, and pass the output of the child processes on to this process's streams."""
+    """Run to the end, and pass the output of the child processes on to this process's streams.
 
-    def pass_on(line: str, stream: TextIO) -> None:
+    A notebook shows only what its own process prints, so the child processes cannot write to its streams themselves.
+    """
+    out, err = sys.stdout, sys.stderr  # a notebook replaces these streams for each cell
+    errors: deque[str] = deque(maxlen=_KEPT_ERRORS)
+
+    def write(line: str, stream: TextIO) -> None:
         if not quiet:
-            stream.write(line)
+            stream.write(f"{line}\n")
             stream.flush()
 
+    def write_error(line: str) -> None:
+        errors.append(line)
+        write(line, err)
+
     failure: RunFailedError | None = None
-    out, err = sys.stdout, sys.stderr  # a notebook replaces these streams for each cell
-    output = CollectedOutput(lambda line: pass_on(line, out))
-    errors = CollectedOutput(lambda line: pass_on(line, err))
+    log, records = run.directory / run_directory.OUTPUT, logging.NullHandler() if quiet else logging.StreamHandler(out)
+    output = ChildOutput(log, lambda line: write(line, out), write_error)
     try:
-        streams = Streams(stdout=output.descriptor, stderr=errors.descriptor)
-        with _records_to(logging.NullHandler() if quiet else logging.StreamHandler(out)):
-            return run_locally(run, threading.Event(), streams)
+        with _records_to(records), output:
+            return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
-    finally:
-        output.close()
-        printed = errors.close()
+    if not output.withheld:
+        run_directory.remove_failed(run.directory)
     # A restarted process fails with the same message.
-    reasons = dict.fromkeys(f"{printed}\n{failure}".strip().splitlines())
-    raise TrainingError("\n".join(reasons) or f"the learner ended with status {failure.status}")
+    reasons = dict.fromkeys([*errors, *str(failure).splitlines()])
+    raise TrainingError("\n".join(filter(None, reasons)) or f"the learner ended with status {failure.status}")
 
 
 @contextmanager

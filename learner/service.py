@@ -8,7 +8,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,12 +17,14 @@ from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
+from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
-from daedalus.protocol.messages import Rollout
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
@@ -34,6 +36,9 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
+# Reasons for actors.
+_FINISHED, _STOPPED = "the learner has finished", "the learner was stopped"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
@@ -41,6 +46,7 @@ class Outcome:
 
     solved: bool
     finished: bool  # solved or out of budget; False if the run was stopped before
+    saved: bool  # whether the last checkpoint was saved, or there was nothing to save
     seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
 
 
@@ -58,6 +64,8 @@ class LearnerService:
         *,
         started: float,
         restored: "Checkpoint | None" = None,
+        modules: UserModules = NO_MODULES,
+        certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
         """Construct the service.
 
@@ -70,15 +78,22 @@ class LearnerService:
           open_writers: functions that open the metrics writers.
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
+          modules: modules that may be imported for the policy.
+          certificate_days_left: function that returns the days until the certificate of this process expires.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
-        self._open_writers, self._restored = open_writers, restored
+        self._open_writers, self._restored, self._modules = open_writers, restored, modules
         self._counters = RunCounters(spec.training.target_episodes)
+        self._annealing = Annealing(budget=spec.training.env_steps)
         if restored is not None:
             self._counters.restore(restored.counters)
+            self._annealing = _resumed_annealing(restored, spec)
         epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
-        self._health = Health(started=started, updated=started, actor_seen=started)
+        self._heartbeat = Heartbeat(directory)
+        self._health = Health(
+            started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
+        )
         self._server = ActorServer(
             directory.name,
             spec,
@@ -95,6 +110,7 @@ class LearnerService:
             spec,
             epoch,
             counters=self._counters,
+            annealing=self._annealing,
             fleet=self._server.fleet,
             lock=self._server.lock,
             evaluations=self._evaluations,
@@ -113,16 +129,23 @@ class LearnerService:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop)
+            spaces = self._server.await_spaces(self._stop, self._heartbeat.beat)
             if spaces is None:
-                return Outcome(solved=False, finished=False, seconds_to_target=None)
-            learner = Learner(self._spec.training, self._spec.policy, spaces)
+                _logger.info("stopped before the first actor joined")
+                return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
+            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
+                if learner.learning_rate(self._annealing.at(self._counters.env_steps)) == 0.0:
+                    _logger.warning(
+                        "the learning rate has been annealed to 0: the policy changes no more; "
+                        "start a new run with the larger budget"
+                    )
             return self._learn(learner, self._checkpointer(learner))
         finally:
-            self._close_server()
+            self._server.close(_STOPPED)  # unless it is closed
+            self._heartbeat.clear()
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
         """Publish the policy and return its checkpointer."""
@@ -144,22 +167,35 @@ class LearnerService:
         )
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer") -> Outcome:
-        """Run the main loop, then write the last metrics row, checkpoint and summary."""
+        """Run the main loop, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
+        finished, saved = False, None
         try:
             seconds_to_target = self._loop(learner, checkpointer, recorder)
+            finished = self._is_finished(seconds_to_target)
         finally:
             ended = time.monotonic()
-            self._close_server()
+            self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
             recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
             recorder.close()
-            checkpointer.save()
+            saved = checkpointer.save()
         solved = seconds_to_target is not None
-        out_of_budget = self._counters.env_steps >= self._spec.training.env_steps
-        finished = out_of_budget or (solved and self._spec.training.stop_when_solved)
         self._write_summary(solved, finished, seconds_to_target, ended)
-        return Outcome(solved=solved, finished=finished, seconds_to_target=seconds_to_target)
+        env_steps = f"{self._counters.env_steps:,} env_steps"
+        if finished:
+            self._server.await_departures(self._stop)
+        elif saved is not None:
+            _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
+        else:
+            _logger.error("stopped; the checkpoint at %s could not be saved: %s", env_steps, self._health.save_fault)
+        return Outcome(solved=solved, finished=finished, saved=saved is not None, seconds_to_target=seconds_to_target)
+
+    def _is_finished(self, seconds_to_target: float | None) -> bool:
+        """Return whether the run is over, rather than stopped."""
+        training = self._spec.training
+        solved = seconds_to_target is not None
+        return self._counters.env_steps >= training.env_steps or (solved and training.stop_when_solved)
 
     def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
         """Train until the run ends. Return the seconds until the target was reached, or None if it was not."""
@@ -168,6 +204,7 @@ class LearnerService:
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+            self._heartbeat.beat()
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._counters.reached(training.target_return):
@@ -178,6 +215,8 @@ class LearnerService:
             if now >= log_at:
                 recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
                 log_at = now + service.log_seconds
+                if hint := self._reporter.hint():
+                    _logger.warning("%s", hint)
             if now >= save_at:
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds
@@ -185,26 +224,21 @@ class LearnerService:
 
     def _update(self, learner: "Learner") -> None:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
-        progress = self._counters.env_steps / self._spec.training.env_steps
+        progress = self._annealing.at(self._counters.env_steps)
         rollouts = self._server.rollouts.take_batch(learner.policy_version)
         self._health.left_out = self._server.rollouts.left_out
         if not rollouts:
             return
         skipped = learner.updates_skipped
-        at_fault = learner.step(rollouts, progress)
+        left_out = learner.step(rollouts, progress)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
-        self._server.rollouts.count_trained(rollouts, at_fault)
+        self._server.rollouts.count_trained(rollouts, left_out)
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
-        fault = _gradient_fault(at_fault) if skipped else ""
         if skipped and not self._health.gradient_fault:
-            _logger.warning("update skipped: %s; the weights are unchanged", fault)
-        self._health.gradient_fault = fault
+            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
+        self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
-
-    def _close_server(self) -> None:
-        stopped = self._stop.is_set()
-        self._server.close("the learner was stopped" if stopped else "the learner has finished")
 
     def _status(self) -> RunStatus:
         return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())
@@ -217,7 +251,7 @@ class LearnerService:
             _logger.warning("summary not written: %s", error.strerror)
 
 
-def _gradient_fault(at_fault: list[Rollout]) -> str:
-    """Return why an update was skipped, with the senders of the rollouts that are at fault."""
-    senders = sorted({rollout.identity.actor for rollout in at_fault})
-    return "the gradient is not finite" + (f" with rollouts of {', '.join(senders[:5])}" if senders else "")
+def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:
+    """Return the annealing of a run that continues from a checkpoint, perhaps with another budget."""
+    saved = restored.counters.get("annealing", {"budget": restored.policy.spec.training.env_steps})
+    return Annealing(**saved).resumed(restored.counters["env_steps"], spec.training.env_steps)

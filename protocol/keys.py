@@ -9,18 +9,23 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 ANY_RUN = "*"
 
 
+def is_name(name: str) -> bool:
+    """Return whether `name` can be one chunk of a key."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str, what: str) -> str:
     """Return `name` if it can be one chunk of a key. Raises ValueError, which names `what` it is, otherwise."""
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ValueError(
             f"{what} {name!r} must be 1 to 64 letters, digits, '.', '_' or '-', starting with a letter or digit"
         )
     return name
 
 
-def join(run: str) -> str:
-    """Return the key of the queries by which actors join."""
-    return f"daedalus/{run}/join"
+def join(run: str, actor: str) -> str:
+    """Return the key of the queries by which an actor joins (`*` for all actors)."""
+    return f"daedalus/{run}/join/{actor}"
 
 
 def program(run: str, program_hash: str) -> str:
@@ -41,6 +46,11 @@ def evaluations(run: str, evaluator: str) -> str:
 def snapshots(run: str) -> str:
     """Return the key where snapshots are published, and where the newest is queried."""
     return f"daedalus/{run}/snapshots"
+
+
+def run_end(run: str) -> str:
+    """Return the key where the learner publishes that it ends."""
+    return f"daedalus/{run}/end"
 
 
 def presence(run: str, actor: str, incarnation: int | str) -> str:
@@ -64,8 +74,21 @@ def status(run: str) -> str:
     return f"daedalus/{run}/status"
 
 
+def intersection(served: str, queried: str) -> str:
+    """Return the key of a query to a server: where the query has `*`, the chunk that is served.
+
+    Where both have `*`, it stays. A query with `**`, which nobody of ours sends, has the served key.
+    """
+    if "*" not in queried:
+        return queried
+    ours, theirs = served.split("/"), queried.split("/")
+    if len(ours) != len(theirs):
+        return served
+    return "/".join(mine if "*" in other else other for mine, other in zip(ours, theirs, strict=True))
+
+
 def last_chunk(key: str) -> str:
-    """Return the last chunk: the actor's name in a rollouts key, the evaluator's in an evaluations key."""
+    """Return the last chunk: the actor's name in a join or rollouts key, the evaluator's in an evaluations key."""
     return key.rsplit("/", 1)[-1]
 
 

@@ -6,14 +6,17 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 Time first: row t holds observation t, the action chosen from it and the reward that action earned.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
+
+MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +94,8 @@ class Rollout:
     valid: np.ndarray  # [T, E] bool, False where the environment only reset
     episode_returns: np.ndarray  # [K] float32, unscaled undiscounted returns of the episodes that ended in this rollout
     episode_lengths: np.ndarray  # [K] int32, their env_steps
+    # By name [n] float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
+    episode_info: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.rewards.ndim != 2:
@@ -118,6 +123,19 @@ class Rollout:
             raise ValueError("episode_returns and episode_lengths must both be [K]")
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
+        self._check_episode_info()
+
+    def _check_episode_info(self) -> None:
+        if len(self.episode_info) > MAX_INFO_NAMES:
+            raise ValueError(f"episode_info has {len(self.episode_info)} names, at most {MAX_INFO_NAMES} are allowed")
+        most = min(len(self.episode_returns), MAX_INFO_VALUES)
+        for name, values in self.episode_info.items():
+            check_name(name, "the name in episode_info")
+            if values.ndim != 1 or values.dtype != np.float32 or not 1 <= len(values) <= most:
+                raise ValueError(
+                    f"episode_info {name!r} must be float32 [n], with n from 1 to {most}, "
+                    f"not {values.dtype} {values.shape}"
+                )
 
     def _check_dtypes(self) -> None:
         masks = {f"masks/{name}": mask for name, mask in self.masks.items()}
@@ -177,16 +195,19 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotRequest:
-    """Request of an actor on a slow link for one part of a CompactSnapshot. Actor -> learner, on `snapshots`.
+    """Request of an actor for the newest snapshot. Actor -> learner, on `snapshots`.
 
-    The request for part 0 makes the learner encode its newest snapshot as differences to `held_version`; the requests
-    for the other parts give the policy version of that snapshot.
+    If `compact` is false, the answer is the newest Snapshot, or a Refusal `not_ready` if the actor holds it.
+    If `compact` is true, the answer is one part of a CompactSnapshot, for a slow link. The request for part 0 makes the
+    learner encode its newest snapshot as differences to `held_version`; the requests for the other parts give the
+    policy version of that snapshot.
     """
 
     actor: str
     held_version: int | None  # the version that the actor holds; None: no version
     policy_version: int | None = None  # of the snapshot; None: the newest
     part: int = 0
+    compact: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,17 +273,36 @@ class EvaluationReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunEnded:
-    """The run is over and actors end. Learner -> actors, on `snapshots`."""
+    """The learner ends. Learner -> actors and evaluators, on `end`.
+
+    finished: the run is over, and actors leave.
+    stopped: the run is not over, and actors wait for the learner to return.
+    """
 
     learner_epoch: int
+    outcome: Literal["finished", "stopped"]
     reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
-    """State of the run and its actors, in answer to a `status` query."""
+    """State of the run and its first actors, in answer to a `status` query without payload."""
 
     status: RunStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsRequest:
+    """Request of an operator for the next actors of the status. Operator -> learner, on `status`."""
+
+    after: str  # the last name that the operator has
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsReport:
+    """The actors with the next names, in answer to an ActorsRequest; none after the last."""
+
+    page: ActorsPage
 
 
 Message = (
@@ -280,4 +320,6 @@ Message = (
     | EvaluationReport
     | RunEnded
     | StatusReport
+    | ActorsRequest
+    | ActorsReport
 )

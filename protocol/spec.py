@@ -6,6 +6,7 @@ reference of all settings. This file does not know where a specification comes f
 line) or how it is used.
 """
 
+import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, JsonValue, model_validator
@@ -16,6 +17,15 @@ from daedalus.protocol.specification import NaturalInt, PositiveInt, Specificati
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
 FrameStackSize = Annotated[int, Field(ge=1, le=16)]
+_OBJECT = r"\w+(\.\w+)*:\w+"  # module:name
+
+
+def _check_environment_id(value: str) -> str:
+    # It may come from a peer, and messages show it and suggest its module.
+    module, colon, name = value.rpartition(":")
+    if not value.isprintable() or not name or (colon and re.fullmatch(r"\w+(\.\w+)*", module) is None):
+        raise ValueError("must be an id, or module:Id for your own")
+    return value
 
 
 class EnvironmentSpec(Specification):
@@ -25,7 +35,7 @@ class EnvironmentSpec(Specification):
     environment's own steps (frames) its action is repeated for.
     """
 
-    id: Annotated[str, Field(min_length=1, max_length=200)]
+    id: Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_check_environment_id)]
     """Environment to play: a gymnasium id, `module:Id` for your own, or the backend's own name."""
     backend: Backend = "gymnasium"
     """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer."""
@@ -35,6 +45,8 @@ class EnvironmentSpec(Specification):
     """Run each environment in its own process, for slow environments. The gymnasium backend only."""
     max_episode_steps: PositiveInt | None = None
     """Truncate episodes after this many of the environment's own steps. Unset: the environment's own limit."""
+    wrap: Annotated[str, Field(pattern=rf"^{_OBJECT}$", max_length=200)] | None = None
+    """`module:function` of your own that takes each environment and returns the one to play. Gymnasium backend only."""
 
     action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
     """Discrete actions over a continuous action space: one row for each choice, the values of one action."""
@@ -61,6 +73,12 @@ class EnvironmentSpec(Specification):
     bootstrap_terminations: bool = False
     """Bootstrap at terminations as if they were truncations."""
 
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        named = {"environment.id": self.id, "environment.wrap": self.wrap}
+        return {setting: value for setting, value in named.items() if value is not None and ":" in value}
+
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
         """Return the environment for evaluations: without `no_reward_limit`, on another backend if one is named."""
         return self.model_copy(update={"no_reward_limit": None, "backend": backend or self.backend})
@@ -69,8 +87,11 @@ class EnvironmentSpec(Specification):
 class PolicySpec(Specification):
     """Network: an encoder, an optional memory, then a policy head and a value head."""
 
-    encoder: Annotated[str, Field(pattern=r"^(mlp|small|nature|impala|article|[\w.]+:\w+)$", max_length=200)] = "mlp"
-    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own."""
+    encoder: Annotated[str, Field(pattern=rf"^(auto|mlp|small|nature|impala|article|{_OBJECT})$", max_length=200)] = (
+        "auto"
+    )
+    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own. `auto`:
+    `nature` for images, `impala` for images smaller than 36 pixels, `mlp` for everything else."""
     hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)
     """Units of each hidden layer; the `mlp` encoder only."""
     activation: Literal["tanh", "relu"] = "tanh"
@@ -100,6 +121,12 @@ class PolicySpec(Specification):
         if self.separate_value_encoder and self.memory != "none":
             raise ValueError("policy.separate_value_encoder needs policy.memory=none: the memory is shared")
         return self
+
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        named = {"policy.encoder": self.encoder, "policy.distribution": self.distribution}
+        return {name: value for name, value in named.items() if ":" in value}
 
 
 class CollectionSpec(Specification):
@@ -159,7 +186,7 @@ class TrainingSpec(Specification):
     entropy_bonus: Annotated[float, Field(ge=0.0)] = 0.01
     """Weight of the policy's entropy."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
-    """Anneal the entropy bonus to this value over the budget. Unset: constant."""
+    """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
     normalize_rewards: bool = False
     """Divide rewards by the running standard deviation of the discounted return, so that values are near one."""
     normalize_advantages: bool = False
@@ -170,7 +197,7 @@ class TrainingSpec(Specification):
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
     """Learning rate at the start."""
     learning_rate_final: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Anneal the learning rate to this value over the budget. Unset: constant."""
+    """Anneal the learning rate linearly to this value over the budget. Unset: constant."""
     optimizer_epsilon: Annotated[float, Field(gt=0.0)] = 1e-5
     """Epsilon of the optimiser."""
     rmsprop_decay: UnitInterval = 0.99
@@ -212,6 +239,9 @@ class EvaluationSpec(Specification):
     """Episodes of each evaluation during training."""
     actions: Literal["greedy", "sampled"] = "greedy"
     """Actions of evaluations: the most probable, or sampled as in training."""
+    max_episode_env_steps: PositiveInt = 27_000
+    """Cut episodes of evaluations after this many env_steps, and report how many were cut: the environment may never
+    end them. The default is Atari's half an hour, at four frames a step."""
     final_episodes: Annotated[int, Field(ge=1, le=10_000)] = 100
     """Episodes of the evaluation of the best policy after training."""
     final_backend: Backend | None = None
@@ -271,6 +301,22 @@ class RunSpec(Specification):
                 f"collection.rollout_length is {rows}, make it at least {stack}"
             )
         return self
+
+    @model_validator(mode="after")
+    def _wrapped_environments_are_gymnasiums(self) -> "RunSpec":
+        backends = {
+            "environment.backend": self.environment.backend,
+            "evaluation.final_backend": self.evaluation.final_backend,
+        }
+        for setting, backend in backends.items():
+            if self.environment.wrap is not None and backend not in (None, "gymnasium"):
+                raise ValueError(f"environment.wrap needs gymnasium's environments: {setting} is {backend}")
+        return self
+
+    @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        return {**self.environment.user_modules, **self.policy.user_modules}
 
     @property
     def algorithm(self) -> AlgorithmRecord:

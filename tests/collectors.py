@@ -3,6 +3,7 @@
 from unittest import mock
 
 import numpy as np
+from allowed_modules import TEST_MODULES
 
 from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
@@ -26,7 +27,7 @@ def started_collector(
 ) -> EnvironmentCollector:
     """A collector at the start of its first rollout; it steps `environments` instead of its own if they are given."""
     run = RunSpec(environment=spec, collection=CollectionSpec(envs_per_actor=count, rollout_length=rollout_length))
-    collector = EnvironmentCollector()
+    collector = EnvironmentCollector(modules=TEST_MODULES)
     if environments is None:
         collector.prepare(run)
     else:

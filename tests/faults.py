@@ -13,6 +13,7 @@ import numpy as np
 from plain import vector_spaces
 
 from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -160,7 +161,8 @@ class Sender:
         self.name, self.environments, self.incarnation = name, environments, secrets.randbits(62)
         self._queries = LearnerQueries(self.transport)
         join = Join(actor=name, incarnation=self.incarnation, spaces=CARTPOLE, environments=environments)
-        self.welcome: Welcome = self._queries.join_learner(keys.ANY_RUN, join, ANSWER_SECONDS, threading.Event())
+        end = RunEndWatch(self.transport, threading.Event())
+        self.welcome: Welcome = self._queries.join_learner(keys.ANY_RUN, join, ANSWER_SECONDS, end)
         self.transport.declare_presence(keys.presence(self.welcome.run, name, self.incarnation))
         self.key = keys.rollouts(self.welcome.run, name)
 

@@ -89,3 +89,13 @@ def processes_mentioning(text: str) -> list[int]:
             if text.encode() in command:
                 found.append(int(entry.name))
     return found
+
+
+def listening_ports(pid: int) -> list[int]:
+    """Return the TCP ports where a process listens."""
+    own = {os.readlink(entry) for entry in Path(f"/proc/{pid}/fd").iterdir() if entry.is_symlink()}
+    lines = [
+        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/{pid}/net/{name}").read_text().splitlines()
+    ]
+    listening = [words for words in lines if words[3] == "0A" and f"socket:[{words[9]}]" in own]
+    return [int(words[1].rpartition(":")[2], 16) for words in listening]

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from allowed_modules import TEST_MODULES
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.training.checkpoint import save_checkpoint
@@ -35,7 +36,7 @@ def save(
     **spec: Any,
 ) -> Path:
     """Save a run with checkpoints of one untrained policy that takes all actions; return the run directory."""
-    made = make_environments(environment, 1)
+    made = make_environments(environment, 1, modules=TEST_MODULES)
     made.close()
     run_spec = RunSpec.model_validate({"policy": {"hidden": (16,)}, **spec, "environment": environment})
     learner = Learner(run_spec.training, run_spec.policy, spaces or made.spaces)

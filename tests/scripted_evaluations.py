@@ -6,6 +6,7 @@ import threading
 from typing import Any
 
 import numpy as np
+from allowed_modules import TEST_MODULES
 from plain import vector_spaces
 from processes import LIMIT
 
@@ -33,10 +34,10 @@ from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
-def run_spec(seconds: float = 0.001, episodes: int = 2) -> RunSpec:
+def run_spec(seconds: float = 0.001, episodes: int = 2, **environment: Any) -> RunSpec:
     return RunSpec.model_validate(
         {
-            "environment": {"id": "counting_environment:Counting-v0"},
+            "environment": {"id": "counting_environment:Counting-v0", **environment},
             "evaluation": {"seconds": seconds, "episodes": episodes},
         }
     )
@@ -59,7 +60,7 @@ class ScriptedLearner:
         self.transport.serve(keys.evaluations("r", "*"), self.received.put)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
-        self.transport.serve(keys.join("r"), self._join)
+        self.transport.serve(keys.join("r", "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
@@ -103,7 +104,7 @@ class RunningEvaluator:
     def __init__(self, network: MemoryNetwork, timeout: float | None = None) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
-        config = ActorConfig(name="e", incarnation=7, timeout=timeout)
+        config = ActorConfig(name="e", incarnation=7, timeout=timeout, modules=TEST_MODULES)
         self._evaluator = Evaluator(config, MemoryTransport(network), self.stop)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

@@ -65,11 +65,12 @@ class ScriptedLearner:
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.transport.declare_presence(keys.learner("r"))
         self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
         self.transport.serve(keys.snapshots("r"), self._newest)
         self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.serve(keys.join("r"), self._join)
+        self.transport.serve(keys.join("r", "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
@@ -84,7 +85,12 @@ class ScriptedLearner:
             return
         message = decode(request.payload, Limits())
         assert isinstance(message, SnapshotRequest)
-        request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+        if message.compact:
+            request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+            return
+        self.fetches.append(message)
+        if self.snapshot:  # otherwise the answer is lost
+            request.reply(self.snapshot)
 
     def _program(self, request: Request) -> None:
         model = self.policy.model
@@ -117,6 +123,8 @@ class RunningActor:
         timeout: float | None = None,
         link: LinkChoice = "auto",
         collector: Collector | None = None,
+        *,
+        begin: bool = True,
     ) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
@@ -124,6 +132,10 @@ class RunningActor:
         config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
         self._service = ActorService(config, self.transport, self.stop, collector)
         self._thread = threading.Thread(target=self._run, daemon=True)
+        if begin:
+            self.begin()
+
+    def begin(self) -> None:
         self._thread.start()
 
     def _run(self) -> None:

@@ -104,6 +104,7 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
     lines = str(failed.value).splitlines()
     assert lines[0].startswith("daedalus actor: unknown environment 'CartPole-v9'")
     assert len(lines) == len(set(lines))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -204,7 +205,9 @@ def test_the_pretrained_policy_plays_gymnasiums_car_racing() -> None:
 
 def test_stacked_frames_are_cleared_by_reset(tmp_path: Path) -> None:
     save(tmp_path, COUNTING, 1)
-    policy = daedalus.load_policy(tmp_path)
+    with pytest.raises(EnvironmentSetupError, match=r"pass allow_modules=\['counting_environment'\]"):
+        daedalus.load_policy(tmp_path)
+    policy = daedalus.load_policy(tmp_path, allow_modules=["counting_environment"])
     space = policy.observation_space
     observations = [space.sample() for _ in range(5)]
     actions = [policy.act(observation) for observation in observations]

@@ -1,7 +1,7 @@
 """Rules of Zenoh's access control: what each role may do on an untrusted network, by the names in certificates.
 
 Everything that these rules do not allow is denied. Plain TCP connections have full access: a router accepts them on
-loopback only (transport/addresses.py). Pure functions.
+loopback only (transport/addresses.py). So have connections over a Unix socket. Pure functions.
 """
 
 from collections.abc import Iterable
@@ -41,7 +41,7 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     ]
     subjects: list[dict[str, Any]] = [
         {"id": "learner and routers", "cert_common_names": [common_name("learner"), common_name("router")]},
-        {"id": "this machine", "link_protocols": ["tcp"]},
+        {"id": "this machine", "link_protocols": ["tcp", "unixsock-stream"]},
     ]
     policies: list[dict[str, Any]] = [{"rules": ["all"], "subjects": ["learner and routers", "this machine"]}]
     shared = [rule["id"] for rule in _actors_rules()]
@@ -51,7 +51,7 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     for actor in sorted(actors):
         rules += _own_rules(actor)
         subjects.append({"id": f"actor {actor}", "cert_common_names": [common_name("actor", actor)]})
-        own = [f"{actor} uploads", f"{actor} is present", f"{actor} receives replies"]
+        own = [f"{actor} joins and uploads", f"{actor} is present", f"{actor} receives replies"]
         policies.append({"rules": [*shared, *own], "subjects": [f"actor {actor}"]})
     return {
         "enabled": True,
@@ -73,15 +73,16 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 
 
 def _actors_rules() -> list[dict[str, Any]]:
-    """Return the rules of every actor: query `join`, programs, snapshots; subscribe to snapshots; watch the learner."""
-    queried = [keys.join(_RUN), keys.program(_RUN, "*"), keys.snapshots(_RUN)]
-    served = [*queried, keys.rollouts(_RUN, "*"), keys.evaluations(_RUN, "*")]
+    """Return the rules of every actor: query programs and snapshots; subscribe; watch the learner."""
+    queried = [keys.program(_RUN, "*"), keys.snapshots(_RUN)]
+    published = [keys.snapshots(_RUN), keys.run_end(_RUN)]
+    served = [*queried, *_own_keys("*")]
     return [
         _rule("actors query", ["ingress"], ["query"], queried),
         _rule("actors receive replies", ["egress"], ["reply"], queried),
         _rule("actors discover queryables", ["egress"], ["declare_queryable"], served),
-        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], [keys.snapshots(_RUN)]),
-        _rule("actors receive snapshots", ["egress"], ["put"], [keys.snapshots(_RUN)]),
+        _rule("actors subscribe", ["ingress"], ["declare_subscriber"], published),
+        _rule("actors receive publications", ["egress"], ["put"], published),
         _rule(
             "actors watch the learner",
             ["ingress"],
@@ -92,12 +93,17 @@ def _actors_rules() -> list[dict[str, Any]]:
     ]
 
 
+def _own_keys(name: str) -> list[str]:
+    """Return the keys of the queries that only the actor or evaluator `name` may send."""
+    return [keys.join(_RUN, name), keys.rollouts(_RUN, name), keys.evaluations(_RUN, name)]
+
+
 def _own_rules(actor: str) -> list[dict[str, Any]]:
     """Return the rules of one actor for its own name and for `NAME.anything`: one certificate serves a whole host."""
     names = [actor, f"{actor}.$*"]
-    sent = [key for name in names for key in (keys.rollouts(_RUN, name), keys.evaluations(_RUN, name))]
+    sent = [key for name in names for key in _own_keys(name)]
     return [
-        _rule(f"{actor} uploads", ["ingress"], ["query"], sent),
+        _rule(f"{actor} joins and uploads", ["ingress"], ["query"], sent),
         _rule(f"{actor} receives replies", ["egress"], ["reply"], sent),
         _rule(
             f"{actor} is present", ["ingress"], ["liveliness_token"], [keys.presence(_RUN, name, "*") for name in names]

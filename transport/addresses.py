@@ -1,8 +1,16 @@
-"""Checks of network addresses: traffic beyond loopback must be encrypted and authenticated. Pure functions."""
+"""Checks of network addresses: traffic that others can reach must be encrypted and authenticated.
+
+tcp/HOST:PORT                everybody who can reach the address; on loopback, every user of this machine
+tls/HOST:PORT                holders of certificates
+unixsock-stream/PATH         a Unix socket: processes that may enter its folder
+"""
 
 import ipaddress
+import os
+import stat
 
-_PROTOCOLS = ("tcp", "tls")
+_SOCKET = "unixsock-stream"
+_MAX_PATH_BYTES = 98  # a socket's path has at most 104 bytes on macOS (108 on Linux), and Zenoh appends ".lock"
 
 
 class AddressError(Exception):
@@ -13,12 +21,14 @@ def check_listening(endpoints: list[str], *, tls: bool, insecure: bool) -> None:
     """Raise AddressError for a malformed address, or one where unauthenticated processes could connect.
 
     Args:
-      endpoints: `tcp/HOST:PORT` or `tls/HOST:PORT`.
+      endpoints: see above.
       tls: whether the process has a certificate.
       insecure: whether the user allows plain TCP beyond loopback.
     """
     for endpoint in endpoints:
         protocol, host = _parts(endpoint)
+        if protocol == _SOCKET:
+            _check_folder(endpoint, os.path.dirname(host))
         if protocol == "tls" and not tls:
             raise AddressError(f"{endpoint} needs certificates: --tls DIR (create them with daedalus certs)")
         if protocol == "tcp" and not insecure and not _is_loopback(host):
@@ -35,16 +45,51 @@ def check_connecting(endpoints: list[str], *, tls: bool) -> None:
         protocol, _ = _parts(endpoint)
         if protocol == "tls" and not tls:
             raise AddressError(f"{endpoint} needs certificates: --tls DIR")
-        if protocol == "tcp" and tls:
+        if protocol != "tls" and tls:
             raise AddressError(f"{endpoint} is not a TLS address: with --tls the address must begin with tls/")
 
 
+def socket_path(endpoint: str) -> str | None:
+    """Return the path of a Unix socket's address, or None for another address."""
+    protocol, _, path = endpoint.partition("/")
+    return path if protocol == _SOCKET else None
+
+
+def socket_address(path: str) -> str:
+    """Return the address of a Unix socket."""
+    return f"{_SOCKET}/{path}"
+
+
+def is_socket_path(path: str) -> bool:
+    """Return whether a Unix socket can have this path."""
+    return path.startswith("/") and len(os.fsencode(path)) <= _MAX_PATH_BYTES
+
+
 def _parts(endpoint: str) -> tuple[str, str]:
+    """Return the protocol, and the host or path."""
     protocol, slash, rest = endpoint.partition("/")
+    if protocol == _SOCKET:
+        if not is_socket_path(rest):
+            raise AddressError(
+                f"{endpoint!r} is not an address: write {_SOCKET}/PATH with an absolute path of at most "
+                f"{_MAX_PATH_BYTES} bytes"
+            )
+        return protocol, rest
     host, colon, port = rest.rpartition(":")
-    if not slash or protocol not in _PROTOCOLS or not colon or not host or not port.isdecimal() or int(port) > 65535:
+    known = protocol in ("tcp", "tls")
+    if not slash or not known or not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise AddressError(f"{endpoint!r} is not an address: write tcp/HOST:PORT or tls/HOST:PORT")
     return protocol, host.strip("[]")
+
+
+def _check_folder(endpoint: str, folder: str) -> None:
+    """Raise AddressError if other users may enter the folder of a socket."""
+    try:
+        found = os.stat(folder)
+    except OSError as error:
+        raise AddressError(f"{endpoint}: {folder}: {error.strerror}") from None
+    if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) & 0o077:
+        raise AddressError(f"{endpoint} is open to other users of this machine: its folder must be yours and mode 700")
 
 
 def _is_loopback(host: str) -> bool:

@@ -66,16 +66,16 @@ class Credentials:
 
         Raises CredentialsError if the certificate is not readable.
         """
-        try:
-            modified = (self.directory / CERTIFICATE).stat().st_mtime_ns
-        except OSError:
-            raise CredentialsError(f"{self.directory} has no {CERTIFICATE}") from None
-        return (_expiry(self.directory, modified) - time.time()) / _DAY
+        return (_validity(self.directory)[1] - time.time()) / _DAY
 
     def warn_of_expiry(self) -> None:
-        """Log a warning if the certificate expires soon. Raises CredentialsError if it is not readable."""
+        """Log a warning in the last 30 days of a certificate, or in the last third of a short-lived one.
+
+        Raises CredentialsError if it is not readable.
+        """
+        begins, ends = _validity(self.directory)
         days = self.days_left()
-        if 0 <= days < WARNING_DAYS:
+        if 0 <= days < min(WARNING_DAYS, (ends - begins) / _DAY / 3):
             _logger.warning(
                 "the certificate in %s expires in %d days: renew it (daedalus certs renew)", self.directory, days
             )
@@ -138,14 +138,23 @@ def _described(role: str, name: str) -> str:
 
 
 def _expired(directory: Path) -> str:
-    ended = time.gmtime(_expiry(directory, (directory / CERTIFICATE).stat().st_mtime_ns))
+    ended = time.gmtime(_validity(directory)[1])
     return f"the certificate expired on {time.strftime('%Y-%m-%d', ended)}: renew it (daedalus certs renew)"
 
 
+def _validity(directory: Path) -> tuple[float, float]:
+    """Return from when to when the certificate in a folder is valid, in seconds since 1970."""
+    try:
+        return _read_validity(directory, (directory / CERTIFICATE).stat().st_mtime_ns)
+    except OSError:
+        raise CredentialsError(f"{directory} has no {CERTIFICATE}") from None
+
+
 @functools.lru_cache(maxsize=16)
-def _expiry(directory: Path, _modified: int) -> float:
-    """Return when a certificate expires, in seconds since 1970. The cache is for a file that does not change."""
-    return ssl.cert_time_to_seconds(str(_verified(directory, ignore_time=True)["notAfter"]))
+def _read_validity(directory: Path, _modified: int) -> tuple[float, float]:
+    certificate = _verified(directory, ignore_time=True)
+    begins, ends = (ssl.cert_time_to_seconds(str(certificate[key])) for key in ("notBefore", "notAfter"))
+    return begins, ends
 
 
 def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import socket
 import ssl
 from typing import NamedTuple
 
+from daedalus.transport.addresses import socket_path
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, KEY, Credentials, with_remedy
 
 _PROBE_SECONDS = 3.0
@@ -18,6 +19,9 @@ class Diagnosis(NamedTuple):
 
 def diagnose_connection(endpoint: str, credentials: Credentials | None) -> Diagnosis:
     """Return why no connection to `endpoint` (PROTOCOL/HOST:PORT) can be made, from a connection attempt."""
+    path = socket_path(endpoint)
+    if path is not None:
+        return Diagnosis(_diagnose_socket(path), False)
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
         link = socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_SECONDS)
@@ -29,6 +33,18 @@ def diagnose_connection(endpoint: str, credentials: Credentials | None) -> Diagn
         if credentials is None or not endpoint.startswith("tls/"):
             return Diagnosis(f"the service at {endpoint} uses another protocol, or requires --tls", False)
         return _diagnose_refusal(link, host, endpoint, credentials)
+
+
+def _diagnose_socket(path: str) -> str:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+        link.settimeout(_PROBE_SECONDS)
+        try:
+            link.connect(path)
+        except PermissionError:
+            return f"{path} belongs to another user"
+        except OSError:
+            return f"nothing answers at {path}"
+    return f"the service at {path} uses another protocol"
 
 
 def _diagnose_refusal(link: socket.socket, host: str, endpoint: str, credentials: Credentials) -> Diagnosis:

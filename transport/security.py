@@ -1,5 +1,6 @@
 """The credentials that an address needs, checked before a socket is opened."""
 
+import contextlib
 from pathlib import Path
 
 from daedalus.transport.addresses import AddressError, check_connecting, check_listening
@@ -18,3 +19,10 @@ def credentials_to_connect(endpoints: list[str], tls: Path | None, *roles: str) 
     """Return the certificate to connect with, or None without `tls`. Raises one of SECURITY_ERRORS."""
     check_connecting(endpoints, tls=tls is not None)
     return None if tls is None else load(tls, *roles)
+
+
+def certificate_days_left(credentials: Credentials | None) -> float | None:
+    """Return the days until a certificate expires, or None without one, or while it is being replaced."""
+    with contextlib.suppress(CredentialsError):
+        return None if credentials is None else credentials.days_left()
+    return None

@@ -94,8 +94,8 @@ class ClientCollector:
         """See Collector."""
         return bool(self._full)
 
-    def collect(self, identity: RolloutIdentity) -> Rollout | None:
-        """See Collector. Return the oldest full rollout."""
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:
+        """See Collector. Return the oldest full rollout. `on_row` has no effect: the caller's loop makes the rows."""
         with self._lock:
             return replace(self._full.popleft(), identity=identity) if self._full else None
 
@@ -193,8 +193,8 @@ class ClientCollector:
 
 
 def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
-    """Raise ActorError for settings that decide when a loop steps or ends, which here belongs to the caller."""
-    defaults = {"action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
+    """Raise ActorError for settings about stepping and wrapping environments: here the loop belongs to the caller."""
+    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
     changed = [
         f"environment.{name}={getattr(spec, name)}"
         for name, default in defaults.items()
@@ -202,6 +202,6 @@ def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
     ]
     if changed:
         raise ActorError(
-            f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop repeats actions and "
-            "ends episodes; start the run without these settings"
+            f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop wraps its "
+            "environment, repeats actions and ends episodes; start the run without these settings"
         )

@@ -1,5 +1,6 @@
 """The interface between an actor's service and whatever produces its rollouts."""
 
+from collections.abc import Callable
 from typing import Protocol
 
 from daedalus.policy.acting.runtime import PolicyRuntime
@@ -30,10 +31,11 @@ class Collector(Protocol):
         """Return whether `collect` would return a rollout now. Safe from any thread."""
         ...
 
-    def collect(self, identity: RolloutIdentity) -> Rollout | None:
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:
         """Return the next rollout, or None if it depends on somebody else and is not complete yet.
 
-        The rollout's arrays are valid until the next call.
+        The rollout's arrays are valid until the next call. While this method makes the rollout, it calls `on_row`
+        before each row; what `on_row` raises ends the rollout.
         """
         ...
 

@@ -1,11 +1,14 @@
 """Rollouts from environments that the actor creates and steps itself. No network, no threads."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -17,14 +20,14 @@ class EnvironmentCollector:
     A rollout's arrays are views of the collector's: encode or copy the rollout before the next `collect`.
     """
 
-    def __init__(self, count: int | None = None, wrap: str | None = None) -> None:
+    def __init__(self, count: int | None = None, modules: UserModules = NO_MODULES) -> None:
         """Create no environments yet.
 
         Args:
           count: E, the number of environments; None: as many as the run specifies.
-          wrap: see make_environments.
+          modules: the modules that may be imported for environments.
         """
-        self._count, self._wrap = count, wrap
+        self._count, self._modules = count, modules
         self._environments: VectorEnvironment | None = None
         self._spec: EnvironmentSpec | None = None  # of the environments
         self._runtime: PolicyRuntime | None = None
@@ -37,7 +40,7 @@ class EnvironmentCollector:
             self.close()
         if self._environments is None:
             count = self._count or spec.collection.envs_per_actor
-            self._environments = make_environments(spec.environment, count, wrap=self._wrap)
+            self._environments = make_environments(spec.environment, count, modules=self._modules)
             self._spec = spec.environment
         return self._environments.spaces, self._environments.count
 
@@ -67,14 +70,15 @@ class EnvironmentCollector:
         """See Collector. `collect` never waits for anybody here."""
         return True
 
-    def collect(self, identity: RolloutIdentity) -> Rollout:
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout:
         """See Collector. Step the environments until the rollout is full."""
         writer, environments = self._writer, self._environments
         assert writer is not None
         assert environments is not None
+        on_row()
         while not writer.record(*environments.step(writer.act())):
-            pass
-        return writer.finish(identity, self._policy_version)
+            on_row()
+        return writer.finish(identity, self._policy_version, environments.take_episode_info())
 
     def close(self) -> None:
         """See Collector. Close the environments."""

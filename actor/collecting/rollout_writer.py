@@ -107,8 +107,13 @@ class RolloutWriter:
         self._row += 1
         return self._row == len(self._rewards)
 
-    def finish(self, identity: RolloutIdentity, policy_version: int) -> Rollout:
-        """Return the full rollout. Its arrays are views: encode or copy it before the next `act`."""
+    def finish(
+        self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
+    ) -> Rollout:
+        """Return the full rollout. Its arrays are views: encode or copy it before the next `act`.
+
+        `episode_info` is that of the environments (VectorEnvironment.take_episode_info).
+        """
         self._row = 0
         if self._reward_clip is not None:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
@@ -131,6 +136,7 @@ class RolloutWriter:
             valid=self._valid,
             episode_returns=finished.returns,
             episode_lengths=finished.lengths,
+            episode_info=episode_info or {},
         )
 
 

@@ -40,6 +40,10 @@ class AleEnvironments:
         observations, rewards, terminated, truncated, _ = self._environment.step(actions)
         return observations[:, 0], rewards, terminated, truncated
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See BackendEnvironments. The `info` of this backend has only numbers of its own, such as frame counts."""
+        return {}
+
     def close(self) -> None:
         """See BackendEnvironments."""
         self._environment.close()

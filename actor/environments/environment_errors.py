@@ -2,8 +2,6 @@
 
 import difflib
 import importlib
-import os
-import sys
 from collections.abc import Collection
 from types import ModuleType
 
@@ -33,16 +31,4 @@ def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
         raise EnvironmentSetupError(
             f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]", '
             "or use another backend (--set environment.backend=gymnasium)"
-        ) from None
-
-
-def import_user_module(module: str, purpose: str) -> ModuleType:
-    """Import a user's module, also from the working directory. Raises EnvironmentSetupError if it cannot be found."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise EnvironmentSetupError(
-            f"{purpose}: cannot import {module} ({error}): install it, or start in the directory that contains it"
         ) from None

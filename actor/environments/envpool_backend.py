@@ -100,6 +100,10 @@ class EnvpoolEnvironments:
         self._ended = terminated | truncated
         return frames, rewards, terminated, truncated
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See BackendEnvironments. The `info` of this backend has only numbers of its own, such as frame counts."""
+        return {}
+
     def close(self) -> None:
         """See BackendEnvironments."""
         if self._pool is not None:

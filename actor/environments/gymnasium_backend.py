@@ -15,12 +15,13 @@ from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     first_line,
     import_extra,
-    import_user_module,
     unknown_environment,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
 Camera = Callable[[np.ndarray], None]
@@ -37,6 +38,7 @@ class GymnasiumEnvironments:
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
+        self._episode_info = EpisodeInfo()
         self.action_mask: Any = None
         if not isinstance(self.action_space, gymnasium.spaces.Box):
             self.reset(0)
@@ -51,7 +53,13 @@ class GymnasiumEnvironments:
         """See BackendEnvironments."""
         observations, rewards, terminated, truncated, info = self._environment.step(actions)
         self.action_mask = info.get(MASK_KEY)
+        if info:
+            self._episode_info.add(info, terminated | truncated)
         return observations, rewards, terminated, truncated
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See BackendEnvironments."""
+        return self._episode_info.take()
 
     def close(self) -> None:
         """See BackendEnvironments."""
@@ -154,25 +162,25 @@ class EnvironmentFactory:
     """A picklable function that creates one environment, here or in a process of its own."""
 
     spec: EnvironmentSpec
-    wrap: str | None = None
+    modules: UserModules = NO_MODULES
     render_mode: str | None = None
     camera: Camera | None = None
     one_episode: bool = False
 
     def __call__(self) -> gymnasium.Env:
         """Return a new environment. Raises whatever the environment raises."""
-        spec, registered = self.spec, registration(self.spec.id)
+        spec, registered = self.spec, registration(self.spec.id, self.modules)
         kwargs = _kwargs(spec)
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
-        late_rendered = registered.entry_point == _CAR_RACING and self.wrap is None
+        late_rendered = registered.entry_point == _CAR_RACING and spec.wrap is None
         environment = gymnasium.make(
             _late_rendered(registered, spec.backend) if late_rendered else registered,
             disable_env_checker=True,  # it costs a tenth of the speed, and warns only authors
             **kwargs,
         )
-        if self.wrap is not None:
-            environment = _wrapped(environment, self.wrap)
+        if spec.wrap is not None:
+            environment = _wrapped(environment, spec.wrap, self.modules)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
         if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
@@ -189,7 +197,7 @@ class EnvironmentFactory:
     def is_plain(self) -> bool:
         """Whether no wrapper is needed, so that the environment's own vector entry point can be used."""
         spec = self.spec
-        wrappers = (spec.no_reward_limit, self.wrap, self.render_mode, self.camera)
+        wrappers = (spec.no_reward_limit, spec.wrap, self.render_mode, self.camera)
         return spec.action_repeat == 1 and not spec.processes and all(wrapper is None for wrapper in wrappers)
 
 
@@ -197,7 +205,7 @@ def make_gymnasium(
     spec: EnvironmentSpec,
     count: int,
     *,
-    wrap: str | None = None,
+    modules: UserModules = NO_MODULES,
     render_mode: str | None = None,
     camera: Camera | None = None,
     one_episode: bool = False,
@@ -206,7 +214,7 @@ def make_gymnasium(
 
     See make_environments for the arguments; `one_episode` is its `for_evaluation`. Raises EnvironmentSetupError.
     """
-    if spec.backend == "fast" and registration(spec.id).entry_point != _CAR_RACING:
+    if spec.backend == "fast" and registration(spec.id, modules).entry_point != _CAR_RACING:
         raise EnvironmentSetupError(
             f"environment.backend=fast supports CarRacing-v3 only, not {spec.id}: "
             "use --set environment.backend=gymnasium"
@@ -215,7 +223,9 @@ def make_gymnasium(
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
     try:
         environment = _make_vector(
-            EnvironmentFactory(spec=spec, wrap=wrap, render_mode=render_mode, camera=camera, one_episode=one_episode),
+            EnvironmentFactory(
+                spec=spec, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
+            ),
             count,
         )
     except EnvironmentSetupError:
@@ -235,11 +245,14 @@ def make_gymnasium(
     return GymnasiumEnvironments(environment)
 
 
-def registration(environment_id: str) -> EnvSpec:
-    """Return gymnasium's registration of `[module:]id`; the module may be in the working directory."""
-    module, _, name = environment_id.rpartition(":")
-    if module:
-        import_user_module(module, f"environment {environment_id}")
+def registration(environment_id: str, modules: UserModules) -> EnvSpec:
+    """Return gymnasium's registration of `[module:]id`; importing the module registers it."""
+    name = environment_id.rpartition(":")[2]
+    if name != environment_id:
+        try:
+            modules.load("environment.id", environment_id)
+        except UserModuleError as error:
+            raise EnvironmentSetupError(str(error)) from error
     elif name.startswith("ALE/"):
         gymnasium.register_envs(import_extra("ale_py", "atari", f"environment {name}"))  # importing it registers them
     try:
@@ -275,7 +288,7 @@ def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:
 
 
 def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
-    spec, registered = factory.spec, registration(factory.spec.id)
+    spec, registered = factory.spec, registration(factory.spec.id, factory.modules)
     # ALE's vector entry point is another environment: it stacks, resizes and clips by itself (see backend=ale).
     if registered.vector_entry_point is not None and registered.namespace != "ALE" and factory.is_plain:
         if not factory.one_episode:
@@ -292,15 +305,18 @@ def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:
     return {**spec.kwargs, **limit}
 
 
-def _wrapped(environment: gymnasium.Env, wrap: str) -> gymnasium.Env:
+def _wrapped(environment: gymnasium.Env, wrap: str, modules: UserModules) -> gymnasium.Env:
     """Return the environment in the user's wrapper `module:function`."""
-    module, _, name = wrap.rpartition(":")
-    function = getattr(import_user_module(module, f"wrap {wrap}"), name, None) if module else None
+    try:
+        function = modules.attribute("environment.wrap", wrap)
+    except UserModuleError as error:
+        raise EnvironmentSetupError(str(error)) from error
     if not callable(function):
-        raise EnvironmentSetupError(f"wrap {wrap}: no such function; name it as module:function")
+        raise EnvironmentSetupError(f"environment.wrap={wrap} is not a function: name it as module:function")
     wrapped = function(environment)
     if not isinstance(wrapped, gymnasium.Env):
         raise EnvironmentSetupError(
-            f"wrap {wrap} returned {type(wrapped).__name__} for {environment}: it must return a gymnasium.Env"
+            f"environment.wrap={wrap} returned {type(wrapped).__name__} for {environment}: "
+            "it must return a gymnasium.Env"
         )
     return wrapped

@@ -56,6 +56,13 @@ class VectorEnvironment(Protocol):
         """
         ...
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """Return scalars of `info` at the ends of the episodes since the last call: name -> [n] float32.
+
+        Empty if the environment reports none, or the backend does not pass them on.
+        """
+        ...
+
     def close(self) -> None:
         """Close the environments. Idempotent."""
         ...
@@ -93,6 +100,10 @@ class BackendEnvironments(Protocol):
 
     def step(self, actions: Any) -> BackendStep:
         """See VectorEnvironment; observations and actions are the environment's own, batched by component."""
+        ...
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See VectorEnvironment."""
         ...
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import BackendEnvironments, VectorEnvironment
 from daedalus.actor.environments.transforms import TransformedEnvironment
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -14,7 +15,7 @@ def make_environments(
     spec: EnvironmentSpec,
     count: int,
     *,
-    wrap: str | None = None,
+    modules: UserModules = NO_MODULES,
     render_mode: str | None = None,
     camera: Callable[[np.ndarray], None] | None = None,
     for_evaluation: bool = False,
@@ -24,7 +25,7 @@ def make_environments(
     Args:
       spec: the environment and its transforms.
       count: E, the number of environments.
-      wrap: `module:function` (gymnasium.Env -> gymnasium.Env), applied to each before the specification's transforms.
+      modules: the modules that may be imported for it.
       render_mode: gymnasium's; "human" opens a window, and a camera needs "rgb_array".
       camera: called with the rendered image [H, W, 3] uint8 after each reset and after every step, repeated ones
         included. Requires count 1.
@@ -32,13 +33,17 @@ def make_environments(
         many environments there are. It need not play another. Environments that share one random generator, because
         gymnasium registers them with a vector entry point only, are reduced to one environment.
 
-    Only the gymnasium backend supports `wrap`, `render_mode` and `camera`.
+    Only the gymnasium backend supports a wrapper, `render_mode` and `camera`.
 
     Raises EnvironmentSetupError; its message is one line.
     """
+    try:
+        modules.check(spec.user_modules)
+    except UserModuleError as error:
+        raise EnvironmentSetupError(str(error)) from None
     if spec.backend != "gymnasium":
-        _refuse_gymnasium_options(spec, {"wrap": wrap, "render_mode": render_mode, "camera": camera})
-    bare, rest = _make_bare(spec, count, wrap, render_mode, camera, for_evaluation)
+        _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
+    bare, rest = _make_bare(spec, count, modules, render_mode, camera, for_evaluation)
     try:
         return TransformedEnvironment(bare, rest)
     except EnvironmentSetupError:
@@ -49,7 +54,7 @@ def make_environments(
 def _make_bare(
     spec: EnvironmentSpec,
     count: int,
-    wrap: str | None,
+    modules: UserModules,
     render_mode: str | None,
     camera: Callable[[np.ndarray], None] | None,
     for_evaluation: bool,
@@ -69,7 +74,7 @@ def _make_bare(
             from daedalus.actor.environments.gymnasium_backend import make_gymnasium
 
             environments = make_gymnasium(
-                spec, count, wrap=wrap, render_mode=render_mode, camera=camera, one_episode=for_evaluation
+                spec, count, modules=modules, render_mode=render_mode, camera=camera, one_episode=for_evaluation
             )
             return environments, spec
 

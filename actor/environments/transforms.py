@@ -141,6 +141,10 @@ class TransformedEnvironment:
         observed = self._transforms.observe(observations, self._environments.action_mask, needed)
         return observed, rewards, terminated, truncated
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        """See VectorEnvironment."""
+        return self._environments.take_episode_info()
+
     def close(self) -> None:
         """See VectorEnvironment."""
         self._environments.close()

@@ -10,10 +10,11 @@ from daedalus.actor.environments.interface import Observed, VectorEnvironment
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec
 
 _MAX_ENVIRONMENTS = 100
 _SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
+_LONGEST = EvaluationSpec().max_episode_env_steps
 _ENVIRONMENTS_PER_PROCESSOR = 4  # if each is a process: enough to keep a processor busy, and few enough to start fast
 
 
@@ -23,6 +24,7 @@ class Evaluation:
 
     returns: np.ndarray  # [episodes] float32, undiscounted and unscaled
     lengths: np.ndarray  # [episodes] int32, env_steps
+    cut: np.ndarray  # [episodes] bool, whether the episode was cut: its return is that of the part that was played
 
 
 def environments_for(episodes: int, spec: EnvironmentSpec | None = None) -> int:
@@ -33,8 +35,16 @@ def environments_for(episodes: int, spec: EnvironmentSpec | None = None) -> int:
     return min(episodes, most)
 
 
-def _no_progress(finished: int, mean: float) -> None:
-    pass
+def cut_note(cut: int, episodes: int, longest: int) -> str:
+    """Return a message about the episodes of an evaluation that were cut."""
+    return (
+        f"{cut} of {episodes} episodes were cut after {longest:,} env_steps (evaluation.max_episode_env_steps): "
+        "if the environment never ends them, set environment.max_episode_steps"
+    )
+
+
+def _no_progress(finished: int, mean: float) -> bool:
+    return False
 
 
 def play_episodes(
@@ -44,7 +54,8 @@ def play_episodes(
     seed: int,
     *,
     sampled: bool,
-    progress: Callable[[int, float], None] = _no_progress,
+    longest: int = _LONGEST,
+    progress: Callable[[int, float], bool] = _no_progress,
 ) -> Evaluation:
     """Play `episodes` episodes and return their results, in the order of their numbers.
 
@@ -60,15 +71,25 @@ def play_episodes(
       episodes: how many to play.
       seed: of the environments and of sampled actions.
       sampled: sample the actions instead of choosing the most probable ones.
+      longest: cut each episode after this many env_steps.
       progress: called after every step with the number of episodes that ended and their mean return (NaN at first).
+        If it returns True, the episodes in progress are cut, and no other begins.
+
+    Returns: the results of the episodes that began.
     """
     environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
     results = _Results(episodes)
     for first in range(0, episodes, environments.count):
         random = _EpisodeNoise(runtime.noise_size, action_seed, first, _rows(environments.count), sampled)
         observed = environments.reset(environment_seed % _SEEDS + first)  # environment e gets this seed + e
-        _play_round(runtime, environments, observed, random, first, results, progress)
-    return Evaluation(returns=results.returns.astype(np.float32), lengths=results.lengths)
+        if not _play_round(runtime, environments, observed, random, first, results, longest, progress):
+            break
+    played = results.lengths > 0
+    return Evaluation(
+        returns=results.returns[played].astype(np.float32),
+        lengths=results.lengths[played],
+        cut=~results.ended[played],
+    )
 
 
 class _EpisodeNoise:
@@ -110,11 +131,12 @@ def _play_round(
     random: _EpisodeNoise,
     first: int,
     results: _Results,
-    progress: Callable[[int, float], None],
-) -> None:
+    longest: int,
+    progress: Callable[[int, float], bool],
+) -> bool:
     """Play episode `first` + e in each environment e, from the first observations on. See play_episodes.
 
-    What an environment does after the end of its episode is ignored.
+    What an environment does after the end of its episode is ignored. Returns False if `progress` asked to stop.
     """
     count = environments.count
     numbers = first + np.arange(count)  # of the episodes
@@ -122,7 +144,7 @@ def _play_round(
     state = np.zeros((count, runtime.state_size), np.float32)
     stacks.push(observed.frames, np.ones(count, np.bool_))
     playing = numbers < len(results.returns)
-    while playing.any():
+    for _ in range(longest):
         actions, state = _act(runtime, stacks.observations, state, random.draw(), observed.masks)
         observed, rewards, terminated, truncated = environments.step(actions)
         stacks.push(observed.frames, np.zeros(count, np.bool_))
@@ -131,7 +153,11 @@ def _play_round(
         ended = playing & (terminated | truncated)
         results.ended[numbers[ended]] = True
         playing &= ~ended
-        progress(int(results.ended.sum()), results.mean_return)
+        if progress(int(results.ended.sum()), results.mean_return):
+            return False
+        if not playing.any():
+            break
+    return True
 
 
 def _act(

@@ -12,8 +12,9 @@ import numpy as np
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import environments_for, play_episodes
-from daedalus.actor.session.learner_queries import LearnerQueries, RunOverError
+from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
+from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
@@ -22,6 +23,7 @@ from daedalus.transport.interface import Transport
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
+_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices the end of the run
 
 
 class Evaluator:
@@ -30,10 +32,12 @@ class Evaluator:
     def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
         """`stop` ends `run`, also in the middle of an episode."""
         self._config, self._stop = config, stop
+        self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
+        self._warned_of_cuts = False
 
-    def run(self) -> None:
-        """Evaluate until `stop` or until the run is over.
+    def run(self) -> bool:
+        """Evaluate until `stop` or until the run is over; return whether the run finished.
 
         Raises ActorError if the evaluator is refused, EnvironmentSetupError if the environment cannot be created here,
         PolicyError if the policy does not run.
@@ -42,13 +46,15 @@ class Evaluator:
         try:
             while True:
                 self._evaluate_learner(
-                    self._queries.join_learner(self._config.run, join, self._config.timeout, self._stop)
+                    self._queries.join_learner(self._config.run, join, self._config.timeout, self._end)
                 )
         except RunOverError as error:
             _logger.info("%s", error)
+            return error.finished
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
+        self._end.follow(welcome.run, welcome.learner_epoch)
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes
@@ -58,12 +64,12 @@ class Evaluator:
         )
         environment = spec.environment.as_evaluated()
         count = environments_for(episodes, environment)
-        environments = make_environments(environment, count, wrap=self._config.wrap, for_evaluation=True)
+        environments = make_environments(environment, count, modules=self._config.modules, for_evaluation=True)
         try:
             due = time.monotonic() + interval
             for number in itertools.count():
-                if self._stop.wait(max(due - time.monotonic(), 0.0)):
-                    raise RunOverError("stopped")
+                while (now := time.monotonic()) < due:
+                    self._end.wait(min(due - now, _HEARTBEAT_SECONDS))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])
@@ -74,7 +80,7 @@ class Evaluator:
 
     def _evaluate(self, welcome: Welcome, environments: VectorEnvironment, seed: int) -> bool:
         """Request a policy, evaluate it and report; return False if the learner is gone."""
-        snapshot = self._queries.evaluation_snapshot(welcome.run, self._config.name, self._stop)
+        snapshot = self._queries.evaluation_snapshot(welcome.run, self._config.name, self._end)
         if not isinstance(snapshot, Snapshot) or snapshot.learner_epoch != welcome.learner_epoch:
             return False
         program = self._queries.program(welcome.run, snapshot.program)
@@ -89,9 +95,13 @@ class Evaluator:
             wanted.episodes,
             seed,
             sampled=wanted.actions == "sampled",
-            progress=self._raise_if_stopped,
+            longest=wanted.max_episode_env_steps,
+            progress=self._raise_if_ended,
         )
         _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
+        if evaluation.cut.any() and not self._warned_of_cuts:
+            self._warned_of_cuts = True
+            _logger.warning("%s", cut_note(int(evaluation.cut.sum()), wanted.episodes, wanted.max_episode_env_steps))
         self._queries.report_evaluation(
             welcome.run,
             EvaluationReport(
@@ -101,11 +111,11 @@ class Evaluator:
                 returns=evaluation.returns,
                 lengths=evaluation.lengths,
             ),
-            self._stop,
+            self._end,
         )
         return True
 
-    def _raise_if_stopped(self, _finished: int, _mean: float) -> None:
-        """End an evaluation on `stop`, in the middle of an episode: called after every step."""
-        if self._stop.is_set():
-            raise RunOverError("stopped")
+    def _raise_if_ended(self, _finished: int, _mean: float) -> bool:
+        """End an evaluation with the run or on `stop`, in the middle of an episode: called after every step."""
+        self._end.check()
+        return False

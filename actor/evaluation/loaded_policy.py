@@ -1,6 +1,7 @@
 """A trained policy for a loop of the caller's own: load it from a run, give it observations, take its actions."""
 
 import copy
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import RunSpec
 
@@ -86,6 +88,7 @@ def load_policy(
     *,
     newest: bool = False,
     pretrained: str | None = None,
+    allow_modules: Collection[str] = (),
     observation_space: gymnasium.Space | None = None,
     action_space: gymnasium.Space | None = None,
 ) -> Policy:
@@ -95,11 +98,14 @@ def load_policy(
       directory: a run directory, or one of its checkpoints; of a run the best checkpoint, else the newest.
       newest: load the newest checkpoint of the run, not the best.
       pretrained: the name of a policy that ships with the package, in place of a directory.
+      allow_modules: modules that may be imported to make the run's environment: those of an environment `module:Id` and
+        of a wrapper `module:function`. Importing a module runs it, and a file named it.
       observation_space, action_space: of the environment to play, if it was changed by wrappers or cannot be made here;
         by default the run's environment is made once to learn its spaces.
 
     Raises DamagedError if there is no checkpoint that can be read, NoPolicyError for an unknown pretrained name,
-    EnvironmentSetupError if the environment cannot be made or is not the one of the run, and ValueError if not exactly
+    EnvironmentSetupError if the environment cannot be made, needs a module that is not allowed or is not the one of the
+    run, and ValueError if not exactly
     one of directory and pretrained is given, or only one of the spaces.
     """
     if (directory is None) == (pretrained is None):
@@ -109,7 +115,14 @@ def load_policy(
     path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
     saved = find_policy(path, newest)
     if observation_space is None or action_space is None:
-        environment = make_gymnasium(as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False}), 1)
+        spec = as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False})
+        modules = UserModules(frozenset(allow_modules), f"the run of {saved.directory}")
+        try:
+            modules.check(spec.user_modules)
+        except ModuleNotAllowedError as error:
+            remedy = f"if you trust that code, pass allow_modules={list(error.modules)}"
+            raise EnvironmentSetupError(f"{error.reason}; {remedy}") from None
+        environment = make_gymnasium(spec, 1, modules=modules)
         environment.close()
         observation_space, action_space = environment.observation_space, environment.action_space
     return Policy(saved, observation_space, action_space)

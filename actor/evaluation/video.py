@@ -65,9 +65,14 @@ class Video:
             raise self._write_error(error) from None
         return self
 
+    @property
+    def is_full(self) -> bool:
+        """Whether the video has its greatest length."""
+        return self._max_seconds is not None and self.frames >= self._max_seconds * self.frames_per_second
+
     def add(self, frame: np.ndarray) -> None:
         """Record one frame [height, width, 3] uint8 RGB."""
-        if self._max_seconds is not None and self.frames >= self._max_seconds * self.frames_per_second:
+        if self.is_full:
             return
         try:
             if self._encoder is None:

@@ -3,9 +3,9 @@
 import contextlib
 import logging
 import queue
-import threading
 import time
 
+from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
@@ -18,7 +18,6 @@ from daedalus.protocol.messages import (
     Message,
     Program,
     Refusal,
-    RunEnded,
     Snapshot,
     Welcome,
 )
@@ -41,13 +40,12 @@ class ActorError(Exception):
 class LearnerLostError(Exception):
     """The learner left, or another learner epoch began; join again."""
 
+    def __init__(self, reason: str = "the learner went away; looking for it again") -> None:
+        super().__init__(reason)
+
 
 class NameInUseError(ActorError):
     """The actor name is in use by another actor, or was in use a moment ago."""
-
-
-class RunOverError(Exception):
-    """The run ended, or the actor was asked to stop; the message says which."""
 
 
 class LearnerQueries:
@@ -56,17 +54,18 @@ class LearnerQueries:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def join_learner(self, run: str, join: Join, timeout: float | None, stop: threading.Event) -> Welcome:
+    def join_learner(self, run: str, join: Join, timeout: float | None, end: RunEndWatch) -> Welcome:
         """Send requests to join until a learner of `run` (`*`: of any run) answers.
 
-        Raises RunOverError on `stop` or if the run is over; ActorError if refused, or after `timeout` seconds without
-        an answer.
+        Raises RunOverError on a local stop or if the run is over; ActorError if refused, or after `timeout` seconds
+        without an answer.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         pause, logged = _FIRST_RETRY_SECONDS, False
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
         while True:
+            end.check()  # a request may take 5 s
             awaited = "a learner"
             try:
                 welcome = self.request_join(run, join)
@@ -85,8 +84,7 @@ class LearnerQueries:
             if not logged and pause >= _MAX_RETRY_SECONDS:
                 _logger.info("waiting for %s", awaited)
                 logged = True
-            if stop.wait(pause):
-                raise RunOverError("stopped")
+            end.wait(pause)
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
                 self._reopen()
@@ -102,8 +100,8 @@ class LearnerQueries:
             pass  # no router now: the present session keeps trying
 
     def request_join(self, run: str, join: Join) -> Welcome | None:
-        """Send one request to join; return None if nobody answers. Raises ActorError or RunOverError if refused."""
-        answers = self._ask(keys.join(run), encode(join))
+        """Send a request to join; return None if no learner is ready. Raises ActorError or RunOverError if refused."""
+        answers = self._ask(keys.join(run, join.actor), encode(join))
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         if len(welcomes) > 1:
             names = ", ".join(sorted(welcome.run for welcome in welcomes))
@@ -113,14 +111,16 @@ class LearnerQueries:
         for refusal in answers:
             if isinstance(refusal, Refusal):
                 if refusal.code == "finished":
-                    raise RunOverError("the run is over")
+                    raise RunOverError("the run is over", finished=True)
+                if refusal.code == "not_ready":  # the learner is stopping; another process may continue the run
+                    return None
                 kind = NameInUseError if refusal.code == "name_taken" else ActorError
                 raise kind(f"the learner refused this actor: {refusal.reason}")
         return None
 
     def learner_responds(self, run: str, join: Join) -> bool:
         """Return whether any learner of `run` answers a request to join, with whatever answer."""
-        return bool(self._ask(keys.join(run), encode(join)))
+        return bool(self._ask(keys.join(run, join.actor), encode(join)))
 
     def program(self, run: str, name: str = "*") -> tuple[str, bytes] | None:
         """Return hash and bytes of the program with that hash (`*`: the current one), or None if nobody has it."""
@@ -136,21 +136,21 @@ class LearnerQueries:
         """Return the answers of the run's learners: the newest Snapshot, or RunEnded."""
         return self._ask(keys.snapshots(run))
 
-    def evaluation_snapshot(self, run: str, evaluator: str, stop: threading.Event) -> Snapshot | None:
+    def evaluation_snapshot(self, run: str, evaluator: str, end: RunEndWatch) -> Snapshot | None:
         """Return the newest snapshot, or None if the learner has none to evaluate.
 
         The learner keeps a checkpoint of the same version until `report_evaluation`. Raises RunOverError if the run is
-        over, or on `stop`.
+        over, or on a local stop.
         """
         request = encode(EvaluationRequest(evaluator=evaluator))
-        answer = self._ask_between_updates(keys.evaluations(run, evaluator), request, stop)
-        if isinstance(answer, RunEnded) or (isinstance(answer, Refusal) and answer.code == "finished"):
-            raise RunOverError("the run is over")
+        answer = self._ask_between_updates(keys.evaluations(run, evaluator), request, end)
+        if isinstance(answer, Refusal) and answer.code == "finished":
+            raise RunOverError("the run is over", finished=True)
         return answer if isinstance(answer, Snapshot) else None
 
-    def report_evaluation(self, run: str, report: EvaluationReport, stop: threading.Event) -> None:
-        """Report a policy's returns to the learner; a rejected report is lost. Raises RunOverError on `stop`."""
-        answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), stop)
+    def report_evaluation(self, run: str, report: EvaluationReport, end: RunEndWatch) -> None:
+        """Report a policy's returns to the learner; a rejected report is lost. Raises as `evaluation_snapshot`."""
+        answer = self._ask_between_updates(keys.evaluations(run, report.evaluator), encode(report), end)
         if isinstance(answer, Acknowledgement) and answer.verdict != "accepted":
             _logger.warning("the learner rejected the evaluation: %s", answer.reason)
 
@@ -167,21 +167,21 @@ class LearnerQueries:
             _logger.warning("ignored a damaged message: %s", error)
             return None
 
-    def _ask_between_updates(self, key: str, payload: bytes, stop: threading.Event) -> Message | None:
+    def _ask_between_updates(self, key: str, payload: bytes, end: RunEndWatch) -> Message | None:
         """Send a query that the learner answers between two updates; return None without an answer.
 
-        Raises RunOverError on `stop`.
+        Raises RunOverError on a local stop or if the run is over.
         """
         answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         try:
             self._transport.query_async(key, payload, timeout=_UPDATE_SECONDS, on_answer=answers.put)
         except TransportError:
             return None
-        while not stop.is_set():
+        while True:
+            end.check()
             with contextlib.suppress(queue.Empty):
                 answer = answers.get(timeout=_HEARTBEAT_SECONDS)
                 return None if answer is None else self.decode(answer)
-        raise RunOverError("stopped")
 
     def _ask(self, key: str, payload: bytes = b"") -> list[Message]:
         try:

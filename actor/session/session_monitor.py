@@ -1,11 +1,11 @@
 """The waits of an actor's thread: for room to send, for snapshots, or for a reason to stop collecting."""
 
-import threading
 import time
 from collections.abc import Callable
 
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries, RunOverError
+from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol.messages import Join
@@ -24,11 +24,11 @@ class SessionMonitor:
         queries: LearnerQueries,
         join: Join,
         lock: StateLock,
-        stop: threading.Event,
+        end: RunEndWatch,
     ) -> None:
-        """`join` is the request that asks whether the learner is there; `stop` ends every wait."""
+        """`join` is the request that asks whether the learner is there."""
         self._uploads, self._presence, self._queries, self._join = uploads, presence, queries, join
-        self._lock, self._stop = lock, stop
+        self._lock, self._end = lock, end
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
         """Wait until `ready` returns True; return False if `timeout` seconds pass first. Raises as `check` does.
@@ -68,24 +68,26 @@ class SessionMonitor:
         Raises RunOverError if the run or the actor is over, ActorError in quarantine, LearnerLostError if the learner
         left or does not accept rollouts of this learner epoch any more.
         """
-        if self._stop.is_set():
-            raise RunOverError("stopped")
         with self._lock:
             ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
             left = self._presence.left
+        self._end.check()  # after the presence was read: a learner that finished says so before it leaves
         if ended_by == "quarantined":
             raise ActorError(f"the learner quarantined this actor: {reason}; fix the cause and restart the actor")
         if ended_by == "finished":
-            raise RunOverError("the run is over")
+            raise RunOverError("the run is over", finished=True)
+        if self._end.learner_stopped:
+            raise LearnerLostError("the learner was stopped; waiting for it to return")
         if left or ended_by == "fenced":
             raise LearnerLostError
 
     def _probe_if_silent(self) -> None:
         """After a long silence ask whether the learner is there: a dead session can look alive.
 
-        Raises LearnerLostError if nobody responds.
+        Raises LearnerLostError if nobody responds, and RunOverError as `check` does.
         """
         if time.monotonic() > self._presence.heard_at + _SILENCE_SECONDS:
+            self._end.check()  # a request may take 5 s
             if not self._queries.learner_responds(self._uploads.run, self._join):
                 raise LearnerLostError
             self._presence.heard()

@@ -19,6 +19,7 @@ import numpy as np
 
 from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -71,7 +72,8 @@ class Simulated:
         self.came: list[tuple[int, float]] = []  # policy version and time of each snapshot received
         incarnation = secrets.randbits(62)
         join = Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=ENVIRONMENTS)
-        self._welcome = self._queries.join_learner(keys.ANY_RUN, join, _WAIT_SECONDS, threading.Event())
+        end = RunEndWatch(transport, threading.Event())
+        self._welcome = self._queries.join_learner(keys.ANY_RUN, join, _WAIT_SECONDS, end)
         run = self._welcome.run
         self._inbox = self._transport.subscribe(keys.snapshots(run), self._on_news)
         self._transport.declare_presence(keys.presence(run, name, incarnation))

@@ -7,8 +7,9 @@ import secrets
 import socket
 
 from daedalus.actor.session.service import ActorConfig
-from daedalus.cli.arguments import add_connect, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser
 from daedalus.cli.logs import add_logging
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
 from daedalus.transport.credentials import Credentials
 
@@ -21,6 +22,7 @@ examples:
   daedalus actor --connect tcp/127.0.0.1:7447
   daedalus actor --connect tcp/gpu-box:7447 --envs 32 --name arm-3
   daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
+  daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
 
 exit status: 0 the run is over or the actor was stopped, 1 failed, 2 bad usage"""
@@ -36,11 +38,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="E",
         help="number of environments to step together (default: as the learner asks)",
     )
-    options.add_argument(
-        "--wrap",
-        metavar="MODULE:FUNCTION",
-        help="your function that takes each gymnasium environment and returns the environment to play",
-    )
+    add_allow_module(options, "the learner")
     options.add_argument(
         "--runtime",
         choices=("onnx", "torch"),
@@ -73,7 +71,7 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
         "--link",
         choices=("auto", "lan", "wan"),
         default="auto",
-        help="lan: receive every snapshot in full. wan: fetch snapshots as bfloat16 differences, as often as the link "
+        help="lan: fetch whole snapshots. wan: fetch snapshots as bfloat16 differences, as often as the link "
         "allows (default: %(default)s, which measures the link)",
     )
     options.add_argument(
@@ -102,7 +100,7 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         run=arguments.run,
         environments=arguments.envs,
         runtime=arguments.runtime,
-        wrap=arguments.wrap,
+        modules=UserModules(frozenset(arguments.allow_module), "the learner"),
         link=arguments.link,
         timeout=arguments.timeout,
     )

@@ -2,6 +2,7 @@
 
 import argparse
 import datetime
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,8 +138,7 @@ def _issue(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
 def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
     known = folder.identities()
     if parsed.role is None:
-        soon = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=WARNING_DAYS)
-        identities = [identity for identity, issued in known.items() if issued.expires < soon]
+        identities = [identity for identity, issued in known.items() if issued.days_left < WARNING_DAYS]
         if not identities:
             return [f"no certificate expires within {WARNING_DAYS} days"]
     elif parsed.role in _NAMED and not parsed.names:
@@ -158,12 +158,11 @@ def _revoke(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str
 
 
 def _list(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
-    now = datetime.datetime.now(datetime.UTC)
     lines = [f"{'certificate':<24} {'expires':<10} {'days':>5}"]
     for identity, issued in sorted(folder.identities().items(), key=lambda each: each[1].expires):
-        days = (issued.expires - now).days
-        state = "  EXPIRED" if issued.expires < now else "  renew it soon" if days < WARNING_DAYS else ""
-        lines.append(f"{identity.folder:<24} {issued.expires:%Y-%m-%d} {days:>5}{state}")
+        days = issued.days_left
+        state = "  EXPIRED" if days < 0 else "  renew it soon" if days < WARNING_DAYS else ""
+        lines.append(f"{identity.folder:<24} {issued.expires:%Y-%m-%d} {math.floor(days):>5}{state}")
     return lines
 
 

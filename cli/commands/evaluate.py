@@ -2,10 +2,12 @@
 
 import argparse
 import json
+import os
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from typing import Any, TextIO
 
 import gymnasium
@@ -15,15 +17,17 @@ from gymnasium.envs.registration import load_env_creator
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.evaluation.episodes import Evaluation, environments_for, play_episodes
+from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environments_for, play_episodes
 from daedalus.actor.evaluation.video import Video, VideoError
+from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_if_stuck, exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
 from daedalus.protocol.spec import EnvironmentSpec
 
 _PROGRESS_SECONDS = 5.0
@@ -35,9 +39,19 @@ class _StoppedError(Exception):
     """Error of an evaluation that was stopped before its last episode ended."""
 
 
-def main(command_line: Sequence[str] | None = None, stop: threading.Event | None = None) -> int:
-    """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage."""
-    arguments = parser().parse_args(command_line)
+def main(
+    command_line: Sequence[str] | None = None, stop: threading.Event | None = None, output: TextIO | None = None
+) -> int:
+    """Run `daedalus evaluate` and return its exit status: 0 done, 1 failed or stopped, 2 bad usage.
+
+    Args:
+      command_line: the words after `daedalus evaluate`; default: those of this process.
+      stop: ends the evaluation.
+      output: receives the result, and nothing else (default: standard output).
+    """
+    output = output or sys.stdout
+    words = sys.argv[1:] if command_line is None else command_line
+    arguments = parser().parse_args(words)
     configure_logging(
         arguments.log_level,
         as_json=arguments.log_json,
@@ -53,29 +67,44 @@ def main(command_line: Sequence[str] | None = None, stop: threading.Event | None
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        result = _evaluate(arguments, stop)
+        with redirect_stdout(sys.stderr):  # the environment may print
+            result = _evaluate(arguments, stop)
+    except ModuleNotAllowedError as error:
+        print(f"daedalus evaluate: {allowing(error, ['daedalus', 'evaluate', *words])}", file=sys.stderr)
+        return 2
     except (_StoppedError, DamagedError, NoPolicyError, EnvironmentSetupError, PolicyError, VideoError) as error:
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
-    print(json.dumps(result) if arguments.json else _text(result))
+    print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
     return 0
+
+
+def _reserved_stdout() -> TextIO:
+    """Return standard output for the result alone: whatever else this process prints goes to standard error.
+
+    This includes libraries that are not Python's, and the processes of environments.
+    """
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return result
 
 
 def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
     """Return the result of the evaluation that the arguments describe."""
     directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
     policy = find_policy(directory, arguments.newest)
-    spec = _environment(policy, arguments)
+    spec, modules = _environment(policy, arguments), _modules(policy, arguments)
+    modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-    progress = _Progress(sys.stderr, arguments.episodes, stop)
+    progress = _Progress(sys.stderr, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
     try:
         if arguments.video is None:
-            evaluation = _play(policy, spec, arguments, seed, progress, None)
+            evaluation = _play(policy, spec, modules, arguments, seed, progress, None)
         else:
             with Video(arguments.video, width=arguments.width, max_seconds=arguments.max_seconds) as video:
-                evaluation = _play(policy, spec, arguments, seed, progress, video)
+                evaluation = _play(policy, spec, modules, arguments, seed, progress, video)
             filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
     finally:
         progress.end()
@@ -85,6 +114,8 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
     """Return the environment to play: that of the training, on the backend of the evaluation."""
     trained = policy.spec.environment
+    if arguments.wrap is not None:
+        trained = trained.model_copy(update={"wrap": None if arguments.wrap == "none" else arguments.wrap})
     watched = arguments.video is not None or arguments.render
     backend = arguments.backend or policy.spec.evaluation.final_backend or trained.backend
     if watched:
@@ -93,9 +124,16 @@ def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> Environm
     return played.model_copy(update={"processes": played.processes and backend == "gymnasium" and not watched})
 
 
+def _modules(policy: SavedPolicy, arguments: argparse.Namespace) -> UserModules:
+    """Return the modules that the command line allows, with that of its own --wrap."""
+    own = {module_of(arguments.wrap)} if arguments.wrap not in (None, "none") else set()
+    return UserModules(frozenset({*arguments.allow_module, *own}), f"the run of {policy.directory}")
+
+
 def _play(
     policy: SavedPolicy,
     spec: EnvironmentSpec,
+    modules: UserModules,
     arguments: argparse.Namespace,
     seed: int,
     progress: "_Progress",
@@ -106,7 +144,7 @@ def _play(
     environments = make_environments(
         spec,
         1 if watched else min(arguments.envs or environments_for(episodes, spec), episodes),
-        wrap=arguments.wrap,
+        modules=modules,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,
         for_evaluation=True,
@@ -122,7 +160,13 @@ def _play(
         runtime = OnnxRuntime(policy.program, progress.stop)
         runtime.load(policy.weights)
         return play_episodes(
-            runtime, environments, episodes, seed, sampled=_actions(policy, arguments) == "sampled", progress=progress
+            runtime,
+            environments,
+            episodes,
+            seed,
+            sampled=_actions(policy, arguments) == "sampled",
+            longest=policy.spec.evaluation.max_episode_env_steps,
+            progress=lambda finished, mean: progress(finished, mean) or (video is not None and video.is_full),
         )
     finally:
         environments.close()
@@ -151,6 +195,7 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
         "best_checkpoint": is_best(policy.directory),
         "policy_version": policy.policy_version,
         "episodes": len(returns),
+        "notes": [note] if (note := _note(evaluation, policy.spec.evaluation.max_episode_env_steps)) else [],
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "return_min": float(returns.min()),
@@ -161,6 +206,14 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
     }
 
 
+def _note(evaluation: Evaluation, longest: int) -> str:
+    """Return a message about episodes that were cut, or an empty string."""
+    cut = int((evaluation.cut & (evaluation.lengths == longest)).sum())
+    if cut:
+        return cut_note(cut, len(evaluation.cut), longest)
+    return "the last episode was cut at the end of the video" if evaluation.cut.any() else ""
+
+
 def _text(result: dict[str, Any]) -> str:
     best = "best checkpoint, " if result["best_checkpoint"] else ""
     text = (
@@ -169,7 +222,9 @@ def _text(result: dict[str, Any]) -> str:
         f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
         f"over {result['episodes']} {result['actions']} episodes"
     )
-    return f"{text}\nvideo: {result['video']}, {result['video_seconds']:.1f} s" if "video" in result else text
+    if "video" in result:
+        text += f"\nvideo: {result['video']}, {result['video_seconds']:.1f} s"
+    return "\n".join([text, *result["notes"]])
 
 
 class _Progress:
@@ -178,23 +233,24 @@ class _Progress:
     On a terminal it rewrites one line.
     """
 
-    def __init__(self, stream: TextIO, episodes: int, stop: threading.Event) -> None:
-        self._stream, self._episodes, self.stop = stream, episodes, stop
+    def __init__(self, stream: TextIO, episodes: int, longest: int, stop: threading.Event) -> None:
+        self._stream, self._episodes, self._longest, self.stop = stream, episodes, longest, stop
         self._terminal = stream.isatty()
         self._due = time.monotonic() + _PROGRESS_SECONDS
         self._rewriting = False
 
-    def __call__(self, finished: int, mean: float) -> None:
+    def __call__(self, finished: int, mean: float) -> bool:
         if self.stop.is_set():
             raise _StoppedError
         if time.monotonic() < self._due:
-            return
+            return False
         self._due = time.monotonic() + _PROGRESS_SECONDS
-        so_far = f", mean return {mean:.1f}" if finished else ""
+        so_far = f", mean return {mean:.1f}" if finished else f" (each is cut after {self._longest:,} env_steps)"
         line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
         self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
         self._stream.flush()
         self._rewriting = self._terminal
+        return False
 
     def end(self) -> None:
         """Clear the rewritten line."""
@@ -205,6 +261,4 @@ class _Progress:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    stopped = stop_on_signals()
-    exit_if_stuck(stopped)
-    sys.exit(main(stop=stopped))
+    sys.exit(main(stop=stop_on_signals(exit_if_stuck=True), output=_reserved_stdout()))

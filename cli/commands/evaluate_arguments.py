@@ -2,11 +2,12 @@
 
 import argparse
 import os
+import re
 import sys
 from pathlib import Path
 from typing import get_args
 
-from daedalus.cli.arguments import command_parser
+from daedalus.cli.arguments import add_allow_module, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.protocol.spec import Backend
 
@@ -22,6 +23,7 @@ examples:
   daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
   daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
   daedalus evaluate RUN_DIR --render
+  daedalus evaluate RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
 exit status: 0 done, 1 failed or stopped, 2 bad usage"""
 
@@ -66,8 +68,10 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
-        help="your function that takes each gymnasium environment and returns the environment to play",
+        help="your function that takes each gymnasium environment and returns the one to play, or none (default: "
+        "environment.wrap of the run)",
     )
+    add_allow_module(options, "the run")
     options.add_argument("--json", action="store_true", help="print the result as one JSON object")
     _add_watching(options)
     add_logging(options)
@@ -86,7 +90,7 @@ def _add_watching(options: argparse.ArgumentParser) -> None:
         help="width of the video in pixels (default: as rendered, for a gif at most 320)",
     )
     watching.add_argument(
-        "--max-seconds", type=float, metavar="S", help="length of the video. The episodes are still played to their end"
+        "--max-seconds", type=float, metavar="S", help="length of the video. The evaluation ends with it"
     )
     watching.add_argument("--render", action="store_true", help="show the episodes in a window, at human speed")
 
@@ -104,6 +108,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--envs is {arguments.envs}: choose a number from 1 to 4096")
     if arguments.seed is not None and arguments.seed < 0:
         raise ValueError(f"--seed is {arguments.seed}: choose 0 or more")
+    if arguments.wrap not in (None, "none") and re.fullmatch(r"\w+(\.\w+)*:\w+", arguments.wrap) is None:
+        raise ValueError(f"--wrap is {arguments.wrap}: write MODULE:FUNCTION, or none")
     if arguments.video and arguments.render:
         raise ValueError("--video and --render cannot be used together: run the command twice with the same --seed")
     if not arguments.video and (arguments.width is not None or arguments.max_seconds is not None):

@@ -1,7 +1,8 @@
 """`daedalus learner`: construct one learner and run it.
 
-Exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
-before the target, 1 failed or stopped early, 2 bad usage.
+Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
+learner that a signal stopped exits with processes.STOPPED.
 """
 
 import argparse
@@ -9,17 +10,27 @@ import logging
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, raise_descriptor_limit, stop_on_signals
-from daedalus.cli.settings_arguments import LISTEN, learner_parser, resolve, resolve_to_resume
+from daedalus.cli.processes import (
+    STOPPED,
+    exit_on_thread_exceptions,
+    exit_with_parent,
+    raise_descriptor_limit,
+    stop_on_signals,
+)
+from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.heartbeat import Heartbeat
+from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.serving.rollout_intake import largest_request
@@ -28,11 +39,17 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect, credentials_to_listen
+from daedalus.transport.security import (
+    SECURITY_ERRORS,
+    certificate_days_left,
+    credentials_to_connect,
+    credentials_to_listen,
+)
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
 
@@ -40,15 +57,7 @@ if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Run:
-    """Run to train, from the command line."""
-
-    spec: RunSpec
-    directory: Path
-    exists: bool  # whether the run directory was created before
+_FAILURES = CheckpointMismatchError, CredentialsError, DamagedError, NetworkError, SettingsError, TransportError
 
 
 def main() -> int:
@@ -61,43 +70,55 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        run = _resolve(arguments)
+        run = choose_run(arguments)
         credentials = _credentials(arguments)
-    except (SettingsError, *SECURITY_ERRORS) as error:
+    except ModuleNotAllowedError as error:
+        print(f"daedalus learner: {allowing(error, ['daedalus', 'learner', *sys.argv[1:]])}", file=sys.stderr)
+        return BAD_USAGE
+    except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
+    Heartbeat(run.directory).clear()  # before a router is waited for
     progress = Progress(sys.stdout, run.spec.training.env_steps)
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
-        restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
-        transport = _open_transport(arguments, run.spec, credentials, stop)
-    except (TransportError, DamagedError, CredentialsError) as error:
+        with ExitStack() as stack:
+            return _serve(run, arguments, credentials, stop, progress, arguments.started or started, stack)
+    except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
+
+
+def _serve(
+    run: ChosenRun,
+    arguments: argparse.Namespace,
+    credentials: Credentials | None,
+    stop: threading.Event,
+    progress: Progress,
+    started: float,
+    stack: ExitStack,
+) -> int:
+    """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
+    if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
+        stack.enter_context(RunLock(run.directory))
+    restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
+    transport = _open_transport(arguments, run.spec, credentials, stop)
+    stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
-        return FAILED
+        return stopped
+    stack.callback(transport.close)
+    if not run.exists:
+        lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
+        stack.enter_context(lock)
+        run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments)
-        return _train(run, transport, stop, progress, arguments.started or started, restored)
-    except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
-        print(f"daedalus learner: {error}", file=sys.stderr)
-        return FAILED
-    finally:
-        transport.close()
-
-
-def _resolve(arguments: argparse.Namespace) -> _Run:
-    """Return the run that the arguments define. Raises SettingsError."""
-    if arguments.prepared:
-        return _Run(spec=run_directory.read_config(arguments.prepared), directory=arguments.prepared, exists=True)
-    if arguments.resume:
-        spec, directory, exists = resolve_to_resume(arguments)
-    else:
-        spec, directory = resolve(arguments)
-        exists = False
-    if not exists:
-        run_directory.check_free(directory)
-    return _Run(spec=spec, directory=directory, exists=exists)
+        outcome = _train(run, transport, stop, progress, started, restored, credentials)
+    except _FAILURES:
+        if not run.exists:
+            run_directory.remove_failed(run.directory)
+        raise
+    return _status(outcome, run.spec, stopped)
 
 
 def _credentials(arguments: argparse.Namespace) -> Credentials | None:
@@ -125,25 +146,25 @@ def _open_transport(
     return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
-def _announce(run: _Run, arguments: argparse.Namespace) -> None:
-    """Create the run directory if it is new, and log how actors join. Raises SettingsError."""
-    if not run.exists:
-        run_directory.create(run.directory, run.spec)
+def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
+    """Log how actors join."""
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        _logger.info("actors join with: daedalus actor --connect %s", ", ".join(_addresses(arguments)))
+        options = [", ".join(_addresses(arguments)), *allow_settings(spec.environment.user_modules)]
+        _logger.info("actors join with: daedalus actor --connect %s", " ".join(options))
 
 
 def _train(
-    run: _Run,
+    run: ChosenRun,
     transport: Transport,
     stop: threading.Event,
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
-) -> int:
-    """Run the learner to its end and return the exit status."""
+    credentials: Credentials | None,
+) -> Outcome:
+    """Run the learner to its end."""
     directory = run.directory
     service = LearnerService(
         run.spec,
@@ -154,8 +175,10 @@ def _train(
         [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
         started=started,
         restored=restored,
+        modules=run.modules,
+        certificate_days_left=lambda: certificate_days_left(credentials),
     )
-    return _status(service.run(), run.spec)
+    return service.run()
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
@@ -171,10 +194,10 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
-def _status(outcome: Outcome, spec: RunSpec) -> int:
-    """Return the exit status for the end of a run."""
+def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
+    """Return the exit status for the end of a run; `stopped` is that of a run that was stopped."""
     if not outcome.finished:
-        return FAILED
+        return stopped if outcome.saved else FAILED
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED
 

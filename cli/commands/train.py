@@ -4,15 +4,23 @@ import argparse
 import importlib.util
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from daedalus.cli.arguments import add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allowing, command_parser
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.settings_arguments import add_settings, resolve
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.user_modules import (
+    ModuleNotAllowedError,
+    UserModuleError,
+    UserModules,
+    allow_settings,
+)
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 
@@ -20,7 +28,8 @@ _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. Training stops when the target is
 reached or the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes). If the run was
 evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as many new episodes
-each to select the best. Otherwise the newest policy is used."""
+each to select the best. Otherwise the newest policy is used. If the target was reached, the policy of that moment also
+plays 100 new sampled episodes (training.target_episodes) to confirm it."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -35,12 +44,13 @@ before the target, 1 failed or stopped, 2 bad usage"""
 
 _RESUME = """\
 Continues a run from its newest undamaged checkpoint, with the same weights, optimiser state, counters and random state.
-The environments start new episodes."""
+The environments start new episodes. With another budget, annealed settings continue from the values that they had."""
 
 _RESUME_EXAMPLES = """\
 examples:
   daedalus resume runs/cartpole-impala-s1-20261121-101500
   daedalus resume RUN_DIR --env-steps 3000000      (the whole budget, with the steps already done)
+  daedalus resume RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
 exit status: as of daedalus train"""
 
@@ -52,11 +62,15 @@ def train(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
-        run_directory.create(directory, spec)
+        lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None)
+    except RunInUseError as error:
+        print(f"daedalus train: {error}", file=sys.stderr)
+        return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
-    return _run(directory, spec, parsed, started, resume=False)
+    with lock:
+        return _run(lock, spec, parsed, started, resume=False)
 
 
 def resume(arguments: list[str]) -> int:
@@ -66,13 +80,27 @@ def resume(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         spec = run_directory.read_config(parsed.directory)
-        if parsed.env_steps is not None:
-            spec = run_directory.with_budget(spec, parsed.env_steps)
-            run_directory.write_config(parsed.directory, spec)
-    except (SettingsError, *SECURITY_ERRORS) as error:
+        source = str(parsed.directory / run_directory.CONFIG)
+        UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
+        lock = RunLock(parsed.directory)
+    except ModuleNotAllowedError as error:
+        print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
+        return 2
+    except RunInUseError as error:
+        print(f"daedalus resume: {error}", file=sys.stderr)
+        return 1
+    except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
-    return _run(parsed.directory, spec, parsed, started, resume=True)
+    with lock:
+        try:
+            if parsed.env_steps is not None:
+                spec = run_directory.with_budget(spec, parsed.env_steps)
+                run_directory.write_config(parsed.directory, spec)
+        except SettingsError as error:
+            print(f"daedalus resume: {error}", file=sys.stderr)
+            return 2
+        return _run(lock, spec, parsed, started, resume=True)
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -88,6 +116,7 @@ def resume_parser() -> argparse.ArgumentParser:
     options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
     options.add_argument("directory", type=Path, metavar="RUN_DIR", help="run to continue")
     options.add_argument("--env-steps", type=int, metavar="N", help="new budget (default: the budget of the run)")
+    add_allow_module(options, "config.toml of the run")
     _add_machine_options(options)
     return options
 
@@ -96,15 +125,10 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--listen",
         metavar="tcp/HOST:PORT",
-        help="address where more actors may join (default: a free port of this machine)",
+        help="address where more actors may join (default: none; the processes of the run use a private Unix socket)",
     )
     add_tls(options)
     add_insecure(options)
-    options.add_argument(
-        "--wrap",
-        metavar="MODULE:FUNCTION",
-        help="your function that takes each gymnasium environment of these actors and returns the environment to play",
-    )
     add_logging(options)
 
 
@@ -112,34 +136,51 @@ def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
-def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
+def _run(lock: RunLock, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
     """Run to the end, print the result, and return the exit status."""
+    directory = lock.directory
     run = LocalRun(
         directory=directory,
         spec=spec,
         started=started,
+        lock=lock.inheritable,
         resume=resume,
         listen=parsed.listen,
         tls=parsed.tls,
         insecure=parsed.insecure,
-        wrap=parsed.wrap,
         log_level=parsed.log_level,
         log_json=parsed.log_json,
     )
-    # The learner rewrites a line of progress on the same terminal: a record replaces this line.
-    clear = "\r\x1b[K" if sys.stdout.isatty() else ""
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=lambda line: print(f"{clear}{line}", flush=True))
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
     try:
-        end = run_locally(run, stop_on_signals())
+        with output:
+            end = run_locally(run, stop_on_signals(), output)
     except RunStoppedError:
-        print(f"stopped; continue with: daedalus resume {directory}")
+        options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
+        print(f"stopped; continue with: daedalus resume {directory}{options}")
         return 1
     except RunFailedError as error:
         if str(error):
             print(f"daedalus train: {str(error).rstrip()}", file=sys.stderr)
+        if not (resume or output.withheld):
+            run_directory.remove_failed(directory)
         return error.status
     print(_report(run, end.summary))
     return end.status
+
+
+def _print_out(line: str) -> None:
+    _print_line(line, sys.stdout)
+
+
+def _print_err(line: str) -> None:
+    _print_line(line, sys.stderr)
+
+
+def _print_line(line: str, stream: TextIO) -> None:
+    """Print a line in place of the line of progress that the learner rewrites on the same terminal."""
+    print(f"\r\x1b[K{line}" if stream.isatty() else line, file=stream, flush=True)
 
 
 def _report(run: LocalRun, summary: dict[str, Any]) -> str:
@@ -162,4 +203,18 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
-    return f"{trained}\n{evaluated}\n{folder}"
+    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+
+
+def _confirmed(summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
+        "of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
+    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]

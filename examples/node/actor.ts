@@ -86,7 +86,8 @@ export class Actor {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
         this.#publishedVersion = 0;
       }
-      bridge.follow(`daedalus/${run}/snapshots`, (bytes) => this.#onSnapshotMessage(bytes));
+      bridge.follow(`daedalus/${run}/snapshots`, (bytes) => this.#onPublication(bytes));
+      bridge.follow(`daedalus/${run}/end`, (bytes) => this.#onPublication(bytes));
       bridge.watch(`daedalus/${run}/learner`, (_key, present) => {
         if (!present) this.#stopCollecting(new LearnerLostError("the learner went away"));
       });
@@ -122,7 +123,8 @@ export class Actor {
     for (let loaded = -1; ; ) {
       await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {
-        const due = () => this.#version > loaded || this.#rejected;
+        // A rejected rollout is replaced, unless a newer version is out: another one of this version would be stale.
+        const due = () => this.#version > loaded || (this.#rejected && this.#publishedVersion <= loaded);
         await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
       } else if (this.#publishedVersion > this.#version) {
@@ -169,13 +171,13 @@ export class Actor {
   }
 
   /** Receive a Snapshot or RunEnded, published or in answer to a request. Ignore any other message. Never throws. */
-  #onSnapshotMessage(bytes: Uint8Array): void {
+  #onPublication(bytes: Uint8Array): void {
     try {
       const message = tryDecode(bytes);
-      if (!message || (message.kind !== "RunEnded" && message.kind !== "Snapshot")) return;
-      const { learner_epoch, reason, policy_version } = message.fields;
+      if (message?.kind === "RunEnded") return this.#onRunEnded(message);
+      if (message?.kind !== "Snapshot") return;
+      const { learner_epoch, policy_version } = message.fields;
       if (learner_epoch !== this.#uploader.learnerEpoch) throw new LearnerLostError("another learner epoch began");
-      if (message.kind === "RunEnded") throw new RunOverError(`the run is over: ${reason}`);
       if (Number(policy_version) > this.#version) this.#snapshot = message;
       this.#heardAt = this.#snapshotAt = performance.now();
       this.#wake();
@@ -184,13 +186,20 @@ export class Actor {
     }
   }
 
+  /** Obey RunEnded. A finished run is over whatever the epoch of the message. */
+  #onRunEnded({ fields: { learner_epoch, outcome, reason } }: Message): void {
+    if (outcome === "finished") this.#stopCollecting(new RunOverError(`the run is over: ${reason}`));
+    else if (learner_epoch === this.#uploader.learnerEpoch)
+      this.#stopCollecting(new LearnerLostError("the learner was stopped"));
+  }
+
   /** Request the newest snapshot in case a push was lost. Throws LearnerLostError without an answer. */
   async #requestSnapshot(bridge: Bridge, run: string): Promise<void> {
     this.#snapshotAt = performance.now();
     const answers = await bridge.query(`daedalus/${run}/snapshots`);
     if (answers.length === 0) throw new LearnerLostError("the learner did not answer a request for its snapshot");
     this.#heardAt = performance.now();
-    for (const answer of answers) this.#onSnapshotMessage(answer);
+    for (const answer of answers) this.#onPublication(answer);
   }
 
   // -------------------------------------------------------------------------------------------- waiting
@@ -220,22 +229,22 @@ export class Actor {
     });
   }
 
-  /** Make the next wait throw `reason`. Only the first reason counts. */
+  /** Make the next wait throw `reason`. The end of the run counts, otherwise the first reason. */
   #stopCollecting(reason: Error): void {
-    this.#stopReason ??= reason;
+    if (!this.#stopReason || reason instanceof RunOverError) this.#stopReason = reason;
     this.#wake();
   }
 }
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
 function checkSupported(spec: link.EnvironmentSpec): void {
-  const { id, kwargs, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,
     kwargs: Object.keys(kwargs).length > 0,
     action_repeat: action_repeat !== 1,
     frame_stack: frame_stack !== 1,
-    ...{ action_table, no_reward_limit, crop, grey, resize },
+    ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
   if (unsupported.length === 0) return;

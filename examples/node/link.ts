@@ -8,6 +8,7 @@ export interface EnvironmentSpec {
   id: string;
   kwargs: Record<string, unknown>;
   max_episode_steps: number | null;
+  wrap: string | null;
   action_table: unknown;
   action_repeat: number;
   no_reward_limit: number | null;
@@ -49,12 +50,14 @@ export class LearnerLostError extends Error {}
  * RefusedError or RunOverError if a learner refuses.
  */
 export async function join(bridge: Bridge, run: string, fields: Message["fields"]): Promise<Welcome> {
-  const answers = await query(bridge, `daedalus/${run}/join`, encode({ kind: "Join", fields, arrays: {} }));
+  const request = encode({ kind: "Join", fields, arrays: {} });
+  const answers = await query(bridge, `daedalus/${run}/join/${fields.actor}`, request);
   const welcomes = answers.filter((answer) => answer.kind === "Welcome");
   if (welcomes.length > 1) throw new RefusedError("several learners answer here: choose one with --run");
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
   const refusal = answers.find((answer) => answer.kind === "Refusal")?.fields;
   if (refusal?.code === "finished") throw new RunOverError("the run is over");
+  if (refusal?.code === "not_ready") throw new LearnerLostError(String(refusal.reason));
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);
   throw new LearnerLostError("no learner answers: check that the learner runs and that the bridge connects to it");

@@ -10,26 +10,29 @@ from daedalus.learner.reporting.metrics import COLUMNS, Details
 
 
 class CsvWriter:
-    """Writer that appends one line for each row. A resumed run continues its file, with the columns of its header.
+    """Writer that appends one line for each row. A resumed run continues its file.
 
-    Lines are complete: if the disk is full, a partly written line is removed.
+    Lines are complete: if the disk is full, a partly written line is removed. A row with new columns, such as the first
+    scalar of the environment's info, adds them to the header, for which the file is written anew.
     """
 
     def __init__(self, path: Path) -> None:
-        header = _header(path)  # another release may have had other columns
-        self._columns = header or COLUMNS
+        self._path = path
+        self._columns = _header(path)  # another release may have had other columns
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
-        if not header:
+        if not self._columns:
             self._append(COLUMNS)
+            self._columns = COLUMNS
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Append a line. See MetricsWriter."""
+        new = [name for name in row if name not in self._columns]
+        if new:
+            self._add_columns(new)
         self._append([_cell(row.get(name)) for name in self._columns])
 
     def _append(self, cells: Sequence[str]) -> None:
-        line = io.StringIO()
-        csv.writer(line).writerow(cells)
-        data = line.getvalue().encode()
+        data = _line(cells)
         before = os.fstat(self._file.fileno()).st_size
         try:
             written = self._file.write(data)
@@ -39,9 +42,32 @@ class CsvWriter:
             self._file.truncate(before)
             raise
 
+    def _add_columns(self, names: Sequence[str]) -> None:
+        """Write the file anew with further columns, which are blank in the rows so far."""
+        columns = (*self._columns, *names)
+        beside = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
+        try:
+            with open(self._path, newline="", encoding="utf-8", errors="replace") as old, open(beside, "wb") as new:
+                next(old)
+                new.write(_line(columns))
+                for cells in csv.reader(old):
+                    new.write(_line([*cells, *[""] * len(names)]))
+            os.replace(beside, self._path)
+        finally:
+            beside.unlink(missing_ok=True)
+        self._file.close()
+        self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+        self._columns = columns
+
     def close(self) -> None:
         """Close the file. See MetricsWriter."""
         self._file.close()
+
+
+def _line(cells: Sequence[str]) -> bytes:
+    line = io.StringIO()
+    csv.writer(line).writerow(cells)
+    return line.getvalue().encode()
 
 
 def _header(path: Path) -> Sequence[str]:

@@ -6,39 +6,60 @@ from typing import Protocol
 
 import numpy as np
 
-COLUMNS = (
-    "wall_seconds",
-    "env_steps",
-    "updates",
-    "episodes",
-    "episode_return_mean",
-    "episode_return_std",
-    "episode_return_min",
-    "episode_return_max",
-    "episode_length_mean",
-    "env_steps_per_second",
-    "updates_per_second",
-    "policy_lag_mean",
-    "policy_lag_max",
-    "actors",
-    "rollouts_accepted",
-    "rollouts_rejected",
-    "updates_skipped",
-    "policy_loss",
-    "value_loss",
-    "entropy",
-    "explained_variance",
-    "gradient_norm",
-    "value_mean",
-    "advantage_std",
-    "clipped_fraction",
-    "evaluation_return_mean",
-    "evaluation_return_std",
-    "evaluation_length_mean",
-    "evaluation_env_steps",
-    "learning_rate",
-    "entropy_bonus",
-)
+# By the group that TensorBoard shows them in. docs/reference/metrics.md explains each column.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "time": ("wall_seconds", "env_steps", "updates", "env_steps_per_second", "updates_per_second"),
+    "rollout": (
+        "episodes",
+        "episode_return_mean",
+        "episode_return_std",
+        "episode_return_min",
+        "episode_return_max",
+        "episode_length_mean",
+        "policy_lag_mean",
+        "policy_lag_max",
+        "actors",
+        "rollouts_accepted",
+        "rollouts_rejected",
+    ),
+    "train": (
+        "updates_skipped",
+        "policy_loss",
+        "value_loss",
+        "entropy",
+        "explained_variance",
+        "gradient_norm",
+        "gradient_clipped_fraction",
+        "value_mean",
+        "advantage_std",
+        "clipped_fraction",
+        "behaviour_kl",
+        "rho_mean",
+        "rho_effective_share",
+        "rho_clipped_fraction",
+        "value_error_p05",
+        "value_error_p50",
+        "value_error_p95",
+        "learning_rate",
+        "entropy_bonus",
+    ),
+    "evaluation": (
+        "evaluation_return_mean",
+        "evaluation_return_std",
+        "evaluation_length_mean",
+        "evaluation_env_steps",
+    ),
+}
+COLUMNS = tuple(name for names in GROUPS.values() for name in names)
+ENV = "env/"  # prefix of the columns for the scalars of the environment's info, which a run adds to COLUMNS
+
+
+def tag(column: str) -> str:
+    """Return the name of a column with its group: `train/entropy`, `evaluation/return_mean`, `env/lives`."""
+    for group, names in GROUPS.items():
+        if column in names:
+            return f"{group}/{column.removeprefix(group + '_')}"
+    return column
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,7 +76,11 @@ class MetricsWriter(Protocol):
     """Interface of a destination of metrics rows. Only the recorder's thread calls it."""
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """Write a row. Its keys are in COLUMNS; columns without a value yet are absent. Raises OSError."""
+        """Write a row. Raises OSError.
+
+        Its keys are in COLUMNS, or ENV and the name of a scalar of the environment's info. Columns without a value yet
+        are absent.
+        """
         ...
 
     def close(self) -> None:

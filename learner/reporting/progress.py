@@ -1,11 +1,14 @@
 """Progress of a run: one line that is rewritten on a terminal, or a new line every few seconds elsewhere."""
 
+import shutil
 import time
+from collections import deque
 from collections.abc import Mapping
 from typing import TextIO
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
+_RATE_SECONDS = 30.0  # of the run, over which the rate of the env_steps is measured
 
 
 class Progress:
@@ -17,19 +20,22 @@ class Progress:
         self._terminal = stream.isatty()
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
+        self._seen: deque[tuple[float, float]] = deque()  # seconds and env_steps of the newest rows
 
     def show(self, row: Mapping[str, float]) -> None:
         """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds."""
+        rate = self._rate(row)
         if not self._terminal:
             if time.monotonic() < self._next_line:
                 return
             self._next_line = time.monotonic() + _LINE_SECONDS
-        line = _line(row, self._budget)
+        parts = _parts(row, self._budget, rate)
         if self._terminal:
+            line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._stream.write(f"\r\x1b[K{line}")
             self._rewriting = True
         else:
-            self._stream.write(line + "\n")
+            self._stream.write("  ".join(parts) + "\n")
         self._stream.flush()
 
     def say(self, text: str) -> None:
@@ -45,12 +51,46 @@ class Progress:
             self._stream.flush()
             self._rewriting = False
 
+    def _rate(self, row: Mapping[str, float]) -> float:
+        """Return env_steps a second over the newest rows: slow environments make steps in few of the rows."""
+        seconds, env_steps = row["wall_seconds"], row["env_steps"]
+        self._seen.append((seconds, env_steps))
+        while len(self._seen) > 2 and seconds - self._seen[1][0] >= _RATE_SECONDS:
+            self._seen.popleft()
+        first_seconds, first_env_steps = self._seen[0]
+        if seconds <= first_seconds:
+            return row.get("env_steps_per_second", 0.0)
+        return (env_steps - first_env_steps) / (seconds - first_seconds)
 
-def _line(row: Mapping[str, float], budget: int) -> str:
+
+def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
+    """Return the parts of a line, the most important first."""
     mean = f"{row['episode_return_mean']:.1f}" if "episode_return_mean" in row else "-"
-    share = 100.0 * row["env_steps"] / budget
-    return (
-        f"{row['wall_seconds']:7.1f} s  return {mean:>7}  env_steps {row['env_steps']:>11,} ({share:.0f} %)"
-        f"  {row['env_steps_per_second']:>9,.0f}/s  updates {row['updates_per_second']:>6,.0f}/s"
-        f"  lag {row['policy_lag_mean']:.1f}  actors {row['actors']}"
-    )
+    left = _duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
+    parts = [
+        f"{row['wall_seconds']:7.1f} s",
+        f"return {mean:>7}",
+        f"env_steps {row['env_steps']:>11,} ({100.0 * row['env_steps'] / budget:.0f} %)",
+        f"{rate:>7,.0f}/s",
+        f"left {left:>6}",
+        f"updates {row.get('updates_per_second', 0.0):>5,.0f}/s",
+        f"lag {row.get('policy_lag_mean', 0.0):.1f}",
+        f"actors {row['actors']}",
+    ]
+    if "episode_length_mean" in row:
+        parts.insert(5, f"length {row['episode_length_mean']:>6,.0f}")
+    return parts
+
+
+def _fitted(parts: list[str], width: int) -> str:
+    """Return as many of the parts, from the first on, as fit into one line."""
+    while len(parts) > 1 and len("  ".join(parts)) > width:
+        parts = parts[:-1]
+    return "  ".join(parts)[: max(width, 0)]
+
+
+def _duration(seconds: float) -> str:
+    """Return a short text: 45 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{max(seconds, 0.0):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"

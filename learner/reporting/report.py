@@ -1,17 +1,20 @@
 """Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.fleet_status import page, totals
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
+_LONG_EPISODE = 10_000  # env_steps in each environment without the end of an episode: give a hint
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -25,7 +28,9 @@ class Health:
     saved: float | None = None  # time of the last checkpoint
     save_fault: str = ""  # error of the last checkpoint, if it failed
     left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
-    gradient_fault: str = ""  # why the last update was skipped, if it was
+    gradient_fault: bool = False  # whether the last update was skipped
+    # Days until the certificate of this process expires, or None without one.
+    certificate_days_left: Callable[[], float | None] = lambda: None
 
     def problems(self, now: float, live: int) -> tuple[str, ...]:
         """Return descriptions of the problems, most severe first; empty if the service is healthy.
@@ -44,7 +49,7 @@ class Health:
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
         if self.gradient_fault:
-            found.append(f"updates are skipped: {self.gradient_fault}")
+            found.append("updates are skipped: the gradient is not finite")
         if self.save_fault:
             found.append(f"checkpoints cannot be saved: {self.save_fault}")
         return tuple(found)
@@ -79,7 +84,7 @@ class RateMeter:
             totals = actor.env_steps, actor.received_bytes, actor.answered_bytes
             env_steps, received, answered = np.subtract(totals, self._actors.get(actor.name, (0, 0, 0))) / seconds
             self._actors[actor.name] = totals
-            subscribed = 0.0 if actor.compact_snapshots or not fleet.is_live(actor) else pushed / seconds
+            subscribed = 0.0 if actor.fetches or not fleet.is_live(actor) else pushed / seconds
             actor.env_steps_per_second = float(env_steps)
             actor.bytes_up_per_hour = 3600 * float(received)
             actor.bytes_down_per_hour = 3600 * float(answered + subscribed)
@@ -92,6 +97,24 @@ class RateMeter:
         }
         self._mark(counters, now)
         return self.rates
+
+
+class EpisodeHint:
+    """Hint that no episode has ended after many steps, given once."""
+
+    def __init__(self) -> None:
+        self._given = False
+
+    def take(self, counters: RunCounters, fleet: Fleet) -> str:
+        """Return the hint if it is due, else an empty string."""
+        environments = sum(fleet.actors[name].environments for name in fleet.live)
+        if self._given or counters.episodes or counters.env_steps < max(environments, 1) * _LONG_EPISODE:
+            return ""
+        self._given = True
+        return (
+            f"no episode has ended after {_LONG_EPISODE:,} env_steps in each environment: "
+            "if the environment never ends them, set environment.max_episode_steps"
+        )
 
 
 def episode_statistics(counters: RunCounters) -> dict[str, float]:
@@ -115,7 +138,7 @@ def metrics_row(
     learning: dict[str, float],
     wall_seconds: float,
 ) -> dict[str, float]:
-    """Return one metrics row, with columns of learner/reporting/metrics.py.
+    """Return one metrics row, with columns of learner/reporting/metrics.py and the scalars of the environment.
 
     Args:
       counters: counters of the run.
@@ -137,6 +160,7 @@ def metrics_row(
         "rollouts_rejected": counters.rollouts_rejected.total(),
         "updates_skipped": counters.updates_skipped,
         **learning,
+        **{ENV + name: float(np.mean(values)) for name, values in counters.info.items()},
     }
 
 
@@ -151,7 +175,8 @@ def run_status(
     queue_bytes: int,
     now: float,
 ) -> RunStatus:
-    """Return the answer to a status query. `now` is on the monotonic clock, in seconds."""
+    """Return the status of the run with its first actors. `now` is on the monotonic clock, in seconds."""
+    fleet.forget_absent(now)
     return RunStatus(
         run=run,
         learner_epoch=learner_epoch,
@@ -170,8 +195,11 @@ def run_status(
         queue_bytes=queue_bytes,
         queue_bytes_limit=spec.service.queue_bytes,
         checkpoint_age_seconds=None if health.saved is None else now - health.saved,
+        certificate_days_left=health.certificate_days_left(),
+        rollouts_accepted=counters.rollouts_accepted,
         rollouts_rejected=dict(counters.rollouts_rejected),
-        actors=fleet.statuses(now),
+        **totals(fleet),
+        actors=page(fleet, "", now),
     )
 
 
@@ -204,6 +232,7 @@ def summary(
         "episode_return_mean": counters.episode_return_mean,
         "evaluation_return_mean": None,
         "evaluation_return_std": None,
+        "confirmation_return_mean": None,
         "policy_lag_mean": counters.policy_lag_mean,
         "policy_lag_max": counters.policy_lag_max,
         "rollouts_accepted": counters.rollouts_accepted,

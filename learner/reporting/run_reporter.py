@@ -4,7 +4,8 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.report import Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.report import EpisodeHint, Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.fleet import Fleet
@@ -25,6 +26,7 @@ class RunReporter:
         learner_epoch: int,
         *,
         counters: RunCounters,
+        annealing: Annealing,
         fleet: Fleet,
         lock: threading.Condition,
         evaluations: Evaluations,
@@ -33,9 +35,10 @@ class RunReporter:
     ) -> None:
         """Construct the reporter. `lock` guards counters and fleet; `started` is on the monotonic clock, in seconds."""
         self._run, self._spec, self._epoch = run, spec, learner_epoch
-        self._counters, self._fleet, self._lock = counters, fleet, lock
+        self._counters, self._annealing, self._fleet, self._lock = counters, annealing, fleet, lock
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
+        self._hint = EpisodeHint()
 
     def begin(self, now: float) -> None:
         """Start to measure rates, at the begin of training."""
@@ -49,22 +52,28 @@ class RunReporter:
     def counters_state(self, now: float) -> dict[str, Any]:
         """Return the counters in the form that a checkpoint stores."""
         with self._lock:
-            return self._counters.state(self.wall_seconds(now))
+            return {**self._counters.state(self.wall_seconds(now)), "annealing": self._annealing.state()}
 
     def row(self, learner: "Learner", now: float) -> dict[str, float]:
         """Return a metrics row, with rates and means since the previous row."""
+        learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         with self._lock:
-            progress = self._counters.env_steps / self._spec.training.env_steps
+            progress = self._annealing.at(self._counters.env_steps)
             rates = self._meter.measure(self._counters, self._fleet, now)
             if self._fleet.live:
                 self._health.actor_seen = now
             learning = {
-                **learner.metrics.take_means(),
+                **learned,
                 **self._evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
             }
             return metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
+
+    def hint(self) -> str:
+        """Return a hint for the user if one is due, else an empty string."""
+        with self._lock:
+            return self._hint.take(self._counters, self._fleet)
 
     def details(self, learner: "Learner") -> Details:
         """Return the distributions and the picture that belong to a metrics row."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.learner.reporting.metrics import Details
+from daedalus.learner.reporting.metrics import Details, tag
 
 
 class TensorBoardWriter:
@@ -40,22 +40,22 @@ class TensorBoardWriter:
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Write one event. See MetricsWriter."""
         values: list[Any] = [
-            self._summary.Value(tag=name, simple_value=float(value))
+            self._summary.Value(tag=tag(name), simple_value=float(value))
             for name, value in row.items()
             if name != "env_steps"
         ]
         values += [
-            self._summary.Value(tag=tag, histo=self._histogram(*np.histogram(numbers, bins=30), numbers))
-            for tag, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
+            self._summary.Value(tag=f"rollout/{name}", histo=self._histogram(*np.histogram(numbers, bins=30), numbers))
+            for name, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
             if len(numbers)
         ]
         for name, counts in details.action_counts.items():
             if sum(counts):
-                tag = "action" if name == "action" else f"action/{name}"
+                tag = "rollout/action" if name == "action" else f"rollout/action/{name}"
                 histogram = self._histogram(np.array(counts), np.arange(len(counts) + 1) - 0.5, ())
                 values.append(self._summary.Value(tag=tag, histo=histogram))
         if details.picture is not None:
-            values.append(self._summary.Value(tag="what_the_network_sees", image=self._image(details.picture)))
+            values.append(self._summary.Value(tag="rollout/observation", image=self._image(details.picture)))
         self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))
 
     def _add(self, event: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Rollout
 
 _SAVED = (
     "env_steps",
@@ -44,6 +44,7 @@ class RunCounters:
     wall_seconds: float = 0.0  # of the learner processes before this one
     returns: deque[float] = field(init=False)
     lengths: deque[int] = field(init=False)
+    info: dict[str, deque[float]] = field(default_factory=dict)  # newest scalars of the environment; not saved
 
     def __post_init__(self) -> None:
         self.returns = deque(maxlen=self.target_episodes)
@@ -71,8 +72,14 @@ class RunCounters:
             self.lengths.extend(rollout.episode_lengths.tolist())
             self.episodes += len(rollout.episode_returns)
             self.env_steps += int(np.count_nonzero(rollout.valid))
+            self._add_info(rollout)
         self.rollouts_trained += len(rollouts)
         self.updates += updates
+
+    def _add_info(self, rollout: Rollout) -> None:
+        for name, values in rollout.episode_info.items():
+            if name in self.info or len(self.info) < MAX_INFO_NAMES:
+                self.info.setdefault(name, deque(maxlen=self.target_episodes)).extend(values.tolist())
 
     @property
     def episode_return_mean(self) -> float | None:

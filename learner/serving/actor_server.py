@@ -8,6 +8,7 @@
 The learner's thread takes batches and publishes snapshots. Network threads never wait for an update.
 """
 
+import contextlib
 import logging
 import threading
 import time
@@ -16,20 +17,30 @@ from collections.abc import Callable
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.fleet_status import page
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.rollout_intake import HEARTBEAT_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import EVALUATION_LIMITS, JOIN_LIMITS, SNAPSHOT_REQUEST_LIMITS, Limits
-from daedalus.protocol.messages import Refusal, StatusReport
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import (
+    EVALUATION_LIMITS,
+    JOIN_LIMITS,
+    SNAPSHOT_REQUEST_LIMITS,
+    STATUS_REQUEST_LIMITS,
+    Limits,
+)
+from daedalus.protocol.messages import ActorsReport, ActorsRequest, Message, Refusal, RunEnded, StatusReport
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
+_LEAVE_SECONDS = 5.0  # after the end of the run, for the actors to leave
+_ASK_SECONDS = 2.0  # in which an actor asks again that was refused because its name is in use
+_REPEAT_SECONDS = 0.5  # between repetitions of the message that the run is over
 _HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
 _logger = logging.getLogger(__name__)
@@ -57,14 +68,15 @@ class ActorServer:
           spec: specification of the run.
           transport: the network.
           counters: updated by the server; other threads read them under `lock`.
-          status: function that returns the answer to a status query; called with the lock held.
+          status: function that returns the status with the first page of actors; called with the lock held.
           learner_epoch: epoch of this learner process.
           start_version, spaces: from the checkpoint that the run continues from, else 0 and None.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
-        self._run, self._transport, self._status = run, transport, status
-        self._closed = False
+        self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
+        self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
+        self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
@@ -88,11 +100,11 @@ class ActorServer:
         self._serve(keys.rollouts(run, "*"), self.rollouts.offer)
         self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
-        self._serve(keys.status(run), self._on_status)
+        self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
-        self._serve(keys.join(run), self._on_join, JOIN_LIMITS)
+        self._serve(keys.join(run, "*"), self._on_join, JOIN_LIMITS)
         self._watchdog.open()
 
     def _serve(self, key: str, handler: Callable[[Request], None], limits: Limits | None = None) -> None:
@@ -108,24 +120,62 @@ class ActorServer:
 
         self._transport.serve(key, handle)
 
-    def close(self, reason: str) -> None:
-        """Publish the end of the run with `reason`, and stop to serve. Idempotent."""
+    def close(self, reason: str, *, finished: bool = False) -> None:
+        """Publish that the learner ends, and stop the threads. The first call decides.
+
+        Until the transport is closed, every query is still answered: that the run is over, or that the learner stops.
+        """
         with self.lock:
-            if self._closed:
+            if self._ended:
                 return
-            self._closed = True
-            self.rollouts.end()
+            outcome = "finished" if finished else "stopped"
+            self._ended = encode(RunEnded(learner_epoch=self._epoch, outcome=outcome, reason=reason))
+            self._ended_at = time.monotonic()
+            self._were_cut_off = any(
+                self._ended_at < actor.last_seen + _LEAVE_SECONDS and not self.fleet.is_present(actor)
+                for actor in self.fleet.actors.values()
+            )
+        self._responses.end(self._ended, finished=finished)
+        self._publish_end()
+        with self.lock:
+            self.rollouts.end(finished=finished)
             self.lock.notify_all()
-        self.publisher.close(reason)
-        self.evaluations.close(reason)
+        self.publisher.close()
+        self.evaluations.end(reason, finished=finished)
         self._watchdog.close()
         self.rollouts.close()
 
-    def await_spaces(self, stop: threading.Event) -> Spaces | None:
-        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first."""
+    def _publish_end(self) -> None:
+        with contextlib.suppress(TransportError):  # the session is being replaced; actors receive a repetition
+            self._transport.publish(keys.run_end(self._run), self._ended)
+
+    def await_departures(self, stop: threading.Event) -> None:
+        """Wait until all actors have left, at most 5 s, and repeat that the run is over. Call after `close`."""
+        repeat_at = self._ended_at + _REPEAT_SECONDS
+        while self._expects_actors(time.monotonic()) and not stop.is_set():
+            with self.lock:
+                self.lock.wait(HEARTBEAT_SECONDS)
+            if time.monotonic() >= repeat_at:
+                self._publish_end()
+                repeat_at += _REPEAT_SECONDS
+        self._publish_end()  # to whoever has just begun to join
+
+    def _expects_actors(self, now: float) -> bool:
+        """Return whether an actor may not know of the end yet: it is present, was cut off, or is about to ask again."""
+        if now > self._ended_at + _LEAVE_SECONDS:
+            return False
+        with self.lock:
+            return bool(self.fleet.live) or self._were_cut_off or now < self._responses.postponed_at + _ASK_SECONDS
+
+    def await_spaces(self, stop: threading.Event, on_wait: Callable[[], None] = lambda: None) -> Spaces | None:
+        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first.
+
+        `on_wait` is called again and again meanwhile.
+        """
         hint_at: float | None = time.monotonic() + _HINT_SECONDS
         with self.lock:
             while self.fleet.spaces is None and not stop.is_set():
+                on_wait()
                 self.lock.wait(HEARTBEAT_SECONDS)
                 if hint_at is not None and time.monotonic() > hint_at:
                     _logger.info("waiting for the first actor: start one with `daedalus actor --connect ADDRESS`")
@@ -144,13 +194,27 @@ class ActorServer:
         actor = keys.parse_presence(key)
         if actor is not None:
             with self.lock:
-                self.fleet.set_present(*actor, present)
+                self.fleet.set_present(*actor, present, time.monotonic())
                 self.lock.notify_all()
 
     def _on_join(self, request: Request) -> None:
-        request.reply(self._responses.join(request.payload, time.monotonic()))
+        name = keys.last_chunk(request.key)
+        request.reply(self._responses.join(name, request.payload, time.monotonic()))
 
     def _on_status(self, request: Request) -> None:
+        request.reply(encode(self._status_answer(request)))
+
+    def _status_answer(self, request: Request) -> Message:
+        """Return the answer to a status query: the status, or the page of actors that an ActorsRequest names."""
+        if not request.size:
+            with self.lock:
+                return StatusReport(status=self._status())
+        try:
+            message = decode(request.payload, STATUS_REQUEST_LIMITS)
+        except ProtocolError as error:
+            return Refusal(code="malformed", reason=str(error))
+        if not isinstance(message, ActorsRequest):
+            return Refusal(code="malformed", reason="expected an ActorsRequest message")
         with self.lock:
-            status = self._status()
-        request.reply(encode(StatusReport(status=status)))
+            actors = page(self.fleet, message.after, time.monotonic())
+        return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))

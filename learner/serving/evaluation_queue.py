@@ -15,7 +15,7 @@ _M = TypeVar("_M")
 
 
 class EvaluationQueue:
-    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `close`.
+    """Bounded queue of messages on the `evaluations` keys. Accepts messages from `open` to `end`.
 
     It holds at most one request and one report of each evaluator: a newer message replaces the older one.
     """
@@ -25,18 +25,20 @@ class EvaluationQueue:
         # By evaluator, the oldest first.
         self._requests: dict[str, tuple[Request, EvaluationRequest]] = {}
         self._reports: dict[str, tuple[Request, EvaluationReport]] = {}
-        self._ready = self._closed = False
+        self._ready = False
+        self._ending: Refusal | None = None  # of all messages after the end
 
     def open(self) -> None:
         """Accept messages from now on. Called when there is a policy to evaluate."""
         self._ready = True
 
-    def close(self, reason: str) -> None:
+    def end(self, reason: str, *, finished: bool) -> None:
         """Refuse all waiting and all later messages, with `reason`."""
+        ending = Refusal(code="finished" if finished else "not_ready", reason=reason)
         with self._lock:
-            self._closed = True
+            self._ending = ending
         for request, _ in [*self.take_requests(), *self.take_reports()]:
-            request.reply(encode(Refusal(code="finished", reason=reason)))
+            request.reply(encode(ending))
 
     def offer(self, request: Request) -> None:
         """Queue a message of an evaluator, or refuse it. Does not block."""
@@ -51,14 +53,18 @@ class EvaluationQueue:
             request.reply(encode(Refusal(code="malformed", reason=reason)))
             return
         with self._lock:
-            if self._closed or not self._ready:
-                refused, reason = request, "no evaluation is possible now"
+            if self._ending is not None:
+                refused, refusal = request, self._ending
+            elif not self._ready:
+                refused, refusal = request, _refusal("no evaluation is possible now")
             elif isinstance(message, EvaluationRequest):
-                refused, reason = _put(self._requests, sender, (request, message)), "a newer request took its place"
+                refused = _put(self._requests, sender, (request, message))
+                refusal = _refusal("a newer request took its place")
             else:
-                refused, reason = _put(self._reports, sender, (request, message)), "a newer report took its place"
+                refused = _put(self._reports, sender, (request, message))
+                refusal = _refusal("a newer report took its place")
         if refused is not None:
-            refused.reply(encode(Refusal(code="finished" if self._closed else "not_ready", reason=reason)))
+            refused.reply(encode(refusal))
 
     def take_requests(self) -> list[tuple[Request, EvaluationRequest]]:
         """Return the waiting requests for a policy. The caller replies to each."""
@@ -71,6 +77,10 @@ class EvaluationQueue:
         with self._lock:
             taken, self._reports = self._reports, {}
         return list(taken.values())
+
+
+def _refusal(reason: str) -> Refusal:
+    return Refusal(code="not_ready", reason=reason)
 
 
 def _put(waiting: dict[str, tuple[Request, _M]], sender: str, entry: tuple[Request, _M]) -> Request | None:

@@ -14,13 +14,16 @@ from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
-_ROW_BYTES = 1 + 2 + 4 * 4 + 8  # per environment and row, without the observation, rounded up
+_ROW_BYTES = 27  # per environment and row, without the observation, rounded up
 _SLACK_BYTES = 64 << 10
-_OTHER_ARRAYS = 16  # besides observations, actions and masks
+_OTHER_ARRAYS = 16  # besides observations, actions, masks and scalars of info
+# Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
+# chooses its number, and zeros compress to nothing: the learner's memory must not depend on the actor.
+_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS = 64 << 20, 8
 # Largest magnitudes. No healthy actor comes near them, and beyond them squares overflow float32: updates would have no
 # finite gradient. The state of a GRU lies between -1 and 1.
 _LARGEST = {
@@ -53,6 +56,7 @@ class Intake:
         self._spec = spec
         self._epoch = learner_epoch
         self._fleet = fleet
+        self._envs_per_actor = spec.collection.envs_per_actor
         # A synchronous algorithm accepts only rollouts of the newest version.
         self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
         self.state_size = 0  # size of the recurrent state; set before any actor has the program
@@ -65,9 +69,9 @@ class Intake:
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
         if size <= _SLACK_BYTES:
             return None
-        if spaces is None or actor is None or not actor.environments:
+        if spaces is None or actor is None:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
-        plain, queue = self._limits(spaces, actor).message_bytes, self._spec.service.queue_bytes
+        plain, queue = self._limits(spaces, actor.environments).message_bytes, self._spec.service.queue_bytes
         if size > plain:
             reason = f"the message has {size:,} bytes, and a rollout of this actor at most {plain:,}"
             return Rejected(verdict="rejected", cause="malformed", reason=reason)
@@ -86,12 +90,20 @@ class Intake:
         result may change in the meantime.
         """
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
-        if spaces is None or actor is None or not actor.environments:
+        if spaces is None or actor is None:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=f"actor {sender!r} has not joined")
         if actor.quarantined:
             return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
+        limits = self._limits(spaces, actor.environments)
+        most = max(_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS * self._limits(spaces, self._envs_per_actor).max_bytes)
+        if limits.max_bytes > most:
+            reason = (
+                f"a rollout of {actor.environments} environments has {limits.max_bytes:,} bytes, at most {most:,} are "
+                "allowed: use fewer environments per actor (--envs)"
+            )
+            return Rejected(verdict="rejected", cause="unfit", reason=reason)
         try:
-            rollout = decode(data, self._limits(spaces, actor))
+            rollout = decode(data, limits)
         except ProtocolError as error:
             return Rejected(verdict="rejected", cause="malformed", reason=str(error))
         if not isinstance(rollout, Rollout):
@@ -124,6 +136,7 @@ class Intake:
             if isinstance(verdict, Rejected) and verdict.cause == "unfit":
                 actor.count_unfit(verdict.reason)
                 if actor.quarantined:
+                    self._fleet.changed()
                     verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 
@@ -157,17 +170,16 @@ class Intake:
             return Rejected(verdict="fenced", cause="unknown_actor", reason=reason)
         return None
 
-    def _limits(self, spaces: Spaces, actor: Actor) -> Limits:
-        """Return the size limits of a rollout, from the specification and the number of environments of the actor."""
+    def _limits(self, spaces: Spaces, environments: int) -> Limits:
+        """Return the size limits of a rollout, from the specification and the actor's number of environments."""
         row = _ROW_BYTES + sum(spaces.masks.values())
         row += sum(space.size * np.dtype(space.dtype).itemsize for space in spaces.actions.values())
-        size = self._spec.collection.rollout_length * row + 4 * self.state_size
+        rows = self._spec.collection.rollout_length
+        size = rows * row + 4 * self.state_size
         for space in spaces.observations.values():
-            frame = math.prod(space.shape) * np.dtype(space.dtype).itemsize
-            size += (self._spec.collection.rollout_length + space.frames) * frame
-        arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions)
-        padding = _SLACK_BYTES + arrays * 8
-        return Limits(max_bytes=actor.environments * size + padding, max_arrays=arrays)
+            size += (rows + space.frames) * math.prod(space.shape) * np.dtype(space.dtype).itemsize
+        arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions) + MAX_INFO_NAMES
+        return Limits(max_bytes=environments * size + _SLACK_BYTES, max_arrays=arrays)
 
     def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
@@ -210,6 +222,9 @@ def _number_violation(rollout: Rollout) -> str:
             return f"{name} has a value that is not finite"
         if max(-low, high) > largest:
             return f"{name} has a value beyond +-{largest:g}{_REMEDIES.get(name, '')}"
+    for name, values in rollout.episode_info.items():
+        if not np.isfinite(values).all():
+            return f"episode_info {name!r} has a value that is not finite"
     return ""
 
 

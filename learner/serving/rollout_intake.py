@@ -64,16 +64,19 @@ class RolloutIntake:
         self._buffer = _buffer(spec)
         self._requests = _queue(spec)
         self._named: set[str] = set()  # actors that were logged as left out
-        self._closed = False
+        self._ending: Acknowledgement | None = None  # of all rollouts after the end
         self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
 
     def open(self) -> None:
         """Start the intake thread."""
         self._thread.start()
 
-    def end(self) -> None:
-        """Answer every rollout `finished` from now on. The caller holds the lock."""
-        self._closed = True
+    def end(self, *, finished: bool) -> None:
+        """Answer every rollout `finished` from now on, `fenced` if the run is not over. The caller holds the lock."""
+        if finished:
+            self._ending = Acknowledgement(verdict="finished")
+        else:
+            self._ending = Acknowledgement(verdict="fenced", reason="the learner is stopping")
 
     def close(self) -> None:
         """Answer the queued rollouts, and stop the thread. Call after `end`, without the lock."""
@@ -98,8 +101,8 @@ class RolloutIntake:
 
     def offer(self, request: Request) -> None:
         """Queue a rollout, or answer busy. Does not block."""
-        if self._closed:
-            request.reply(encode(Acknowledgement(verdict="finished")))
+        if self._ending is not None:
+            request.reply(encode(self._ending))
         elif self._refuses_size(request):
             pass
         elif not self._requests.offer(request):
@@ -142,21 +145,24 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
-    def count_trained(self, rollouts: list[Rollout], at_fault: list[Rollout]) -> None:
+    def count_trained(self, rollouts: list[Rollout], left_out: list[Rollout]) -> None:
         """Count the rollouts of a batch for their senders, after its updates.
 
         Args:
           rollouts: the rollouts of the batch.
-          at_fault: those for which an update had no finite gradient.
+          left_out: those that were left out of updates, because they have no finite gradient.
         """
         with self._lock:
             for rollout in rollouts:
-                finite = not any(rollout is each for each in at_fault)
+                finite = not any(rollout is each for each in left_out)
                 actor = self._fleet.find(rollout.identity)
                 if actor is not None:
                     actor.count_trained(finite=finite)
                 if not finite:
+                    self._fleet.changed()
                     self._counters.rollouts_rejected["non_finite"] += 1
+                if not finite and actor is not None and actor.rejected["non_finite"] == 1:
+                    _logger.warning("a rollout of actor %r has no finite gradient, and was left out", actor.name)
 
     def _take(self, version: int) -> TakenRollouts:
         taken = self._buffer.take(self._fleet.live, version, time.monotonic())
@@ -198,7 +204,7 @@ class RolloutIntake:
             content = self._intake.read(sender, payload)
             with self._lock:
                 answer = self._judge(sender, content, len(payload))
-            request.reply(encode(Acknowledgement(verdict="finished") if self._closed else answer))
+            request.reply(encode(self._ending or answer))
 
     def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
@@ -225,7 +231,7 @@ class RolloutIntake:
 
     def _store(self, rollout: Rollout, size: int) -> None:
         """Put a rollout into the buffer, and wait for room first. The late answer slows the sender down."""
-        while not self._buffer.has_room_for(rollout) and not self._closed:
+        while not self._buffer.has_room_for(rollout) and self._ending is None:
             self._lock.wait(HEARTBEAT_SECONDS)
         self._buffer.add(rollout)
         self._counters.accepted(rollout, size)

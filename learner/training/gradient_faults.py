@@ -1,30 +1,33 @@
-"""Which rollouts of a batch are at fault if an update has no finite gradient. Rare, so it may be slow."""
+"""Which rollouts of a batch are at fault if the gradient of an update is not finite. Rare, so it may be slow."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
-from daedalus.algorithms.batch import BatchAssembler
+from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spaces import Spaces
 
 
 def rollouts_at_fault(
-    gradients: GradientComputer, spaces: Spaces, device: torch.device, rollouts: Sequence[Rollout]
+    gradients: GradientComputer, joined: Callable[[Sequence[Rollout]], Batch], rollouts: Sequence[Rollout]
 ) -> list[Rollout]:
     """Return the rollouts that have no finite gradient of their own at the present parameters.
 
     Return none if a rollout of zeros has no finite gradient either: then the parameters are at fault, and no sender.
     The gradients of the parameters are overwritten; the parameters are not changed.
+
+    Args:
+      gradients: computes the gradients of a batch.
+      joined: returns the batch of rollouts, as the updates have it.
+      rollouts: the rollouts of the batch.
     """
 
     def is_finite(rollout: Rollout) -> bool:
-        batch = BatchAssembler(spaces, device).join([rollout]).to(device)
         # All updates of the batch, because a minibatch has only some of its rows.
-        return all(bool(gradients.parameters.gradients.norm().isfinite()) for _ in gradients.compute(batch, 0.0))
+        updates = gradients.compute(joined([rollout]), 0.0)
+        return all(bool(gradients.parameters.gradients.norm().isfinite()) for _ in updates)
 
     if not is_finite(_of_zeros(rollouts[0])):
         return []

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import BatchAssembler
-from daedalus.algorithms.gradients import GradientComputer, Terms
+from daedalus.algorithms.batch import Batch, BatchAssembler
+from daedalus.algorithms.diagnostics import diagnostics
+from daedalus.algorithms.gradients import GradientComputer
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.gradient_faults import rollouts_at_fault
@@ -17,6 +18,8 @@ from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -25,8 +28,12 @@ from daedalus.protocol.spec import PolicySpec, TrainingSpec
 class Learner:
     """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
-    def __init__(self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces) -> None:
+    def __init__(
+        self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES
+    ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
+
+        `modules` may be imported for the policy.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces.
         """
@@ -39,7 +46,7 @@ class Learner:
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
         self._device = torch.device(spec.device)
-        self._network = ActorCritic(policy, spaces).to(self._device)
+        self._network = ActorCritic(policy, spaces, modules).to(self._device)
         self._gradients = GradientComputer(spec, self._network)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
@@ -57,34 +64,56 @@ class Learner:
         return self._network.state_size
 
     def step(self, rollouts: Sequence[Rollout], progress: float) -> list[Rollout]:
-        """Make all updates of one batch. Return the rollouts that are at fault if an update was skipped.
+        """Make all updates of one batch. Return the rollouts that were left out of updates.
+
+        If the gradient of an update is not finite, the update is repeated without the rollouts at fault. If no rollout
+        is at fault, or all are, the remaining updates of the batch are skipped: new versions with unchanged parameters.
 
         Args:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
-        batch = self._assembler.join(rollouts)
+        end = self.policy_version + self._updates_of(rollouts)
         if self._rewards is not None:
-            self._rewards.normalize(batch, rollouts)
-        batch = batch.to(self._device)
-        skipped = self.updates_skipped
+            self._rewards.add(rollouts)
+        kept, left_out = list(rollouts), []
+        while kept and not self._make_updates(kept, progress, end):
+            at_fault = rollouts_at_fault(self._gradients, self._joined, kept)
+            left_out += at_fault
+            kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
+        self.updates_skipped += end - self.policy_version
+        self.policy_version = end
+        return left_out
+
+    def _updates_of(self, rollouts: Sequence[Rollout]) -> int:
+        """Return the number of policy versions that a batch of these rollouts makes."""
+        if self.state_size:
+            return self._spec.updates_from(sum(rollout.environments for rollout in rollouts))
+        return self._spec.updates_from(sum(int(np.count_nonzero(rollout.valid)) for rollout in rollouts))
+
+    def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
+        """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
+        batch = self._joined(rollouts)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
+            norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
+            size = float(norm)
+            if not math.isfinite(size):  # such a step would set all parameters to nan for the rest of the run
+                return False
             self.policy_version += 1
-            self._apply_gradients(terms, self.learning_rate(progress))
+            self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
+            self.metrics.add_update(terms, norm, clipped=size > self._spec.max_gradient_norm)
+            if self.policy_version == end:
+                break
         self._observations.add(batch)
         self.metrics.add_batch(batch)
-        if self.updates_skipped == skipped:
-            return []
-        return rollouts_at_fault(self._gradients, self._spaces, self._device, rollouts)
+        return True
 
-    def _apply_gradients(self, terms: Terms, learning_rate: float) -> None:
-        """Take one optimiser step with the gradients that were computed last."""
-        norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
-            self.updates_skipped += 1
-            return
-        self._optimizer.step(self._flat.values, self._flat.gradients, learning_rate)
-        self.metrics.add_update(terms, norm)
+    def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
+        """Return the batch of the rollouts, with normalised rewards, on the device."""
+        batch = self._assembler.join(rollouts)
+        if self._rewards is not None:
+            self._rewards.scale(batch)
+        return batch.to(self._device)
 
     def learning_rate(self, progress: float) -> float:
         """Return the learning rate at a share of the budget."""
@@ -93,6 +122,12 @@ class Learner:
     def entropy_bonus(self, progress: float) -> float:
         """Return the weight of the entropy in the loss at a share of the budget."""
         return _annealed(self._spec.entropy_bonus, self._spec.entropy_bonus_final, progress)
+
+    def take_diagnostics(self) -> dict[str, float]:
+        """Return the diagnostics of the newest batch (algorithms/diagnostics.py), once; empty without a new batch."""
+        first_pass = self._gradients.take_first_pass()
+        rho_clip = self._spec.rho_clip if ALGORITHMS[self._spec.algorithm].corrected else None
+        return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
     # ----------------------------------------------------------------------------- for actors and checkpoints
 

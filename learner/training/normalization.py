@@ -81,15 +81,13 @@ class RewardNormalizer:
         self.moments = RunningMoments(())
         self._running: dict[str, tuple[RolloutIdentity, np.ndarray]] = {}  # by actor: last rollout, G of it [E]
 
-    def normalize(self, batch: Batch, rollouts: Sequence[Rollout]) -> None:
-        """Add the returns of a batch to the statistics, and scale the rewards of the batch in place.
-
-        Args:
-          batch: the rollouts joined.
-          rollouts: in the same order.
-        """
+    def add(self, rollouts: Sequence[Rollout]) -> None:
+        """Add the returns of rollouts to the statistics."""
         seen = [self._returns(rollout)[rollout.valid] for rollout in rollouts]
         self.moments.add(torch.from_numpy(np.concatenate(seen)))
+
+    def scale(self, batch: Batch) -> None:
+        """Scale the rewards of a batch in place."""
         deviation = float(self.moments.variance.sqrt())
         batch.rewards.div_(max(deviation, 1e-8)).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
 

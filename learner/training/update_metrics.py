@@ -11,7 +11,8 @@ from daedalus.algorithms.gradients import Terms
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
-METRICS = (*Terms._fields, GRADIENT_NORM)
+GRADIENT_CLIPPED_FRACTION = "gradient_clipped_fraction"  # share of the updates
+METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION)
 
 
 class UpdateMetrics:
@@ -24,8 +25,8 @@ class UpdateMetrics:
         arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
         self._image = next((name for name, space in arrays.items() if _shows_image(space)), None)
         self._image_space = arrays.get(self._image or "")
-        self._sums = torch.zeros(len(METRICS), device=device)
-        self._updates = 0
+        self._sums = torch.zeros(len(METRICS) - 1, device=device)
+        self._updates = self._clipped_updates = 0
         self._action_counts = {
             name: torch.zeros(space.choices, dtype=torch.int64, device=device)
             for name, space in spaces.actions.items()
@@ -38,10 +39,11 @@ class UpdateMetrics:
         }
         self._newest: Tensor | None = None  # the first image of the newest batch
 
-    def add_update(self, terms: Terms, gradient_norm: Tensor) -> None:
-        """Add the metrics of an update that changed the parameters."""
+    def add_update(self, terms: Terms, gradient_norm: Tensor, clipped: bool) -> None:
+        """Add the metrics of an update that changed the parameters, with a clipped gradient or not."""
         self._sums += torch.stack([*terms, gradient_norm])
         self._updates += 1
+        self._clipped_updates += clipped
 
     def add_batch(self, batch: Batch) -> None:
         """Count the actions of a batch, and keep one of its observations."""
@@ -56,9 +58,9 @@ class UpdateMetrics:
         """Return means over the updates since the last call, by name; empty if there were no updates."""
         if not self._updates:
             return {}
-        means = (self._sums / self._updates).tolist()
+        means = [*(self._sums / self._updates).tolist(), self._clipped_updates / self._updates]
         self._sums.zero_()
-        self._updates = 0
+        self._updates = self._clipped_updates = 0
         return dict(zip(METRICS, means, strict=True))
 
     def take_action_counts(self) -> dict[str, list[int]]:

@@ -8,6 +8,7 @@ from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
 from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -22,17 +23,17 @@ class ActorCritic(nn.Module):
     Learning calls `forward`; acting needs only `act`, which is what the exported program computes.
     """
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise NetworkError if the encoder or the distribution does not support the spaces."""
+    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+        """Raise NetworkError if the encoder or the distribution does not fit the spaces, or may not be imported."""
         super().__init__()
-        self.distribution = ActionDistribution(spec, spaces)
+        self.distribution = ActionDistribution(spec, spaces, modules)
         self.normalizer = ObservationNormalizer(spaces.observations if spec.normalize_observations else {})
-        self.encoder = build_encoder(spec, spaces.observations)
+        self.encoder = build_encoder(spec, spaces.observations, modules)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1))
-        self.value_encoder = build_encoder(spec, spaces.observations) if spec.separate_value_encoder else None
+        self.value_encoder = build_encoder(spec, spaces.observations, modules) if spec.separate_value_encoder else None
 
     @property
     def state_size(self) -> int:

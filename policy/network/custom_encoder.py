@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 
 ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
@@ -18,14 +19,17 @@ ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 class CustomEncoder(nn.Module):
     """The user's module, imported, constructed and checked."""
 
-    def __init__(self, name: str, spaces: ObservationSpaces) -> None:
-        """Raise NetworkError, naming the encoder, if it cannot be imported, constructed or called."""
+    def __init__(self, name: str, spaces: ObservationSpaces, modules: UserModules) -> None:
+        """Raise NetworkError, naming the encoder, if it may not be imported, or cannot be constructed or called."""
         super().__init__()
         self._only = next(iter(spaces)) if len(spaces) == 1 else None
         shapes = {component: space.stacked_shape for component, space in spaces.items()}
         try:
-            self.module = find_class(name, nn.Module)(shapes if self._only is None else shapes[self._only])
+            encoder = find_class("policy.encoder", name, nn.Module, modules)
+            self.module = encoder(shapes if self._only is None else shapes[self._only])
             self.features = _checked_features(self.module, self._inputs(_zeros(spaces)))
+        except UserModuleError as error:
+            raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
         except Exception as error:  # the user's code may raise anything

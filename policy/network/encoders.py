@@ -14,11 +14,13 @@ from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, 
 from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.layers import orthogonal
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _GAIN = math.sqrt(2.0)
+_SMALLEST_FOR_NATURE = 36  # pixels of the shorter side
 
 Observations = dict[str, Tensor]
 
@@ -64,10 +66,10 @@ class ArrayEncoder(nn.Module):
 class CompositeEncoder(nn.Module):
     """An encoder for each image, and a multilayer perceptron for everything else; their features side by side."""
 
-    def __init__(self, images: ObservationSpaces, others: ObservationSpaces, spec: PolicySpec) -> None:
+    def __init__(self, images: dict[str, ArraySpace], others: ObservationSpaces, spec: PolicySpec) -> None:
         super().__init__()
         self._names = tuple(images)
-        encoders = [_array_encoder(spec, space) for space in images.values()]
+        encoders = [_image_encoder(spec.encoder, space) for space in images.values()]
         self.images = nn.ModuleList(encoders)
         self.others = FlatEncoder(others, spec) if others else None
         self.features = sum(encoder.features for encoder in encoders)
@@ -84,23 +86,24 @@ class CompositeEncoder(nn.Module):
 Encoder = FlatEncoder | ArrayEncoder | CompositeEncoder | CustomEncoder
 
 
-def build_encoder(spec: PolicySpec, spaces: ObservationSpaces) -> Encoder:
+def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModules = NO_MODULES) -> Encoder:
     """Return the encoder that the specification names, for observations of the spaces.
 
     Of several components, images go through the named encoder, everything else through the multilayer perceptron.
 
-    Raises NetworkError if a custom encoder cannot be imported, or the encoder does not accept such observations.
+    Raises NetworkError if a custom encoder may not or cannot be imported, or the encoder does not accept the
+    observations.
     """
-    if spec.encoder == "mlp":
-        return FlatEncoder(spaces, spec)
     if ":" in spec.encoder:
-        return CustomEncoder(spec.encoder, spaces)
+        return CustomEncoder(spec.encoder, spaces, modules)
+    images = {name: space for name, space in spaces.items() if isinstance(space, ArraySpace) and space.is_image}
+    if spec.encoder == "mlp" or (spec.encoder == "auto" and not images):
+        return FlatEncoder(spaces, spec)
     if len(spaces) == 1:
         name, space = next(iter(spaces.items()))
-        return ArrayEncoder(name, _array_encoder(spec, space))
-    images: ObservationSpaces = {
-        name: space for name, space in spaces.items() if isinstance(space, ArraySpace) and space.is_image
-    }
+        if isinstance(space, DiscreteSpace):
+            raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")
+        return ArrayEncoder(name, _image_encoder(spec.encoder, space))
     if not images:
         raise NetworkError(
             f"the encoder {spec.encoder!r} takes images, but the observations have none: set policy.encoder to mlp"
@@ -108,10 +111,10 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces) -> Encoder:
     return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec)
 
 
-def _array_encoder(spec: PolicySpec, space: ArraySpace | DiscreteSpace) -> ImageEncoder:
-    if isinstance(space, DiscreteSpace):
-        raise NetworkError(f"the encoder {spec.encoder!r} takes arrays, not {space}: set policy.encoder to mlp")
-    match spec.encoder:
+def _image_encoder(name: str, space: ArraySpace) -> ImageEncoder:
+    if name == "auto":
+        name = "nature" if min(sorted(space.shape)[-2:]) >= _SMALLEST_FOR_NATURE else "impala"
+    match name:
         case "nature":
             return nature(space)
         case "small":

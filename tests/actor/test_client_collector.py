@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from collectors import started_collector
 
 from daedalus.actor.collecting.client_collector import _MAX_FULL_ROLLOUTS, ClientCollector
@@ -32,7 +33,7 @@ class Played:
 
     def __init__(self, spec: RunSpec) -> None:
         self.spec = spec
-        environments = make_environments(spec.environment, 1)
+        environments = make_environments(spec.environment, 1, modules=TEST_MODULES)
         self.spaces = environments.spaces
         environments.close()
         policy = spec.policy.model_copy(update={"memory": "gru", "memory_units": 4, "hidden": (8,)})

@@ -151,7 +151,12 @@ def only_part(data: bytes, parts: int = 1) -> bytes:
 
 @pytest.mark.parametrize(
     "answer",
-    [b"junk", only_part(b"x", 2**40), only_part(b"x"), only_part(encode(RunEnded(learner_epoch=5, reason="")))],
+    [
+        b"junk",
+        only_part(b"x", 2**40),
+        only_part(b"x"),
+        only_part(encode(RunEnded(learner_epoch=5, outcome="finished", reason=""))),
+    ],
     ids=["junk", "too many parts", "a part of nothing", "a part of something else"],
 )
 def test_invalid_answer_ends_the_fetch_and_the_next_succeeds(ends: tuple[Learner, Fetcher], answer: bytes) -> None:
@@ -168,5 +173,5 @@ def test_invalid_answer_ends_the_fetch_and_the_next_succeeds(ends: tuple[Learner
 def test_run_ended_is_passed_on(ends: tuple[Learner, Fetcher]) -> None:
     learner, fetcher = ends
     fetcher.request_newest()
-    learner.requests.get(timeout=LIMIT).reply(encode(RunEnded(learner_epoch=5, reason="over")))
-    assert fetcher.take() == RunEnded(learner_epoch=5, reason="over")
+    learner.requests.get(timeout=LIMIT).reply(encode(RunEnded(learner_epoch=5, outcome="finished", reason="over")))
+    assert fetcher.take() == RunEnded(learner_epoch=5, outcome="finished", reason="over")

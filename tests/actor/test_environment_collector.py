@@ -11,6 +11,7 @@ from collectors import collect, started_collector
 from daedalus.policy.acting.sampling import RandomSource
 
 from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
@@ -240,3 +241,48 @@ def test_cartpole_vector_entry_point_resets_after_truncations_too() -> None:
     assert (np.abs(rollout.frames[6]) <= 0.05).all()  # the start of an episode
     assert (np.abs(rollout.frames[5]) > 0.05).any()  # the true last observation
     np.testing.assert_array_equal(rollout.episode_lengths, [5] * 6)
+
+
+class Seeds:
+    """Environments that keep the seed of their reset, and a policy that keeps its random numbers."""
+
+    count, state_size = 1, 0
+    spaces = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=DiscreteSpace(count=4))
+
+    def __init__(self) -> None:
+        self.seed = -1
+        self.random: RandomSource | None = None
+
+    def reset(self, seed: int) -> np.ndarray:
+        self.seed = seed
+        return np.zeros((1, 2), np.float32)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return np.zeros((1, 2), np.float32), np.zeros(1), np.zeros(1, np.bool_), np.zeros(1, np.bool_)
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        pass
+
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self.random = self.random or copy.deepcopy(random)
+        return np.zeros(1, np.int64), np.zeros(1, np.float32), state
+
+
+def test_environments_and_actions_draw_from_different_random_numbers() -> None:
+    """With one seed for both, the numbers that choose the actions would be those of the environment."""
+    drawn = []
+    for seed in (1, 2):
+        both = Seeds()
+        collect(started_collector(COUNTING, both, rollout_length=1, seed=seed, environments=both))
+        assert both.random is not None
+        of_environment = np.random.default_rng(both.seed).random(4, np.float32).tolist()
+        drawn += [of_environment, both.random.random(4, np.float32).tolist()]
+    assert len({tuple(numbers) for numbers in drawn}) == 4

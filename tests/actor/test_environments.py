@@ -6,9 +6,11 @@ from typing import Literal
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -67,7 +69,9 @@ def test_unknown_environment_error_suggests_close_matches() -> None:
 
 def test_missing_module_is_named() -> None:
     with pytest.raises(EnvironmentSetupError, match="cannot import no_such_module"):
-        make_environments(EnvironmentSpec(id="no_such_module:Mine-v0"), 1)
+        make_environments(
+            EnvironmentSpec(id="no_such_module:Mine-v0"), 1, modules=UserModules(frozenset({"no_such_module"}))
+        )
 
 
 def test_continuous_actions_require_a_table() -> None:
@@ -115,7 +119,7 @@ def test_unsupported_observation_space_is_named() -> None:
 @pytest.mark.parametrize("backend", ["envpool", "ale"])
 def test_other_backends_refuse_gymnasium_options(backend: Literal["envpool", "ale"]) -> None:
     with pytest.raises(EnvironmentSetupError, match=f"backend={backend} does not support wrap"):
-        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, wrap="module:function")
+        make_environments(EnvironmentSpec(id="Pong-v5", backend=backend, wrap="corridor:wrap"), 1, modules=TEST_MODULES)
     with pytest.raises(EnvironmentSetupError, match="does not support render_mode"):
         make_environments(EnvironmentSpec(id="Pong-v5", backend=backend), 1, render_mode="human")
 

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 from daedalus.policy.acting.sampling import RandomSource
 
@@ -36,7 +37,7 @@ def runtime(spaces: Spaces, **policy: Any) -> OnnxRuntime:
 def played(
     spec: EnvironmentSpec, count: int, *, sampled: bool = True, episodes: int = EPISODES, seed: int = 1, **policy: Any
 ) -> Evaluation:
-    environments = make_environments(spec, count, for_evaluation=True)
+    environments = make_environments(spec, count, modules=TEST_MODULES, for_evaluation=True)
     try:
         return play_episodes(runtime(environments.spaces, **policy), environments, episodes, seed, sampled=sampled)
     finally:

@@ -4,6 +4,7 @@ import os
 from typing import Any
 
 import numpy as np
+from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 from daedalus.policy.acting.sampling import RandomSource
 
@@ -66,7 +67,7 @@ def one_by_one(episodes: int) -> list[tuple[float, int]]:
 
 
 def counting(count: int, **fields: Any) -> VectorEnvironment:
-    return make_environments(COUNTING.model_copy(update=fields), count, for_evaluation=True)
+    return make_environments(COUNTING.model_copy(update=fields), count, modules=TEST_MODULES, for_evaluation=True)
 
 
 def test_each_environment_plays_one_episode_of_each_round() -> None:
@@ -103,13 +104,36 @@ def test_progress_is_reported_after_every_step() -> None:
         3,
         1,
         sampled=False,
-        progress=lambda finished, mean: reports.append((finished, mean)),
+        progress=lambda finished, mean: bool(reports.append((finished, mean))),
     )
     # Steps 1 to 3 end the first episode of both; two more end the second episode of the first.
     assert [finished for finished, _ in reports] == [0, 0, 2, 2, 3]
     assert np.isnan([mean for _, mean in reports[:2]]).all()
     assert [mean for _, mean in reports[2:]] == [3, 3, 9]
     assert evaluation.returns.tolist() == [3, 3, 21]
+
+
+def test_episodes_that_do_not_end_are_cut_and_the_next_round_begins() -> None:
+    """By hand: 0+1+2 and 10+11 end; without a cut the third episode would last 100 steps."""
+    environments = counting(1, kwargs={"ends": [3, -2, 100]})
+    evaluation = play_episodes(AlwaysZero(), environments, 4, 1, sampled=False, longest=4)
+    assert evaluation.returns.tolist() == [3, 21, 20 + 21 + 22 + 23, 93]
+    assert evaluation.lengths.tolist() == [3, 2, 4, 3]
+    assert evaluation.cut.tolist() == [False, False, True, False]
+
+
+def test_an_episode_that_ends_with_its_last_step_is_not_cut() -> None:
+    evaluation = play_episodes(AlwaysZero(), counting(2), 3, 1, sampled=False, longest=3)
+    assert evaluation.cut.tolist() == [False] * 3
+
+
+def test_progress_may_end_the_evaluation() -> None:
+    """The episodes that began are counted, with the part that was played."""
+    steps = iter([False, False, False, True])
+    evaluation = play_episodes(AlwaysZero(), counting(2), 6, 1, sampled=False, progress=lambda *_: next(steps))
+    assert evaluation.returns.tolist() == [3, 3, 10, 10]
+    assert evaluation.lengths.tolist() == [3, 3, 1, 1]
+    assert evaluation.cut.tolist() == [False, False, True, True]
 
 
 def test_environments_in_processes_are_limited_per_processor() -> None:

@@ -12,9 +12,7 @@ from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol.messages import (
     Join,
-    Message,
     Refusal,
-    RunEnded,
 )
 from daedalus.transport.memory import MemoryNetwork
 
@@ -55,6 +53,15 @@ def test_evaluator_samples_if_the_run_says_so(network: MemoryNetwork) -> None:
     finally:
         evaluator.end(learner)
     assert seen - {0.0}
+
+
+def test_evaluated_episodes_are_not_cut_by_the_no_reward_limit(network: MemoryNetwork) -> None:
+    """The first reward of the first episode is 0, at which training would cut it."""
+    learner = ScriptedLearner(network, run_spec(no_reward_limit=1))
+    evaluator = RunningEvaluator(network)
+    learner.give(learner.snapshot(version=1))
+    assert learner.receive_report().lengths.tolist() == [3, 3]
+    evaluator.end(learner)
 
 
 def test_each_evaluation_uses_the_policy_given_then(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
@@ -147,13 +154,8 @@ def test_evaluator_ends_after_its_timeout_without_a_learner(network: MemoryNetwo
 # ---------------------------------------------------------------------------------------------------- its end
 
 
-@pytest.mark.parametrize(
-    "answer", [RunEnded(learner_epoch=1, reason="solved"), Refusal(code="finished", reason="solved")]
-)
-def test_evaluator_ends_when_the_run_is_over(
-    learner: ScriptedLearner, evaluator: RunningEvaluator, answer: Message
-) -> None:
-    learner.give(answer)
+def test_evaluator_ends_when_the_run_is_over(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
+    learner.give(Refusal(code="finished", reason="solved"))
     evaluator.join()
     assert evaluator.error is None
     assert LINES[-1] == "the run is over"
@@ -187,6 +189,9 @@ class Endless:
         self.playing.set()
         over = np.full(2, self.over)
         return np.zeros((2, 2), np.float32), np.zeros(2), over, np.zeros(2, np.bool_)
+
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
 
     def close(self) -> None:
         self.closed.set()

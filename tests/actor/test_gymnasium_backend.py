@@ -3,20 +3,26 @@
 import os
 import signal
 import sys
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 
+from daedalus.actor.environments import make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps, make_gymnasium
 from daedalus.actor.environments.interface import VectorEnvironment
-from daedalus.actor.environments.make import make_environments
+from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spec import EnvironmentSpec
+
+make_environments = partial(make.make_environments, modules=TEST_MODULES)
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5
 
@@ -110,7 +116,7 @@ def test_second_reset_restarts_all_episodes() -> None:
 
 def test_wrapper_is_applied_before_the_repeats() -> None:
     wrap = "picture_environment:with_doubled_rewards"
-    environments = make_environments(_counting(action_repeat=2), 1, wrap=wrap)
+    environments = make_environments(_counting(action_repeat=2, wrap=wrap), 1)
     environments.reset(1)
     assert _rows(environments, [0, 0])[1] == ([0.0, 3.0], 4.0, True, False)
 
@@ -118,15 +124,29 @@ def test_wrapper_is_applied_before_the_repeats() -> None:
 @pytest.mark.parametrize(
     ("wrap", "reason"),
     [
-        ("no_such_module:function", "cannot import no_such_module"),
-        ("picture_environment:no_such_function", "no such function"),
-        ("picture_environment", "name it as module:function"),
+        ("no_such_module:function", "the module no_such_module may not be imported here"),
+        ("picture_environment:no_such_function", "picture_environment.py has no 'no_such_function'"),
+        ("picture_environment:__doc__", "is not a function: name it as module:function"),
         ("picture_environment:with_nothing_to_play", "returned str for .*must return a gymnasium.Env"),
     ],
 )
 def test_invalid_wrapper_is_reported(wrap: str, reason: str) -> None:
-    with pytest.raises(EnvironmentSetupError, match=f"wrap {wrap}.*{reason}"):
-        make_environments(_picture(), 1, wrap=wrap)
+    with pytest.raises(EnvironmentSetupError, match=f"environment.wrap={wrap}.*{reason}"):
+        make_environments(_picture(wrap=wrap), 1)
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_the_module_of_an_environment_is_not_imported_unless_it_is_allowed(
+    processes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trap.py").write_text("import pathlib; pathlib.Path('sprung').touch()")
+    monkeypatch.chdir(tmp_path)
+    for spec in (EnvironmentSpec(id="trap:Env-v0"), EnvironmentSpec(id="CartPole-v1", wrap="trap:wrap")):
+        for make_some in (make.make_environments, make_gymnasium):
+            with pytest.raises(EnvironmentSetupError, match="the module trap may not be imported here"):
+                make_some(spec.model_copy(update={"processes": processes}), 1, modules=NO_MODULES)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["trap.py"]
+    assert str(tmp_path) not in sys.path
 
 
 def test_camera_receives_every_step_of_the_environment() -> None:
@@ -173,7 +193,7 @@ def test_processes_give_the_same_steps_as_one_process() -> None:
 
 
 def _processes(**fields) -> EnvironmentProcesses:
-    return EnvironmentProcesses([EnvironmentFactory(spec=_counting(**fields))] * 2)
+    return EnvironmentProcesses([EnvironmentFactory(spec=_counting(**fields), modules=TEST_MODULES)] * 2)
 
 
 def test_close_ends_the_processes() -> None:

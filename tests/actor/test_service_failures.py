@@ -7,7 +7,7 @@ from log_lines import LINES
 from processes import LIMIT, until
 from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
-from daedalus.actor.session import learner_queries, session_monitor
+from daedalus.actor.session import learner_queries, service, session_monitor
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -47,7 +47,9 @@ def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningA
     learner.publish(0)
     _, request = learner.receive()
     if how == "run_ended":
-        learner.transport.publish(keys.snapshots("r"), encode(RunEnded(learner_epoch=1, reason="solved")))
+        learner.transport.publish(
+            keys.run_end("r"), encode(RunEnded(learner_epoch=1, outcome="finished", reason="solved"))
+        )
         acknowledge(request, "accepted")
     else:
         acknowledge(request, "finished")
@@ -60,7 +62,7 @@ def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: Ru
     learner = ScriptedLearner(network)
     learner.publish(0)
     _, request = learner.receive()
-    learner.transport.publish(keys.snapshots("r"), b"\xff" * 100)
+    learner.snapshot = b"\xff" * 100
     acknowledge(request, "accepted")
     _, request = learner.receive()
     acknowledge(request, "accepted")
@@ -107,7 +109,7 @@ def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
         welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
-        transport.serve(keys.join(run), lambda request, welcome=welcome: request.reply(welcome))
+        transport.serve(keys.join(run, "*"), lambda request, welcome=welcome: request.reply(welcome))
     actor = RunningActor(network)
     actor.join()
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
@@ -158,9 +160,9 @@ def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
     for _ in range(3):
         assert learner.joins.get(timeout=LIMIT).spaces is None  # the probe is answered: the learner is only slow
     assert not any("went away" in text for text in LINES)
-    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # no valid message
+    learner.transport.serve(keys.join("r", "*"), lambda request: request.reply(b""))  # no valid message
     until(lambda: any("went away" in text for text in LINES))
-    learner.transport.serve(keys.join("r"), learner._join)
+    learner.transport.serve(keys.join("r", "*"), learner._join)
     again = learner.receive()
     assert again[0].identity in [rollout.identity for rollout, _ in held]  # the same rollout again
 
@@ -185,3 +187,28 @@ def test_actor_reopens_its_transport_while_nobody_answers(
     actor.stop.set()
     actor.join()
     assert actor.error is None
+
+
+@pytest.mark.parametrize("stopped_in", ["join", "program"])
+def test_an_actor_that_is_stopped_during_a_query_sends_no_other_query(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch, stopped_in: str
+) -> None:
+    """Each query may take 5 s, and a process has 5 s to end."""
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    actor = RunningActor(network, begin=False)
+    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
+    query, sent = actor.transport.query, list[str]()
+
+    def stopping_query(key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
+        sent.append(key)
+        if f"/{stopped_in}" in key:
+            actor.stop.set()
+        return query(key, payload, timeout=timeout)
+
+    monkeypatch.setattr(actor.transport, "query", stopping_query)
+    actor.begin()
+    actor.join()
+    assert actor.error is None
+    assert [f"/{stopped_in}" in key for key in sent].count(True) == 1
+    assert f"/{stopped_in}" in sent[-1]

@@ -1,6 +1,7 @@
 """ActorService against a scripted learner, over the memory transport: which snapshots it collects with."""
 
 import threading
+from collections.abc import Callable
 
 import pytest
 from log_lines import LINES
@@ -9,6 +10,7 @@ from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session import learner_queries, service
+from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
@@ -17,6 +19,7 @@ from daedalus.protocol.messages import (
     RolloutIdentity,
     Snapshot,
 )
+from daedalus.transport.interface import Inbox
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 
@@ -34,15 +37,21 @@ def test_window_is_larger_on_a_slow_link_before_the_first_acknowledgement(networ
 def test_actor_never_subscribes_on_a_link_measured_as_slow(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    followed: list[object] = []
-    monkeypatch.setattr(MemoryTransport, "subscribe", lambda *arguments: followed.append(arguments))
+    followed: list[str] = []
+    subscribe = MemoryTransport.subscribe
+
+    def noted(transport: MemoryTransport, key: str, on_news: Callable[[], None]) -> Inbox:
+        followed.append(key)
+        return subscribe(transport, key, on_news)
+
+    monkeypatch.setattr(MemoryTransport, "subscribe", noted)
     monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
     learner = ScriptedLearner(network)
     learner.publish(3)
     actor = RunningActor(network)
     assert learner.receive()[0].policy_version == 3
     assert any(text.startswith("slow link: ") for text in LINES)
-    assert followed == []
+    assert followed == [keys.run_end("r")]
     actor.stop.set()
     actor.join()
 
@@ -70,14 +79,46 @@ def test_actor_collects_with_the_newest_snapshot(network: MemoryNetwork, actor: 
     assert versions[-1] >= 5
 
 
+def test_actor_fetches_its_snapshots_once_or_twice_for_a_rollout_and_is_pushed_none(
+    network: MemoryNetwork, actor: RunningActor
+) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    rollouts = 40
+    for version in range(1, rollouts + 1):
+        rollout, request = learner.receive()
+        learner.publish(version)
+        acknowledge(request, "accepted", version)
+    assert rollout.policy_version >= rollouts - 3  # two rollouts are in flight
+    assert rollouts / 2 <= len(learner.fetches) <= 2 * rollouts + 2
+    assert all(not fetch.compact and fetch.actor == "a" for fetch in learner.fetches)
+    assert [fetch.held_version for fetch in learner.fetches] == sorted(fetch.held_version for fetch in learner.fetches)
+    subscriptions = {inbox.key for inbox in actor.transport._inboxes} - {""}  # without those that were closed
+    assert subscriptions == {keys.run_end("r")}
+
+
+def test_actor_plays_with_its_snapshot_if_a_fetch_has_no_answer(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    _, request = learner.receive()
+    learner.snapshot = b""
+    acknowledge(request, "accepted", 4)
+    rollout, request = learner.receive()
+    assert rollout.policy_version == 3
+    learner.publish(5)
+    while rollout.policy_version < 5:
+        acknowledge(request, "accepted", 5)
+        rollout, request = learner.receive()
+
+
 class SlowClient(EnvironmentCollector):
     """A collector whose rollouts are complete only after weights of version 1 came."""
 
     def has_rollout(self) -> bool:
         return self._policy_version >= 1
 
-    def collect(self, identity: RolloutIdentity) -> Rollout | None:  # type: ignore[override] - as Collector has it
-        return super().collect(identity) if self.has_rollout() else None
+    def collect(self, identity: RolloutIdentity, on_row: Callable[[], None]) -> Rollout | None:  # type: ignore[override] - as Collector has it
+        return super().collect(identity, on_row) if self.has_rollout() else None
 
 
 def test_newer_weights_are_loaded_while_a_rollout_is_incomplete(network: MemoryNetwork) -> None:

@@ -57,9 +57,11 @@ def test_the_values_of_a_run_and_its_actors_are_exported() -> None:
 
 
 def test_an_unknown_value_has_no_sample() -> None:
-    samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None))
+    samples = scraped(run_status(episode_return_mean=None, checkpoint_age_seconds=None, certificate_days_left=None))
     assert value(samples, "daedalus_episode_return_mean", run="mine") is None
     assert value(samples, "daedalus_checkpoint_age_seconds", run="mine") is None
+    assert value(samples, "daedalus_certificate_days_left", run="mine") is None
+    assert value(scraped(run_status(certificate_days_left=7.5)), "daedalus_certificate_days_left", run="mine") == 7.5
 
 
 def test_a_run_with_a_problem_is_not_healthy() -> None:

@@ -11,6 +11,7 @@ from processes import LIMIT, until
 
 from daedalus.cli import supervisor
 from daedalus.cli.local_run import watch
+from daedalus.cli.processes import STOPPED
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import RunSpec
 
@@ -67,6 +68,15 @@ def test_a_process_that_failed_three_times_is_not_restarted() -> None:
     assert not process.failed_at_once
     with pytest.raises(FailedError, match="worker failed 3 times"):
         message(process)
+    stop([process.process])
+
+
+def test_a_learner_that_a_signal_stopped_has_not_failed() -> None:
+    process = supervised(f"raise SystemExit({STOPPED})")
+    for _ in range(5):
+        process.process.wait(LIMIT)
+        assert not process.failed_at_once
+        assert message(process) == "worker was stopped by a signal; started again"
     stop([process.process])
 
 

@@ -22,6 +22,7 @@ SUMMARY = {
         "best_checkpoint": False,
         "backend": "gymnasium",
         "environment": "CartPole-v1",
+        "notes": ["7 of 9 episodes were cut"],
     },
 }
 
@@ -33,5 +34,6 @@ def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
     text = _report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
+    assert "episodes of the newest checkpoint on gymnasium's CartPole-v1\n7 of 9 episodes were cut\nrun" in text
     assert "run directory: runs/one" in text
     assert ("daedalus plot runs/one" in text) == installed

@@ -6,12 +6,13 @@ import pytest
 
 from daedalus.cli import settings_arguments as learner_options
 from daedalus.cli.commands import actor_arguments as actor_options
-from daedalus.cli.commands import exporter, router, status
+from daedalus.cli.commands import certs, exporter, router, status
 from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.addresses import AddressError, check_listening
 
 PARSERS = {
     "actor": actor_options.parser,
+    "certs": certs.parser,
     "exporter": exporter.parser,
     "learner": learner_options.learner_parser,
     "router": router.parser,

@@ -1,16 +1,19 @@
-"""Test of deploy/slurm, deploy/systemd and the commands in docs/deploy.md."""
+"""Test of deploy/systemd and the commands in docs/deploy.md."""
 
 import configparser
 import re
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
+from certificates import make_certificates
 from commands import check
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "deploy" / "slurm" / "daedalus.sbatch"
-UNIT = ROOT / "deploy" / "systemd" / "daedalus@.service"
+SYSTEMD = ROOT / "deploy" / "systemd"
+UNIT, ACTOR_UNIT = SYSTEMD / "daedalus@.service", SYSTEMD / "daedalus-actor@.service"
 
 
 def commands(text: str) -> list[list[str]]:
@@ -21,28 +24,53 @@ def commands(text: str) -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
-def test_the_commands_of_the_slurm_script_are_valid() -> None:
-    ours = [line for line in SCRIPT.read_text().splitlines() if not line.startswith("#")]
-    text = "\n".join(ours).replace("$(hostname)", "node").replace("$port", "7447")
-    assert [check(words) for words in commands(text)] == ["router", "actor", "learner"]
+def unit(path: Path) -> configparser.ConfigParser:
+    parsed = configparser.ConfigParser(interpolation=None, strict=False)  # some settings occur twice
+    parsed.optionxform = str  # type: ignore[assignment] - as the documentation of configparser shows
+    parsed.read_string(path.read_text())
+    return parsed
 
 
-def test_the_slurm_script_is_valid_bash() -> None:
-    subprocess.run(["bash", "-n", str(SCRIPT)], check=True)
+@pytest.mark.parametrize(("path", "roles"), [(UNIT, ["learner", "exporter"]), (ACTOR_UNIT, ["actor"])])
+def test_the_example_arguments_of_the_systemd_units_are_valid(path: Path, roles: list[str]) -> None:
+    arguments = re.findall(r"^# +/etc/daedalus/\S+: +ARGUMENTS=(.*)$", path.read_text(), re.MULTILINE)
+    assert [check(line.split()) for line in arguments] == roles
 
 
-def test_the_example_arguments_of_the_systemd_unit_are_valid() -> None:
-    arguments = re.findall(r"^# +/etc/daedalus/\S+: +ARGUMENTS=(.*)$", UNIT.read_text(), re.MULTILINE)
-    assert [check(line.split()) for line in arguments] == ["learner", "actor"]
+def test_the_systemd_units_restart_what_has_not_finished() -> None:
+    service, actor = unit(UNIT)["Service"], unit(ACTOR_UNIT)["Service"]
+    assert (service["Restart"], actor["Restart"]) == ("on-failure", "always")
+    assert service["SuccessExitStatus"] == "3"  # the budget was used up
+    own = {"Restart", "SuccessExitStatus", "TimeoutStopSec", "Environment"}
+    assert {name: value for name, value in service.items() if name not in own} == {
+        name: value for name, value in actor.items() if name not in own
+    }
 
 
-def test_the_systemd_unit_accepts_the_exit_status_of_a_used_up_budget() -> None:
-    unit = configparser.ConfigParser(interpolation=None)
-    unit.optionxform = str  # type: ignore[assignment] - as the documentation of configparser shows
-    unit.read_string(UNIT.read_text())
-    assert unit["Service"]["ExecStart"] == "/opt/daedalus/bin/daedalus $ARGUMENTS"
-    assert unit["Service"]["SuccessExitStatus"] == "3"
-    assert unit["Service"]["Restart"] == "on-failure"
+def test_the_tls_drop_in_passes_the_files_that_an_actor_needs(tmp_path: Path) -> None:
+    text = (SYSTEMD / "tls.conf").read_text()
+    command = f"{unit(UNIT)['Service']['ExecStart']} --tls %d"
+    assert re.findall(r"^ExecStart=(.*)$", text, re.MULTILINE) == ["", command]  # empty: replaces that of the unit
+    loaded = dict(re.findall(r"^LoadCredential=(.*):/etc/daedalus/tls/%i/(.*)$", text, re.MULTILINE))
+    issued = make_certificates(tmp_path / "certs") / "actor-arm"
+    assert loaded == {path.name: path.name for path in issued.iterdir()}
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")
+@pytest.mark.parametrize("path", [UNIT, ACTOR_UNIT])
+def test_systemd_calls_the_exposure_of_the_units_ok(path: Path) -> None:
+    # From 0, perfect, to 100; OK is below 50.
+    words = ["systemd-analyze", "security", "--offline=true", "--threshold=20", str(path)]
+    result = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.skipif(shutil.which("systemd-sysusers") is None, reason="systemd is not installed")
+def test_the_user_of_the_units_is_created(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    words = ["systemd-sysusers", f"--root={tmp_path}", "--dry-run", str(SYSTEMD / "sysusers.conf")]
+    result = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert f"Creating user '{unit(UNIT)['Service']['User']}'" in result.stdout
 
 
 def test_the_commands_of_the_deployment_page_are_valid() -> None:

@@ -9,7 +9,7 @@ from pages import DOCS, PAGES, ROOT, code_blocks, inline_code, name_of
 from pydantic import BaseModel
 
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.credentials import CERTIFICATE, KEY
+from daedalus.transport.credentials import CERTIFICATE, CLIENTS, KEY
 
 FOLDERS = "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|learner|policy|protocol|tests|transport"
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
@@ -55,9 +55,10 @@ def test_settings_exist(page: Path) -> None:
 
 
 def test_the_messages_about_certificates_are_those_of_the_code() -> None:
-    table = (DOCS / "security.md").read_text("utf-8").partition("| message |")[2]
+    table = (DOCS / "security.md").read_text("utf-8").partition("| message |")[2].partition("\n\n")[0]
     sources = "".join(path.read_text("utf-8") for path in (ROOT / "transport").glob("*.py"))
     sources = sources.replace("{KEY}", KEY).replace("{CERTIFICATE}", CERTIFICATE)
+    sources = sources.replace("{CLIENTS}", CLIENTS)
     messages = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
     assert len(messages) > 4
     for message in messages:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from pages import DOCS, code_blocks
 
 from daedalus.actor.environments.make import make_environments
@@ -13,6 +14,7 @@ from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
@@ -32,9 +34,9 @@ def example(guide: str, language: str = "python", number: int = 0) -> str:
 def test_the_environment_can_be_played(folder: Path) -> None:
     (folder / "corridor.py").write_text(example("environment.md"))
     (folder / "corridor_wrappers.py").write_text(example("environment.md", number=1))
-    spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8})
-    environments = make_environments(spec, 2, wrap="corridor_wrappers:step_costs")
-    assert environments.spaces.actions["action"].count == 2
+    spec = EnvironmentSpec(id="corridor:Corridor-v0", kwargs={"cells": 8}, wrap="corridor_wrappers:step_costs")
+    environments = PlainEnvironments(make_environments(spec, 2, modules=TEST_MODULES))
+    assert choices(environments.spaces) == 2
     environments.reset(0)
     steps = [environments.step(np.array([1, 0])) for _ in range(8)]
     assert steps[-1][1].tolist() == [0.99, -0.01]
@@ -52,8 +54,10 @@ def test_the_preset_is_a_run(folder: Path) -> None:
 def test_the_network_becomes_a_program(folder: Path) -> None:
     (folder / "my_network.py").write_text(example("network.md"))
     space = ArraySpace(shape=(12, 12), dtype="uint8", frames=3)
-    spaces = Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(4,))})
-    learner = Learner(TrainingSpec(), PolicySpec(encoder="my_network:Encoder"), spaces)
+    spaces = plain_spaces(ArraySpace(shape=(12, 12), dtype="uint8", frames=3), 4)
+    learner = Learner(
+        TrainingSpec(), PolicySpec(encoder="my_network:Encoder"), spaces, UserModules(frozenset({"my_network"}))
+    )
     runtime = OnnxRuntime(learner.program())
     runtime.load(learner.weights())
     observations = np.full((5, 3, 12, 12), 255, np.uint8)

@@ -3,10 +3,11 @@
 import re
 
 import pytest
-from pages import hook
+from pages import DOCS, hook
 from pydantic import BaseModel
 
 from daedalus.cli.main import USAGE
+from daedalus.learner.reporting.metrics import GROUPS
 from daedalus.protocol.spec import RunSpec
 
 SETTINGS = hook("settings_reference").settings_tables().splitlines()
@@ -49,6 +50,14 @@ def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
 def test_rows_state_type_range_and_default(setting: str, kind: str, limits: str, default: str) -> None:
     row = next(row for row in SETTINGS if row.startswith(f"| `{setting}` |"))
     assert [cell.strip() for cell in row.split("|")[2:5]] == [kind, limits, default]
+
+
+def test_every_metric_is_in_the_reference_in_its_group() -> None:
+    page = (DOCS / "reference" / "metrics.md").read_text("utf-8")
+    for group, columns in GROUPS.items():
+        section = page.partition(f"\n## `{group}`\n")[2].partition("\n## ")[0]
+        cells = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+        assert re.findall(r"`(\w+)`", " ".join(cells)) == list(columns)
 
 
 def test_every_command_is_in_the_reference() -> None:

@@ -5,7 +5,7 @@ import itertools
 import json
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from processes import Running, processes_mentioning
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands import train as train_command
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.local_run import LocalRun, evaluate_run
@@ -39,7 +40,7 @@ def evaluate(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]
 
     def run(*words: object) -> dict[str, Any]:
         capsys.readouterr()
-        status = main([*map(str, words), "--json"])
+        status = main([*map(str, words), "--json", "--allow-module", "counting_environment"])
         captured = capsys.readouterr()
         assert status == 0, captured.err
         return json.loads(captured.out)
@@ -86,6 +87,12 @@ def play_one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[i
     return returns, taken
 
 
+def test_episodes_are_not_cut_by_the_no_reward_limit(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    """The first reward of the first episode is 0, at which training would cut it."""
+    run = save(tmp_path / "run", COUNTING.model_copy(update={"no_reward_limit": 1}), 3)
+    assert evaluate(run, "--episodes", 2, "--envs", 2)["lengths"] == [3, 3]
+
+
 @pytest.mark.parametrize("memory", ["none", "gru"])
 def test_the_returns_equal_those_of_episodes_played_one_by_one(
     tmp_path: Path, evaluate: Callable[..., dict], memory: str
@@ -123,7 +130,7 @@ def test_a_damaged_best_checkpoint_is_reported_and_the_newest_is_used(
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1, 2)
     (score(run, 3.0, 1) / "parameters.safetensors").write_bytes(b"")
-    assert main([str(run), "--episodes", "1"]) == 0
+    assert main([str(run), "--episodes", "1", "--allow-module", "counting_environment"]) == 0
     captured = capsys.readouterr()
     assert "skipped a damaged checkpoint" in captured.err
     assert "best_3.0_0000000001" in captured.err
@@ -166,6 +173,32 @@ def test_spaces_that_differ_from_those_of_the_policy_are_reported(tmp_path: Path
 def test_the_option_wrap_imports_the_users_function(tmp_path: Path, refused: Callable[..., str]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     assert "no_such_module" in refused(1, run, "--episodes", 1, "--wrap", "no_such_module:function")
+    assert "--wrap is f: write MODULE:FUNCTION, or none" in refused(2, run, "--wrap", "f")
+
+
+def test_a_module_that_only_the_run_names_is_refused_with_the_command_that_allows_it(
+    tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    run = save(tmp_path / "run", COUNTING, 1)
+    assert refused(2, run, "--episodes", 3) == (
+        f"daedalus evaluate: the run of {run}/checkpoints/0000000001 asks for "
+        "environment.id=counting_environment:Counting-v0, but the module counting_environment may not be imported "
+        f"here; if you trust that code, type: daedalus evaluate {run} --episodes 3 --allow-module counting_environment"
+    )
+
+
+def test_the_wrapper_of_the_run_is_used_unless_the_option_names_another(
+    tmp_path: Path, evaluate: Callable[..., dict], refused: Callable[..., str]
+) -> None:
+    wrap = "picture_environment:with_doubled_rewards"
+    run = save(tmp_path / "run", CARTPOLE.model_copy(update={"wrap": wrap}), 1)
+    options = ("--episodes", 1, "--seed", 3)
+    assert "but the module picture_environment may not be imported here" in refused(2, run, *options)
+    doubled = evaluate(run, *options, "--allow-module", "picture_environment")
+    plain = evaluate(run, *options, "--wrap", "none")
+    assert doubled["return_mean"] == 2 * plain["return_mean"] > 0
+    own = evaluate(save(tmp_path / "plain", CARTPOLE, 1), *options, "--wrap", wrap)
+    assert own["return_mean"] == doubled["return_mean"]
 
 
 # ------------------------------------------------------------------------------------------------ video and window
@@ -196,16 +229,31 @@ def test_a_video_of_an_atari_game_uses_gymnasiums_implementation(tmp_path: Path,
     assert on_gymnasium["video_seconds"] == 2 * 41 / 60
 
 
-def test_max_seconds_cuts_the_gif_but_not_the_episodes(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+def test_max_seconds_ends_the_gif_and_the_evaluation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1)
     options = ("--video", tmp_path / "short.gif", "--episodes", 3, "--seed", 1)
-    result = evaluate(run, *options, "--max-seconds", 0.2, "--width", 150)
-    assert result["video_seconds"] == 0.2
+    result = evaluate(run, *options, "--max-seconds", 0.1, "--width", 150)
+    assert result["video_seconds"] == 0.1
     with Image.open(tmp_path / "short.gif") as image:
         assert image.size == (150, 100)
-        assert getattr(image, "n_frames", 1) == 3  # every fourth of ten
-    assert len(result["returns"]) == 3
-    assert sum(result["lengths"]) > 10
+        assert getattr(image, "n_frames", 1) == 2  # every fourth of five
+    assert result["lengths"] == [4]
+    assert result["notes"] == ["the last episode was cut at the end of the video"]
+
+
+def test_episodes_that_never_end_are_cut_and_the_result_says_so(
+    tmp_path: Path, evaluate: Callable[..., dict], capsys: pytest.CaptureFixture[str]
+) -> None:
+    endless = COUNTING.model_copy(update={"kwargs": {"ends": [10**9]}})
+    run = save(tmp_path / "run", endless, 1, evaluation={"max_episode_env_steps": 30})
+    note = (
+        "2 of 2 episodes were cut after 30 env_steps (evaluation.max_episode_env_steps): if the environment never ends "
+        "them, set environment.max_episode_steps"
+    )
+    result = evaluate(run, "--episodes", 2)
+    assert (result["lengths"], result["notes"]) == ([30, 30], [note])
+    assert main([str(run), "--episodes", "2", "--allow-module", "counting_environment"]) == 0
+    assert capsys.readouterr().out.endswith(f" greedy episodes\n{note}\n")
 
 
 def test_render_needs_a_screen(
@@ -260,8 +308,14 @@ def test_the_pretrained_car_racing_policy_drives(evaluate: Callable[..., dict]) 
 # ------------------------------------------------------------------------------------------------ after training
 
 
+@pytest.fixture
+def output(tmp_path: Path) -> Iterator[ChildOutput]:
+    with ChildOutput(tmp_path / "output.log", lambda _: None, lambda _: None) as output:
+        yield output
+
+
 def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
-    tmp_path: Path,
+    tmp_path: Path, output: ChildOutput
 ) -> None:
     settings = {"final_episodes": 3, "final_backend": "envpool"}
     run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation=settings)
@@ -270,7 +324,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     spec = read_policy(run / "checkpoints" / "best_77.0_0000000004").spec
     write_json(run / "summary.json", {"solved": False, "env_steps": 1234, "updates": 5})
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event())
+    summary = evaluate_run(local_run, threading.Event(), output)
     result = read_json(run / "summary.json")
     evaluation = result["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
@@ -283,7 +337,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
 
 
 def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evaluation(
-    tmp_path: Path, evaluate: Callable[..., dict]
+    tmp_path: Path, evaluate: Callable[..., dict], output: ChildOutput
 ) -> None:
     run = tmp_path / "run"
     for version in (1, 2, 3):
@@ -293,7 +347,7 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / f"{best:010d}").spec
     newest = max(version for version in (1, 2, 3) if version != worst)
-    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event())
+    evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), threading.Event(), output)
     evaluation = read_json(run / "summary.json")["evaluation"]
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (newest, True)
     scores = [(each["policy_version"], each["return_mean"]) for each in evaluation["select_best"]]
@@ -303,17 +357,43 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     assert [best_score(each) for each in best_checkpoints(run)] == [round(each, 1) for _, each in scores]
 
 
+def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path, output: ChildOutput) -> None:
+    training = {"target_return": 20.0, "target_episodes": 40}
+    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 3}, training=training)
+    score(run, 77.0, 4)
+    spec = read_policy(run / "checkpoints" / "0000000005").spec
+    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 20.5}
+    write_json(run / "summary.json", solved)
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    summary = evaluate_run(local_run, threading.Event(), output)
+    confirmation = read_json(run / "summary.json")["confirmation"]
+    assert (confirmation["policy_version"], confirmation["best_checkpoint"]) == (5, False)
+    assert (confirmation["episodes"], confirmation["actions"], confirmation["seed"]) == (40, "sampled", 1 + 2**34)
+    low, high = confirmation["interval"]
+    mean = summary["confirmation_return_mean"]
+    assert mean == confirmation["return_mean"]
+    assert (
+        high - mean
+        == pytest.approx(mean - low)
+        == pytest.approx(2.0227 * confirmation["return_std"] / 39**0.5, rel=1e-4)
+    )
+    report = train_command._report(local_run, summary)
+    assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
+    assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 20.5")
+
+
 def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:
     return evaluate(run / "checkpoints" / f"{version:010d}", "--episodes", 20)["return_mean"]
 
 
-def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path) -> None:
+def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path, output: ChildOutput) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
+    write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
     stopping.set()
     with pytest.raises(EvaluationFailedError):
-        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping)
+        evaluate_run(LocalRun(directory=run, spec=spec, started=0.0), stopping, output)
     assert not processes_mentioning(str(run))
 
 
@@ -325,10 +405,11 @@ def test_progress_is_written_to_standard_error(
 ) -> None:
     run = save(tmp_path / "run", COUNTING, 1)
     monkeypatch.setattr("daedalus.cli.commands.evaluate._PROGRESS_SECONDS", 0.0)
-    assert main([str(run), "--json", "--episodes", "2", "--envs", "1"]) == 0
+    options = ["--json", "--episodes", "2", "--envs", "1", "--allow-module", "counting_environment"]
+    assert main([str(run), *options]) == 0
     captured = capsys.readouterr()
     lines = captured.err.splitlines()
-    assert lines[0] == "evaluation: 0 of 2 episodes"
+    assert lines[0] == "evaluation: 0 of 2 episodes (each is cut after 27,000 env_steps)"
     assert lines[2].startswith("evaluation: 1 of 2 episodes, mean return 3.")
     assert len(json.loads(captured.out)["returns"]) == 2
 

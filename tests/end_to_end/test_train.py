@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.numpy
-from processes import Running, processes_mentioning, until
+from processes import Running, listening_ports, processes_mentioning, until
+
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
@@ -32,10 +34,16 @@ def newest_checkpoint(directory: Path) -> Path:
     return max((directory / "checkpoints").iterdir())
 
 
-def is_port_closed(output: str) -> bool:
-    port = int(output.split("tcp/127.0.0.1:")[1].split(";")[0])
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) != 0
+def is_socket_removed(output: str) -> bool:
+    return not Path(output.split("unixsock-stream/")[1].split(";")[0]).parent.exists()
+
+
+def is_free(directory: Path) -> bool:
+    try:
+        RunLock(directory).close()
+    except RunInUseError:
+        return False
+    return True
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +74,9 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     assert result["rollouts_rejected"] == {}
     assert result["snapshots_published"] == result["updates"] + 1
     assert "solved: mean return 475 reached" in output
+    assert result["confirmation"]["episodes"] == 100
+    assert result["confirmation_return_mean"] > 400
+    assert "over 100 new sampled episodes of the policy at that moment, 95 % interval" in output
     assert "evaluation: return" in output
 
 
@@ -79,8 +90,18 @@ def test_summary_counts_agree_with_each_other(solved: tuple[Path, str]) -> None:
 
 def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     directory, _ = solved
-    names = {entry.name.split(".out.")[0] for entry in directory.iterdir()}
-    assert names == {"config.toml", "versions.json", "metrics.csv", "events", "checkpoints", "summary.json"}
+    names = {entry.name.split(".out.")[0] for entry in directory.iterdir()} - {
+        "output.log"
+    }  # written by a slow evaluation
+    assert names == {
+        "learner.lock",
+        "config.toml",
+        "versions.json",
+        "metrics.csv",
+        "events",
+        "checkpoints",
+        "summary.json",
+    }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
     assert float(rows[-1]["entropy"]) > 0
@@ -88,7 +109,7 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
 
 def test_no_process_and_no_open_port_is_left(solved: tuple[Path, str]) -> None:
     assert not processes_mentioning("solved-run")
-    assert is_port_closed(solved[1])
+    assert is_socket_removed(solved[1])
 
 
 def test_evaluate_plays_a_finished_run(solved: tuple[Path, str], start: Start) -> None:
@@ -133,27 +154,35 @@ def test_resume_restores_the_exact_state_and_continues(solved: tuple[Path, str],
 def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: Path, number: signal.Signals) -> None:
     running = start("train", "cartpole", "--run-dir", "stopped-run", *ENDLESS)
     running.expect(r"updates .*/s")
+    assert not any(map(listening_ports, processes_mentioning("stopped-run")))  # every user could connect there
     running.process.send_signal(number)
     assert running.wait() == 1
     running.expect("continue with: daedalus resume stopped-run")
     assert newest_checkpoint(tmp_path / "stopped-run").name.isdigit()
     assert not processes_mentioning("stopped-run")
-    assert is_port_closed(running.output)
+    assert is_socket_removed(running.output)
 
 
-def test_the_child_processes_end_when_train_is_killed(start: Start) -> None:
+def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
-    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
+    second = start("resume", "orphan-run")
+    assert second.wait() == 1
+    assert second.lines == [
+        f"daedalus resume: run directory orphan-run is in use by process {running.process.pid} on "
+        f"{socket.gethostname()}: stop it first, or choose another --run-dir"
+    ]
     running.process.kill()
     until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))
+    until(lambda: is_free(tmp_path / "orphan-run"))
 
 
 def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
     running = start(
         "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 4_000_000
     )
-    address = running.expect(r"at (tcp/127.0.0.1:\d+);").group(1)
+    address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
     os.kill(victim, signal.SIGKILL)
@@ -164,11 +193,19 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
     assert result["solved"]
 
 
-def test_an_environment_module_in_the_working_directory_is_found(start: Start, tmp_path: Path) -> None:
+def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> None:
+    """The module is in the working directory; it prints in every step, also from a process of its own."""
     source = (Path(__file__).parent.parent / "counting_environment.py").read_text()
-    (tmp_path / "my_module.py").write_text(source)
+    noise = "        print('noise'); self._step or os.system('echo from a process')\n"
+    noisy = source.replace("        self._step += 1\n", f"{noise}        self._step += 1\n")
+    (tmp_path / "my_module.py").write_text(noisy.replace("import gymnasium\n", "import os\nimport gymnasium\n", 1))
     running = start("train", "--env", "my_module:Counting-v0", "--env-steps", 2000, "--run-dir", "own")
     assert running.wait() == 0, running.output
+    assert running.lines.count("noise") < 200
+    running.expect(r"[\d,]+ lines of output were not shown; see own/output.log")
+    log = (tmp_path / "own" / "output.log").read_text().splitlines()
+    for line in ("[actor-1] noise", "[evaluation-0] noise", "[evaluation-0] from a process"):
+        assert line in log
     result = summary(tmp_path / "own")
     assert result["env_steps"] >= 2000
     assert result["solved"] is False
@@ -182,7 +219,9 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     assert running.wait() in (0, 3), running.output
     records = [json.loads(line) for line in running.lines if line.startswith("{")]
     assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.cli.local_run", "daedalus.learner.service"} <= {record["logger"] for record in records}
+    assert {"daedalus.cli.local_run", "daedalus.learner.serving.evaluation_server"} <= {
+        record["logger"] for record in records
+    }
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
     *progress, outcome, evaluation, folder = plain

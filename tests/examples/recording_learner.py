@@ -48,7 +48,7 @@ class RecordingLearner:
         transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot()))
         transport.serve(keys.program("r", "*"), lambda request: request.reply(self._program()))
         transport.serve(keys.rollouts("r", "*"), self._on_rollout)
-        transport.serve(keys.join("r"), self._on_join)
+        transport.serve(keys.join("r", "*"), self._on_join)
 
     def snapshot(self) -> bytes:
         if not self.weights:
@@ -67,7 +67,8 @@ class RecordingLearner:
         self._transport.publish(keys.snapshots("r"), message)
 
     def end_run(self) -> None:
-        self.push(encode(RunEnded(learner_epoch=self.epoch, reason="the test is over")))
+        message = RunEnded(learner_epoch=self.epoch, outcome="finished", reason="the test is over")
+        self._transport.publish(keys.run_end("r"), encode(message))
 
     def _program(self) -> bytes:
         return encode(Program(hash=program_hash(self.model), model=np.frombuffer(self.model, np.uint8)))

@@ -216,6 +216,19 @@ def test_with_a2c_the_actor_sends_one_rollout_of_each_policy_version(
     assert process.wait() == 0, process.output
 
 
+def test_with_a2c_the_actor_requests_the_next_version_if_its_rollout_is_stale(
+    play: Callable[..., tuple[RecordingLearner, Running]],
+) -> None:
+    """Otherwise it would send stale rollouts for ever if the push of that version was lost."""
+    learner, _ = play(ONE_AT_A_TIME.model_copy(update={"training": TrainingSpec(algorithm="a2c")}))
+    learner.next()
+    learner.verdicts.put(Acknowledgement(verdict="rejected", policy_version=2))
+    learner.publish()
+    learner.version = 2  # published, but the push is lost
+    assert learner.next().policy_version == 1
+    assert learner.next().policy_version == 2
+
+
 def test_the_actor_refuses_an_environment_that_it_cannot_play(
     play: Callable[..., tuple[RecordingLearner, Running]],
 ) -> None:

@@ -123,7 +123,8 @@ def test_unknown_version_or_part_is_refused(version: int, part: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "instead", [Refusal(code="not_ready", reason="no policy yet"), RunEnded(learner_epoch=5, reason="over")]
+    "instead",
+    [Refusal(code="not_ready", reason="no policy yet"), RunEnded(learner_epoch=5, outcome="finished", reason="over")],
 )
 def test_message_in_place_of_a_snapshot_is_passed_on(instead: Message) -> None:
     assert ask(CompactSnapshotCache(5), encode(instead)) == instead

@@ -59,6 +59,31 @@ def test_target_is_reached_only_with_enough_episodes() -> None:
     assert not counters.reached(None)
 
 
+def with_info(**values: tuple[float, ...]) -> Rollout:
+    info = {name: np.array(each, np.float32) for name, each in values.items()}
+    return make_rollout(
+        episode_returns=np.zeros(5, np.float32), episode_lengths=np.ones(5, np.int32), episode_info=info
+    )
+
+
+def test_scalars_of_the_environment_are_kept_of_the_newest_episodes() -> None:
+    counters = RunCounters(3)
+    counters.trained([with_info(laps=(1.0, 2.0)), with_info(laps=(3.0, 4.0), crashed=(1.0,))], 0, 1)
+    counters.trained([with_info(crashed=(0.0,))], 0, 1)
+    assert {name: list(values) for name, values in counters.info.items()} == {
+        "laps": [2.0, 3.0, 4.0],
+        "crashed": [1.0, 0.0],
+    }
+
+
+def test_actors_with_many_names_do_not_grow_the_counters() -> None:
+    counters = RunCounters(3)
+    for number in range(5):
+        counters.trained([with_info(**{f"name{number}.{each}": (1.0,) for each in range(8)})], 0, 1)
+    assert len(counters.info) == 16
+    assert "name1.7" in counters.info
+
+
 def test_counters_restored_from_json_continue_equally() -> None:
     through, first = RunCounters(3), RunCounters(3)
     for number in range(3):
@@ -78,4 +103,4 @@ def test_counters_restored_from_json_continue_equally() -> None:
 
 def test_state_contains_every_counter() -> None:
     state = RunCounters(3).state(1.0)
-    assert state.keys() == set(RunCounters.__slots__) - {"target_episodes"}
+    assert state.keys() == set(RunCounters.__slots__) - {"target_episodes", "info"}

@@ -1,10 +1,11 @@
-"""Updates without a finite gradient: which rollouts are at fault, and what happens to their senders."""
+"""Rollouts without a finite gradient: they are found and left out, and their senders are quarantined."""
 
 import threading
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from building import (
     ENVIRONMENTS,
     EPOCH,
@@ -19,7 +20,6 @@ from building import (
 )
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.service import _gradient_fault
 from daedalus.learner.serving.fleet import Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
@@ -49,34 +49,62 @@ def senders(rollouts: list[Rollout]) -> list[str]:
         ("appo", RECURRENT, HUGE_REWARDS),
     ],
 )
-def test_rollouts_without_a_finite_gradient_are_found(algorithm: str, policy: PolicySpec, huge: dict[str, Any]) -> None:
+def test_rollouts_without_a_finite_gradient_are_left_out(
+    algorithm: str, policy: PolicySpec, huge: dict[str, Any]
+) -> None:
     learner = Learner(TrainingSpec.model_validate({"algorithm": algorithm}), policy, SPACES)
     size = learner.state_size
     batch = [rollout("a", size), rollout("b", size, **huge), rollout("c", size), rollout("d", size, **huge)]
     assert senders(learner.step(batch, 0.0)) == ["b", "d"]
-    assert learner.updates_skipped > 0
+    assert learner.updates_skipped == 0
+    assert learner.policy_version == learner_updates(algorithm)
     assert all(np.isfinite(array).all() for array in learner.weights().values())
-    skipped = learner.updates_skipped
-    assert learner.step([batch[0], batch[2]], 0.0) == []
-    assert learner.updates_skipped == skipped
 
 
-def test_search_for_the_fault_does_not_change_the_parameters() -> None:
-    """A skipped update leaves the parameters as they were, and the next update starts from them."""
-    learners = [Learner(TrainingSpec(algorithm="a2c"), RELU, SPACES) for _ in range(2)]
-    learners[0].step([rollout("a"), rollout("b", **HUGE_FRAMES)], 0.0)
-    for learner in learners:
-        learner.step([rollout("a")], 0.0)
+def learner_updates(algorithm: str) -> int:
+    return TrainingSpec.model_validate({"algorithm": algorithm}).updates_per_batch
+
+
+@pytest.mark.parametrize("policy", [RELU, RECURRENT])
+def test_update_equals_that_of_a_batch_without_the_rollouts_left_out(policy: PolicySpec) -> None:
+    learners = [Learner(TrainingSpec(algorithm="a2c"), policy, SPACES) for _ in range(2)]
+    size = learners[0].state_size
+    good = [rollout("a", size), rollout("c", size)]
+    learners[0].step([good[0], rollout("b", size, **HUGE_REWARDS), good[1]], 0.0)
+    learners[1].step(good, 0.0)
+    assert learners[0].policy_version == learners[1].policy_version == 1
     for name, array in learners[0].weights().items():
         np.testing.assert_array_equal(array, learners[1].weights()[name])
+    for name, value in learners[0].state().items():
+        assert torch.equal(value, learners[1].state()[name])
+
+
+@pytest.mark.parametrize(("algorithm", "updates"), [("a2c", 1), ("appo", 12)])
+def test_updates_are_skipped_if_all_rollouts_are_at_fault(algorithm: str, updates: int) -> None:
+    learner = Learner(TrainingSpec.model_validate({"algorithm": algorithm}), RELU, SPACES)
+    before = {name: array.copy() for name, array in learner.weights().items()}
+    batch = [rollout("a", **HUGE_REWARDS), rollout("b", **HUGE_REWARDS)]
+    assert senders(learner.step(batch, 0.0)) == ["a", "b"]
+    assert learner.policy_version == learner.updates_skipped == updates
+    for name, array in learner.weights().items():
+        np.testing.assert_array_equal(array, before[name])
+
+
+def test_versions_are_as_many_as_expected_if_few_rows_are_left() -> None:
+    """A batch of one row makes fewer minibatches, but actors and counters expect the versions of the whole batch."""
+    learner = Learner(TrainingSpec(algorithm="appo", passes=2, minibatches=4), RELU, SPACES)
+    one = np.zeros((ROWS, ENVIRONMENTS), np.bool_)
+    one[0, 0] = True
+    learner.step([rollout("a", valid=one), rollout("b", **HUGE_REWARDS)], 0.0)
+    assert (learner.policy_version, learner.updates_skipped) == (8, 6)
 
 
 def test_no_sender_is_at_fault_if_the_parameters_are() -> None:
-    learner = Learner(TrainingSpec(algorithm="a2c"), RELU, SPACES)
+    learner = Learner(TrainingSpec(algorithm="appo"), RELU, SPACES)
     for array in learner.weights().values():
         array.fill(1e30)  # the arrays share memory with the parameters
     assert learner.step([rollout("a"), rollout("b")], 0.0) == []
-    assert learner.updates_skipped == 1
+    assert learner.updates_skipped == learner.policy_version == 12
 
 
 # ---------------------------------------------------------------------------------------------- the senders
@@ -88,12 +116,12 @@ def test_actor_is_quarantined_after_three_rollouts_at_fault() -> None:
         actor.count_trained(finite=False)
     assert not actor.quarantined
     actor.count_trained(finite=False)
-    assert actor.quarantined.startswith("updates with 3 of its rollouts had no finite gradient")
+    assert actor.quarantined.startswith("3 of its rollouts had no finite gradient")
     assert actor.rejected == {"non_finite": 3}
 
 
 def test_few_good_rollouts_in_between_do_not_prevent_the_quarantine() -> None:
-    """Each rollout at fault costs a whole batch: a sender of one in ten must not go on for ever."""
+    """Each such rollout costs the learner much time: a sender of one in ten must not go on for ever."""
     actor = Actor("a")
     for _ in range(3):
         actor.count_trained(finite=False)
@@ -133,10 +161,3 @@ def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
     assert fleet.live == {"a"}
     assert not fleet.actors["a"].rejected
     assert fleet.actors["b"].rejected == {"non_finite": 3}
-
-
-def test_fault_names_the_senders() -> None:
-    assert _gradient_fault([]) == "the gradient is not finite"
-    assert _gradient_fault([rollout("b"), rollout("a"), rollout("b")]) == (
-        "the gradient is not finite with rollouts of a, b"
-    )

@@ -14,7 +14,8 @@ from plain import ACTION, choices, plain, plain_spaces, vector_spaces
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Join, Rollout, RunEnded
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot
 from daedalus.protocol.spaces import ArraySpace
 
 VERSION, MAX_LAG = 10, 4
@@ -113,9 +114,18 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
     assert assert_rejected(harness, data, "malformed").verdict == "rejected"
 
 
+def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
+    weights = {str(number): np.zeros(1, np.float32) for number in range(33)}
+    data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
+    assert_rejected(harness, data, "malformed", "33 arrays, the limit is 32")
+
+
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
     assert_rejected(
-        harness, encode(RunEnded(learner_epoch=EPOCH, reason="")), "malformed", "the message is not a rollout"
+        harness,
+        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
+        "malformed",
+        "the message is not a rollout",
     )
 
 
@@ -174,12 +184,27 @@ def test_value_that_is_not_finite_is_rejected_with_its_array_named(harness: Harn
     assert_rejected(harness, encode(with_value(name, value)), "unfit", name)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_episode_info_that_is_not_finite_is_rejected(harness: Harness, value: float) -> None:
+    info = {"distance": np.full(1, value, np.float32)}
+    assert_rejected(harness, encode(good(episode_info=info)), "unfit", "episode_info 'distance'")
+
+
+def test_all_the_episode_info_that_a_rollout_may_have_is_accepted(harness: Harness) -> None:
+    most = len(good().episode_returns)
+    info = {f"{number:064}": np.full(most, 1.0, np.float32) for number in range(16)}
+    accepted = harness.receive(encode(good(episode_info=info)))
+    assert isinstance(accepted, Rollout)
+    assert accepted.episode_info.keys() == info.keys()
+
+
 def test_log_probability_above_0_is_rejected_as_unfit(harness: Harness) -> None:
     assert_rejected(harness, encode(with_value("behaviour_log_probs", 0.01)), "unfit", "behaviour_log_probs")
 
 
 def test_log_probability_above_0_by_rounding_is_accepted(harness: Harness) -> None:
-    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 1e-6))), Rollout)
+    assert isinstance(harness.receive(encode(with_value("behaviour_log_probs", 0.99e-4))), Rollout)
+    assert isinstance(Harness().receive(encode(with_value("behaviour_log_probs", 1.01e-4))), Rejected)
 
 
 def test_rollout_with_a_future_policy_version_is_rejected_as_unfit(harness: Harness) -> None:
@@ -282,6 +307,57 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
     assert "the limit is" in verdict.reason
 
 
+def test_rollout_of_exactly_64_mib_is_not_refused() -> None:
+    """(6 + 2) x 4,096 x (2,019 + 27) bytes, and 64 KiB."""
+    spaces = SPACES.model_copy(update={"observation": ArraySpace(shape=(2019,), dtype="uint8", frames=2)})
+    intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=4096, spaces=spaces))
+    verdict = intake.read("a", b"no message")
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == "malformed"
+
+
+def test_message_as_large_as_the_queue_is_not_refused() -> None:
+    spec = run_spec()
+    small = spec.service.model_copy(update={"queue_megabytes": 0.125})
+    intake = Intake(spec.model_copy(update={"service": small}), EPOCH, joined_fleet("a", environments=1000))
+    assert intake.refuse_size("a", 1 << 17) is None
+    refused = intake.refuse_size("a", (1 << 17) + 1)
+    assert refused is not None
+    assert "service.queue_megabytes allows 131,072" in refused.reason
+
+
+def test_size_limit_is_the_documented_one() -> None:
+    """(T + k) E (frame bytes + 27) + 4 E S + 64 KiB, and the header: docs/wire.md."""
+    harness = stacked_harness(state_size=7)
+    limit = (ROWS + 4) * ENVIRONMENTS * (60 * 80 * 3 + 27) + 4 * ENVIRONMENTS * 7 + (64 << 10)
+    message = Limits(max_bytes=limit).message_bytes
+    assert harness.intake.refuse_size("a", message) is None
+    refused = harness.intake.refuse_size("a", message + 1)
+    assert refused is not None
+    assert refused.reason == f"the message has {message + 1:,} bytes, and a rollout of this actor at most {message:,}"
+
+
+@pytest.mark.parametrize(
+    ("shape", "environments", "refused"),
+    [
+        ((60, 80, 3), 464, False),
+        ((60, 80, 3), 465, True),  # more than 64 MiB
+        ((1000, 1000, 3), 8 * ENVIRONMENTS, False),  # the run's own rollouts have 90 MB
+        ((1000, 1000, 3), 8 * ENVIRONMENTS + 2, True),
+    ],
+)
+def test_rollouts_of_too_many_environments_are_refused_before_they_are_decoded(
+    shape: tuple[int, ...], environments: int, refused: bool
+) -> None:
+    """4,096 environments of zeros compress to nothing, and would take gigabytes."""
+    spaces = SPACES.model_copy(update={"observation": STACKED.model_copy(update={"shape": shape})})
+    intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=environments, spaces=spaces))
+    verdict = intake.read("a", b"no message")
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == ("unfit" if refused else "malformed")
+    assert ("use fewer environments per actor (--envs)" in verdict.reason) == refused
+
+
 @given(st.data())
 def test_corrupted_bytes_always_get_a_verdict(data: st.DataObject) -> None:
     message = bytearray(encode(good()))
@@ -323,12 +399,22 @@ def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness,
 
 
 def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
-    harness.fleet.set_present("a", 1, False)
+    harness.fleet.set_present("a", 1, False, 0.0)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = harness.receive(encode(good()))
     assert isinstance(verdict, Rejected)
     assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
     assert isinstance(harness.receive(encode(good(rollout_identity=identity(incarnation=2)))), Rollout)
+
+
+def test_rollout_is_fenced_if_its_incarnation_was_replaced_while_it_was_decoded(harness: Harness) -> None:
+    content = harness.intake.read("a", encode(good()))
+    assert isinstance(content, Rollout)
+    harness.fleet.set_present("a", 1, False)
+    harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
+    verdict = harness.intake.judge("a", content, VERSION, 0.0)
+    assert isinstance(verdict, Rejected)
+    assert (verdict.verdict, verdict.cause) == ("fenced", "unknown_actor")
 
 
 def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_again(harness: Harness) -> None:
@@ -397,7 +483,7 @@ def test_quarantine_ends_with_a_new_incarnation_but_not_with_a_second_join(harne
     harness.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     assert verdicts(harness, encode(good(rollout_identity=identity(sequence=5)))) == ["quarantined"]
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    harness.fleet.set_present("a", 2, True)
+    harness.fleet.set_present("a", 2, True, 0.0)
     assert harness.fleet.live == {"a", "b"}
     assert verdicts(harness, encode(good(rollout_identity=identity(incarnation=2)))) == ["accepted"]
 
@@ -424,7 +510,8 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
 
 def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
     lengths = np.zeros_like(good().episode_lengths)
-    assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit", "episode_lengths")
+    verdict = assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit")
+    assert verdict.reason == "episode_lengths has a value below 1"
 
 
 def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Harness) -> None:
@@ -497,16 +584,20 @@ SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([
 
 
 class Traffic(RuleBasedStateMachine):
-    """Model test with stale, duplicate, reordered and unfit rollouts, also from replaced incarnations."""
+    """Model test with stale, duplicate, reordered and unfit rollouts, also from replaced and forgotten incarnations."""
 
     def __init__(self) -> None:
         super().__init__()
         self.fleet = Fleet(1, None)
         self.intake = Intake(run_spec(rows=1, max_policy_lag=2), EPOCH, self.fleet)
         self.version = 0
+        self.now = 0.0
         self.newest = {"a": 0, "b": 0}  # the highest incarnation that joined; they count from 1
-        self.incarnations = {"a": 0, "b": 0}  # the incarnation that joined last
+        self.incarnations = {"a": 0, "b": 0}  # the current incarnation; 0: none joined, or the actor was forgotten
         self.unfit = {"a": 0, "b": 0}  # in a row, of the incarnation that joined last
+        self.remembered = {"a": 0, "b": 0}  # rollouts that were accepted since the actor was last forgotten
+        self.barred: set[tuple[str, int]] = set()  # incarnations that were replaced, or quarantined and forgotten
+        self.given_up: dict[tuple[str, int], int] = {}  # of forgotten incarnations, the highest number received
         self.taken: dict[tuple[str, int], set[int]] = {}
         self.accepted: list[tuple[str, int, int]] = []
         self.sent: list[tuple[str, Rollout]] = []  # accepted rollouts, with their senders
@@ -522,11 +613,25 @@ class Traffic(RuleBasedStateMachine):
             self._join(name, self.newest[name] - older)
 
     def _join(self, name: str, incarnation: int) -> None:
-        if self.incarnations[name] != incarnation:
-            self.unfit[name] = 0
-        self.incarnations[name] = incarnation
         join = Join(actor=name, incarnation=incarnation, spaces=TINY, environments=1)
-        assert self.fleet.join(join, 0.0) is None
+        refusal = self.fleet.join(join, self.now)
+        assert (refusal is not None) == ((name, incarnation) in self.barred)
+        previous = self.incarnations[name]
+        if refusal is not None or previous == incarnation:
+            return
+        if previous:
+            self.barred.add((name, previous))
+        self.incarnations[name], self.unfit[name] = incarnation, 0
+
+    @rule()
+    def both_actors_are_forgotten(self) -> None:
+        self.now += 100.0
+        self.fleet.forget_absent(self.now)
+        for name, incarnation in self.incarnations.items():
+            if incarnation and self.unfit[name] == 3:
+                self.barred.add((name, incarnation))
+            self.given_up[name, incarnation] = max(self.taken.get((name, incarnation), set()), default=-1)
+            self.incarnations[name] = self.remembered[name] = 0
 
     @rule()
     def learner_makes_an_update(self) -> None:
@@ -544,7 +649,7 @@ class Traffic(RuleBasedStateMachine):
     def rollout_arrives(
         self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int, reward: float
     ) -> None:
-        sent = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
+        sent = identity(name, sequence, max(self.newest[name] - older, 0), epoch)
         version = max(self.version - lag, 0)
         rewards = np.full((1, 1), reward, np.float32)
         rollout = make_rollout(sent, version=version, rows=1, environments=1, shape=(1,), rewards=rewards)
@@ -556,7 +661,7 @@ class Traffic(RuleBasedStateMachine):
         self._deliver(*data.draw(st.sampled_from(self.sent)))
 
     def _deliver(self, sender: str, rollout: Rollout) -> None:
-        verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, 0.0)
+        verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, self.now)
         expected = self._expected(sender, rollout)
         assert (verdict.cause if isinstance(verdict, Rejected) else "") == expected
         sent = rollout.identity
@@ -570,6 +675,7 @@ class Traffic(RuleBasedStateMachine):
             self.taken.setdefault((sent.actor, sent.incarnation), set()).add(sent.sequence)
         if isinstance(verdict, Rollout):
             self.accepted.append((sent.actor, sent.incarnation, sent.sequence))
+            self.remembered[sender] += 1
             self.sent.append((sender, rollout))
 
     def _expected(self, sender: str, rollout: Rollout) -> str:
@@ -586,7 +692,8 @@ class Traffic(RuleBasedStateMachine):
         if not np.isfinite(rollout.rewards).all():
             return "unfit"
         taken = self.taken.get((sent.actor, sent.incarnation), set())
-        if sent.sequence in taken or sent.sequence <= max(taken, default=0) - 1024:
+        given_up = self.given_up.get((sent.actor, sent.incarnation), -1)
+        if sent.sequence in taken or sent.sequence <= max(given_up, max(taken, default=0) - 1024):
             return "duplicate"
         if rollout.policy_version > self.version:
             return "unfit"
@@ -597,7 +704,7 @@ class Traffic(RuleBasedStateMachine):
         assert len(set(self.accepted)) == len(self.accepted)
         for name, actor in self.fleet.actors.items():
             assert bool(actor.quarantined) == (self.unfit[name] == 3)
-            assert actor.accepted == sum(accepted[0] == name for accepted in self.accepted)
+            assert actor.accepted == self.remembered[name]
 
 
 TestTraffic = Traffic.TestCase

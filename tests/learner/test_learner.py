@@ -13,10 +13,11 @@ from plain_learner import PlainLearner
 from torch import Tensor
 from torch.testing import assert_close
 
+from daedalus.algorithms.gradients import Terms
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
-from daedalus.learner.training.update_metrics import METRICS
+from daedalus.learner.training.update_metrics import METRICS, UpdateMetrics
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace
@@ -414,3 +415,69 @@ def test_update_is_skipped_and_counted_when_its_gradient_is_not_finite(algorithm
     assert learner.updates_skipped == skipped
     assert all(np.isfinite(array).all() for array in learner.weights().values())
     assert all(np.isfinite(value) for value in learner.metrics.take_means().values())
+
+
+# ------------------------------------------------------------------------------------------- diagnostics
+
+
+@pytest.mark.parametrize("kind", ["a2c", "impala", "appo"])
+def test_diagnostics_are_those_of_the_newest_batch_before_its_first_update(kind: str) -> None:
+    learner = make_learner(algorithm=kind, rho_clip=1.25, learning_rate=0.1)
+    start = weights(learner)
+    rollouts = make_rollouts(4)
+    ratios = np.exp(learned_log_probs(start, rollouts) - join(rollouts).behaviour_log_probs.numpy())
+    ratios = ratios[join(rollouts).valid.numpy() > 0]
+    learner.step(rollouts, 0.0)
+    measured = learner.take_diagnostics()
+    assert measured["rho_mean"] == pytest.approx(ratios.mean(), rel=1e-4)
+    assert measured["behaviour_kl"] == pytest.approx((ratios - 1 - np.log(ratios)).mean(), rel=1e-4)
+    assert measured["rho_effective_share"] == pytest.approx(
+        ratios.sum() ** 2 / (len(ratios) * (ratios**2).sum()), rel=1e-4
+    )
+    assert measured.get("rho_clipped_fraction") == (None if kind == "a2c" else pytest.approx((ratios > 1.25).mean()))
+    assert measured["value_error_p05"] < measured["value_error_p50"] < measured["value_error_p95"]
+    assert learner.take_diagnostics() == {}
+
+
+def learned_log_probs(start: dict[str, np.ndarray], rollouts: list[Rollout]) -> np.ndarray:
+    """Return log pi(a_t | s_t) of the policy with these weights, [T, B]."""
+    return join(on_policy(POLICY, start, rollouts)).behaviour_log_probs.numpy()
+
+
+def test_diagnostics_on_policy_show_no_difference() -> None:
+    learner = make_learner(algorithm="impala")
+    learner.step(on_policy(POLICY, weights(learner), make_rollouts(1)), 0.0)
+    measured = learner.take_diagnostics()
+    assert measured["behaviour_kl"] == pytest.approx(0.0, abs=1e-6)
+    assert measured["rho_effective_share"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_value_error_quantiles_are_of_targets_minus_values() -> None:
+    learner = make_learner(algorithm="a2c", discount_factor=0.0)  # the target of a row is its reward
+    with torch.no_grad():
+        learner._parameters["value_head.weight"].zero_()
+        learner._parameters["value_head.bias"].fill_(2.0)
+    rollouts = make_rollouts(2)
+    batch = join(rollouts)
+    errors = (batch.rewards - 2.0)[batch.valid > 0].numpy()
+    learner.step(rollouts, 0.0)
+    measured = learner.take_diagnostics()
+    assert measured["value_error_p05"] == pytest.approx(np.quantile(errors, 0.05), rel=1e-4)
+    assert measured["value_error_p95"] == pytest.approx(np.quantile(errors, 0.95), rel=1e-4)
+
+
+@pytest.mark.parametrize(("bound", "share"), [(1e9, 0.0), (1e-9, 1.0)])
+def test_share_of_clipped_gradients_is_over_the_updates_since_the_last_row(bound: float, share: float) -> None:
+    learner = make_learner(algorithm="appo", max_gradient_norm=bound)
+    learner.step(make_rollouts(1), 0.0)
+    assert learner.metrics.take_means()["gradient_clipped_fraction"] == share
+
+
+def test_share_of_clipped_gradients_counts_updates() -> None:
+    metrics = UpdateMetrics(SPACES, torch.device("cpu"))
+    terms = Terms(*[torch.zeros(()) for _ in Terms._fields])
+    for clipped in (True, False, False, True, False):
+        metrics.add_update(terms, torch.ones(()), clipped)
+    assert metrics.take_means()["gradient_clipped_fraction"] == 0.4
+    metrics.add_update(terms, torch.ones(()), clipped=True)
+    assert metrics.take_means()["gradient_clipped_fraction"] == 1.0

@@ -8,7 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.metrics import COLUMNS, Details
+from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.training.update_metrics import METRICS
 
@@ -39,17 +39,38 @@ def test_csv_continues_after_a_resume_without_a_second_header(tmp_path: Path) ->
     assert [row["env_steps"] for row in read(path)] == ["1", "2"]
 
 
-def test_csv_continues_with_the_columns_of_an_existing_header(tmp_path: Path) -> None:
+def test_csv_continues_with_the_columns_of_an_existing_header_and_adds_new_ones(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.write_text("wall_seconds,policy_loss,env_steps,no_longer_measured\r\n0.5,0.25,10,7\r\n")
     writer = CsvWriter(path)
+    writer.write({"env_steps": 15, "policy_loss": 0.5}, NONE)
     writer.write({"env_steps": 20, "clipped_fraction": 0.1, "policy_loss": -1.5, "wall_seconds": 1.5}, NONE)
+    writer.write({"env_steps": 30, "env/laps": 2.0}, NONE)
     writer.close()
-    names = ("wall_seconds", "policy_loss", "env_steps", "no_longer_measured")
+    names = ("wall_seconds", "policy_loss", "env_steps", "no_longer_measured", "clipped_fraction", "env/laps")
     assert read(path) == [
-        dict(zip(names, ("0.5", "0.25", "10", "7"), strict=True)),
-        dict(zip(names, ("1.5", "-1.5", "20", ""), strict=True)),
+        dict(zip(names, ("0.5", "0.25", "10", "7", "", ""), strict=True)),
+        dict(zip(names, ("", "0.5", "15", "", "", ""), strict=True)),
+        dict(zip(names, ("1.5", "-1.5", "20", "", "0.1", ""), strict=True)),
+        dict(zip(names, ("", "", "30", "", "", "2"), strict=True)),
     ]
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_csv_that_cannot_be_written_anew_keeps_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "metrics.csv"
+    writer = CsvWriter(path)
+    writer.write({"env_steps": 1}, NONE)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        writer.write({"env_steps": 2, "env/laps": 2.0}, NONE)
+    writer.close()
+    assert [row["env_steps"] for row in read(path)] == ["1"]
+    assert sorted(tmp_path.iterdir()) == [path]
 
 
 def test_csv_writes_a_header_to_an_empty_file(tmp_path: Path) -> None:
@@ -66,9 +87,17 @@ def test_tensorboard_scalars_are_against_env_steps(tmp_path: Path) -> None:
     writer.close()
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    assert sorted(events.Tags()["scalars"]) == ["policy_loss", "updates"]
-    assert [(scalar.step, scalar.value) for scalar in events.Scalars("policy_loss")] == [(100, 0.5), (250, -1.5)]
-    assert [(scalar.step, scalar.value) for scalar in events.Scalars("updates")] == [(100, 3.0)]
+    assert sorted(events.Tags()["scalars"]) == ["time/updates", "train/policy_loss"]
+    assert [(scalar.step, scalar.value) for scalar in events.Scalars("train/policy_loss")] == [(100, 0.5), (250, -1.5)]
+    assert [(scalar.step, scalar.value) for scalar in events.Scalars("time/updates")] == [(100, 3.0)]
+
+
+def test_every_tag_is_in_a_group() -> None:
+    assert tag("evaluation_return_mean") == "evaluation/return_mean"
+    assert tag("rollouts_accepted") == "rollout/rollouts_accepted"
+    assert tag("env/laps") == "env/laps"
+    assert {name: tag(name).count("/") for name in COLUMNS} == dict.fromkeys(COLUMNS, 1)
+    assert len({tag(name) for name in COLUMNS}) == len(COLUMNS)
 
 
 def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Path) -> None:
@@ -80,12 +109,16 @@ def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Pat
     writer.close()
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    assert sorted(events.Tags()["histograms"]) == ["action", "episode_length", "episode_return"]
-    (returns,) = events.Histograms("episode_return")
+    assert sorted(events.Tags()["histograms"]) == [
+        "rollout/action",
+        "rollout/episode_length",
+        "rollout/episode_return",
+    ]
+    (returns,) = events.Histograms("rollout/episode_return")
     assert (returns.step, returns.histogram_value.num, returns.histogram_value.sum) == (100, 3.0, 7.0)
     assert (returns.histogram_value.min, returns.histogram_value.max) == (1.0, 5.0)
-    assert events.Histograms("action")[0].histogram_value.bucket == [2.0, 0.0, 5.0]
-    (image,) = events.Images("what_the_network_sees")
+    assert events.Histograms("rollout/action")[0].histogram_value.bucket == [2.0, 0.0, 5.0]
+    (image,) = events.Images("rollout/observation")
     assert (image.step, image.width, image.height) == (100, 8, 6)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from allowed_modules import TEST_MODULES
 from building import join
 from collectors import started_collector
 
@@ -41,7 +42,7 @@ def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
 ) -> None:
     # Episodes have 3, 2 and 1 steps, so every rollout of 5 rows contains starts and ends of episodes.
     spec = EnvironmentSpec(id="counting_environment:Counting-v0", frame_stack=stack)
-    environments = make_environments(spec, 4)
+    environments = make_environments(spec, 4, modules=TEST_MODULES)
     spaces = environments.spaces
     torch.manual_seed(1)
     network = ActorCritic(POLICIES[policy], spaces)

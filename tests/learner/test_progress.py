@@ -104,7 +104,8 @@ def test_end_adds_no_empty_line_to_a_file(clock: Clock) -> None:
     assert lines[1] == "done"
 
 
-def test_line_shows_the_return_after_the_first_episode() -> None:
+def test_line_shows_the_return_after_the_first_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     screen = Screen()
     progress = Progress(screen, 2_000_000)
     progress.show(row(1_500_000))
@@ -113,3 +114,26 @@ def test_line_shows_the_return_after_the_first_episode() -> None:
     line = screen.getvalue().split(CLEAR)[-1]
     for part in ("return   475.2", "1,500,000 (75 %)", "1,234/s", "56/s", "lag 0.8", "actors 2"):
         assert part in line
+
+
+@pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
+def test_line_fits_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    screen = Screen()
+    Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=-1234.5, episode_length_mean=1000.0))
+    line = screen.getvalue().removeprefix(CLEAR)
+    assert len(line) < columns
+    for part, needed in (("return -1234.5", 30), ("1,500,000 (75 %)", 60), ("left", 80), ("length  1,000", 100)):
+        assert (part in line) == (columns >= needed), part
+
+
+def test_rate_and_time_left_are_measured_over_the_rows_of_30_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow environment makes 16 steps every 4 seconds, and most rows have none."""
+    monkeypatch.setenv("COLUMNS", "200")
+    screen = Screen()
+    progress = Progress(screen, 10_000)
+    for second in range(0, 120):
+        progress.show(row(16 * (second // 4), wall_seconds=float(second), env_steps_per_second=0.0))
+    line = screen.getvalue().split(CLEAR)[-1]
+    assert "      4/s" in line
+    assert "left 43 min" in line  # 9,536 env_steps at 112 in 30 s

@@ -8,11 +8,24 @@ import numpy as np
 import pytest
 from building import EPOCH, joined_fleet, make_rollout, run_spec
 
+from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
-from daedalus.learner.reporting.report import Health, RateMeter, episode_statistics, metrics_row, run_status, summary
+from daedalus.learner.reporting.report import (
+    EpisodeHint,
+    Health,
+    RateMeter,
+    episode_statistics,
+    metrics_row,
+    run_status,
+    summary,
+)
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.update_metrics import METRICS
 
+DIAGNOSTICS = (
+    *("behaviour_kl", "rho_mean", "rho_effective_share", "rho_clipped_fraction"),
+    *VALUE_ERROR_QUANTILES,
+)
 EVERYTHING = np.ones((6, 3), np.bool_)
 
 
@@ -45,6 +58,22 @@ def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
     assert meter.measure(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
 
 
+def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
+    counters, fleet, hint = RunCounters(100), joined_fleet("a", "b"), EpisodeHint()  # six environments
+    counters.env_steps = 59_999
+    assert hint.take(counters, fleet) == ""
+    counters.env_steps = 60_000
+    assert hint.take(counters, fleet) == (
+        "no episode has ended after 10,000 env_steps in each environment: if the environment never ends them, "
+        "set environment.max_episode_steps"
+    )
+    assert hint.take(counters, fleet) == ""
+    assert EpisodeHint().take(trained_counters(1.0), fleet) == ""
+    ended = trained_counters(1.0)
+    ended.env_steps = 10**9
+    assert EpisodeHint().take(ended, fleet) == ""
+
+
 def test_episode_statistics_are_over_the_newest_episodes() -> None:
     assert episode_statistics(RunCounters(3)) == {}
     assert episode_statistics(trained_counters(1.0, 2.0, 6.0)) == pytest.approx(
@@ -61,9 +90,9 @@ def test_episode_statistics_are_over_the_newest_episodes() -> None:
 def test_row_has_every_column_when_all_values_are_known() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
-    fleet.set_present("b", 1, False)
+    fleet.set_present("b", 1, False, 0.0)
     rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
-    learning = {**dict.fromkeys(METRICS, 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
+    learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)
     assert set(row) == set(COLUMNS)
@@ -80,12 +109,12 @@ def test_first_row_omits_unknown_values() -> None:
 def test_status_contains_the_run_and_each_actor() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     spec = run_spec(algorithm="a3c", env_steps=1000)
-    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0)
+    health = Health(started=10.0, updated=24.0, actor_seen=24.0, saved=20.0, certificate_days_left=lambda: 7.5)
     status = run_status("run", EPOCH, spec, counters, fleet, {}, health, 77, 25.0)
     assert (status.run, status.learner_epoch, status.algorithm, status.environment) == ("run", EPOCH, "a3c", "Any-v0")
     assert (status.uptime_seconds, status.env_steps, status.env_steps_budget) == (15.0, 18, 1000)
     assert (status.episode_return_mean, status.env_steps_per_second) == (4.0, 0.0)
-    assert (status.problems, status.checkpoint_age_seconds) == ((), 5.0)
+    assert (status.problems, status.checkpoint_age_seconds, status.certificate_days_left) == ((), 5.0, 7.5)
     assert (status.queue_bytes, status.queue_bytes_limit) == (77, 64 * 2**20)
     assert [actor.actor for actor in status.actors] == ["a", "b"]
 
@@ -102,7 +131,7 @@ HEALTHY = Health(started=0.0, updated=100.0, actor_seen=100.0)
         ({"actor_seen": 90.0}, 1, ()),
         ({"updated": 44.0}, 1, ("no update for 61 s",)),
         ({"updated": 44.0, "actor_seen": 44.0}, 0, ("no live actor for 61 s",)),
-        ({"gradient_fault": "the gradient is not finite"}, 1, ("updates are skipped: the gradient is not finite",)),
+        ({"gradient_fault": True}, 1, ("updates are skipped: the gradient is not finite",)),
         ({"left_out": {"b", "a"}}, 3, ("batches do not wait for a, b: connected, but without rollouts",)),
         (
             {"left_out": set("abcdefg")},

@@ -33,7 +33,7 @@ def specs(draw: st.DrawFn) -> RunSpec:
     return RunSpec.model_validate(
         {
             "environment": {
-                "id": draw(st.text(min_size=1, max_size=9)),
+                "id": draw(st.from_regex(r"[^\W:]{1,9}|[^\W\d]{1,5}:[\w' -]{1,5}", fullmatch=True)),
                 **some(
                     kwargs=st.dictionaries(st.text(max_size=5), JSON, max_size=3),
                     max_episode_steps=st.integers(1, 10**9),
@@ -78,7 +78,9 @@ def test_config_toml_can_be_used_as_a_preset(tmp_path: Path) -> None:
 
 def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
     run_directory.create(tmp_path / "runs" / "new", run_spec())
-    assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == ["config.toml", "versions.json"]
+    assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == [
+        *("config.toml", "learner.lock", "versions.json")
+    ]
     versions = run_directory.read_json(tmp_path / "runs" / "new" / run_directory.VERSIONS)
     assert {"python", "torch", "numpy", "eclipse-zenoh"} <= versions.keys()
 

@@ -10,6 +10,7 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -66,7 +67,7 @@ def spaces(shape: tuple[int, ...], dtype: str = "uint8", frames: int = 1, action
 
 def make_policy(spec: dict[str, Any], where: Spaces) -> Policy:
     checked = PolicySpec.model_validate(spec)
-    network = ActorCritic(checked, where)
+    network = ActorCritic(checked, where, UserModules(frozenset({"users_own"})))
     return Policy(network, checked, where, export_program(network, where))
 
 

@@ -15,6 +15,7 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import PolicySpec
 
 PREAMBLE = """
@@ -44,7 +45,7 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]
 
     def from_source(source: str) -> ActorCritic:
         (tmp_path / "users_own.py").write_text(PREAMBLE + source)
-        return ActorCritic(PolicySpec(encoder="users_own:Net"), SPACES)
+        return ActorCritic(PolicySpec(encoder="users_own:Net"), SPACES, UserModules(frozenset({"users_own"})))
 
     yield from_source
     sys.modules.pop("users_own", None)
@@ -82,18 +83,28 @@ class Net(Base):
     assert logits.shape == (2, 4, 4)
 
 
-@pytest.mark.parametrize("name", ["not_there_at_all:Net", "not_there.at_all:Net", "..:Net"])
+@pytest.mark.parametrize("name", ["not_there_at_all:Net", "not_there.at_all:Net"])
 def test_missing_module_is_reported(name: str) -> None:
-    with pytest.raises(NetworkError, match=rf"policy\.encoder={name}: .*"):
-        ActorCritic(PolicySpec(encoder=name), SPACES)
+    with pytest.raises(NetworkError, match=rf"policy\.encoder={name}: cannot import .*"):
+        ActorCritic(PolicySpec(encoder=name), SPACES, UserModules(frozenset({name.split(":")[0]})))
+
+
+def test_the_module_of_an_encoder_is_not_imported_unless_it_is_allowed(build: Building, tmp_path: Path) -> None:
+    build("class Net(Base): pass")
+    del sys.modules["users_own"]
+    with pytest.raises(
+        NetworkError, match=r"policy\.encoder=users_own:Net, but the module users_own may not be imported"
+    ):
+        ActorCritic(PolicySpec(encoder="users_own:Net"), SPACES)
+    assert "users_own" not in sys.modules
 
 
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("import not_installed_at_all", "No module named 'not_installed_at_all'; install it"),
-        ("class net(Base): pass", r"users_own.py has no torch.nn.Module 'Net'; name"),
-        ("def Net(shape): return Base(shape)", "has no torch.nn.Module 'Net'"),
+        ("import not_installed_at_all", "No module named 'not_installed_at_all'.: install it"),
+        ("class net(Base): pass", r"users_own.py has no 'Net'"),
+        ("def Net(shape): return Base(shape)", "is not a class of torch.nn.Module"),
         ("class Net(Base):\n    def __init__(self): pass", "TypeError: "),
         ("class Net(Base):\n    def forward(self, x): raise KeyError('mine')", "KeyError: 'mine'"),
         ("class Net(Base):\n    def forward(self, x): return self.convolution(x.float())", "must return .2, features."),

@@ -1,6 +1,7 @@
 """A program of another process cannot loop, allocate without limit, or run longer than the watchdog allows."""
 
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -216,6 +217,17 @@ def test_calls_within_the_limit_are_not_ended(monkeypatch: pytest.MonkeyPatch) -
     for _ in range(3):
         np.testing.assert_array_equal(session.run({"observations": OBSERVATIONS})[0], OBSERVATIONS)
         threading.Event().wait(0.3)  # the watchdog has looked between two calls
+
+
+def test_time_in_which_the_process_was_frozen_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    watchdog, cancelled = CallWatchdog(None), threading.Event()
+    watchdog.begin(cancelled.set)
+    monkeypatch.setattr(time, "monotonic", lambda: 1e9)
+    watchdog.tick()
+    assert not cancelled.is_set()
+    for _ in range(round(call_watchdog.CALL_SECONDS / 0.2) + 1):
+        watchdog.tick()
+    assert cancelled.is_set()
 
 
 def test_watchdog_ends_with_its_owner() -> None:

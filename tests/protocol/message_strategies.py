@@ -8,6 +8,8 @@ from wire_format import DTYPES, bits
 
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsReport,
+    ActorsRequest,
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
@@ -33,7 +35,7 @@ from daedalus.protocol.spec import (
     ServiceSpec,
     TrainingSpec,
 )
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, RunStatus
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)
@@ -71,7 +73,8 @@ run_specs = st.builds(
     RunSpec,
     environment=st.builds(
         EnvironmentSpec,
-        id=st.text(min_size=1, max_size=20),
+        id=st.sampled_from(["Any-v0", "ALE/Pong-v5", "my.module:Mine-v0", "ä"]),
+        wrap=st.none() | st.just("my.module:wrap"),
         kwargs=st.dictionaries(text, json_values, max_size=3),
         max_episode_steps=st.none() | positive,
         action_table=st.none() | st.lists(st.tuples(floats, floats), min_size=2, max_size=3).map(tuple),
@@ -117,8 +120,11 @@ statuses = st.builds(
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
     problems=st.lists(text, max_size=3).map(tuple),
     checkpoint_age_seconds=st.none() | floats,
+    certificate_days_left=st.none() | floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
+    **dict.fromkeys(("actors_alive", "actors_quarantined", "actors_gone"), counters),
+    **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
     **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), counters),
     **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), floats),
@@ -158,6 +164,12 @@ def rollouts(draw: st.DrawFn) -> Rollout:
         valid=bits(random, "|b1", shape),
         episode_returns=bits(random, "<f4", (episodes,)),
         episode_lengths=bits(random, "<i4", (episodes,)),
+        episode_info={
+            name: bits(random, "<f4", (draw(st.integers(1, episodes)),))
+            for name in (
+                draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
+            )
+        },
     )
 
 
@@ -224,12 +236,20 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         held_version=st.none() | counters,
         policy_version=st.none() | counters,
         part=counters,
+        compact=st.booleans(),
     ),
     SnapshotPart: snapshot_parts(),
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
-    RunEnded: st.builds(RunEnded, learner_epoch=counters, reason=text),
+    RunEnded: st.builds(
+        RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
+    ),
     StatusReport: st.builds(StatusReport, status=statuses),
+    ActorsRequest: st.builds(ActorsRequest, after=text),
+    ActorsReport: st.builds(
+        ActorsReport,
+        page=st.builds(ActorsPage, learner_epoch=counters, actors=st.lists(actor_statuses, max_size=3).map(tuple)),
+    ),
 }
 messages = st.one_of(*KINDS.values())

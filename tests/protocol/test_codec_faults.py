@@ -138,7 +138,7 @@ def test_missing_array_of_a_rollout_is_rejected() -> None:
 
 
 def test_unknown_array_is_rejected() -> None:
-    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="")))
+    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, outcome="finished", reason="")))
     content.update(arrays=[["extra", "|u1", [8], False]], size=8)
     with pytest.raises(ProtocolError, match="RunEnded has no array 'extra'"):
         decode(wire(content, bytes(8)), LIMITS)

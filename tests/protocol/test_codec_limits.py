@@ -129,7 +129,7 @@ def test_deep_nesting_is_decoded_or_rejected(depth: int) -> None:
 
 
 def test_header_beyond_the_limit_is_not_read() -> None:
-    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, reason="x" * 5000)))
+    _, content, _ = unwire(encode(RunEnded(learner_epoch=1, outcome="finished", reason="x" * 5000)))
     with pytest.raises(ProtocolError, match=r"the header declares .* the limit is 4096"):
         decode(wire(content), SMALL)
     with pytest.raises(ProtocolError, match="the header declares 4294967295 bytes"):

@@ -79,6 +79,9 @@ class Films:
     def reset(self, seed: int) -> Observed:
         return Observed({NAME: self.played.reset(seed=seed)[0]}, {})
 
+    def take_episode_info(self) -> dict[str, np.ndarray]:
+        return {}
+
     def step(self, actions: dict[str, np.ndarray]) -> Step:
         frames, rewards, terminated, truncated, _ = self.played.step(actions[ACTION][:, 0])
         return Observed({NAME: frames}, {}), rewards, terminated, truncated

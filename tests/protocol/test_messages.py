@@ -112,6 +112,44 @@ def test_empty_rollout_is_rejected(rows: int, environments: int) -> None:
         rollout(rewards=np.zeros((rows, environments), np.float32))
 
 
+def test_rollout_with_episode_info_is_accepted() -> None:
+    info = {"x" * 64: np.zeros(K, np.float32), "lap.time_s-1": np.zeros(1, np.float32)}
+    assert rollout(episode_info=info).episode_info == info
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        ({"": np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
+        ({"x" * 65: np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
+        ({"a/b": np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
+        ({"\x1b[31m": np.zeros(1, np.float32)}, "must be 1 to 64 letters"),
+        ({"a": np.zeros(1, np.float64)}, "float32"),
+        ({"a": np.zeros((1, 1), np.float32)}, "float32"),
+        ({"a": np.zeros(0, np.float32)}, "from 1 to"),
+        ({"a": np.zeros(K + 1, np.float32)}, "from 1 to"),
+        ({f"a{number}": np.zeros(1, np.float32) for number in range(17)}, "17 names"),
+    ],
+)
+def test_rollout_with_wrong_episode_info_is_refused(info: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rollout(episode_info=info)
+
+
+def test_at_most_256_values_of_a_name_travel() -> None:
+    rows = {name: np.zeros((300, 1), getattr(rollout(), name).dtype) for name in ROW_ARRAYS}
+    long: dict[str, Any] = {
+        **rows,
+        "frames": np.zeros((301, 1, 4), np.float32),
+        "initial_state": np.zeros((1, 0), np.float32),
+        "episode_returns": np.zeros(300, np.float32),
+        "episode_lengths": np.ones(300, np.int32),
+    }
+    assert rollout(**long, episode_info={"a": np.zeros(256, np.float32)}).rows == 300
+    with pytest.raises(ValueError, match="from 1 to 256"):
+        rollout(**long, episode_info={"a": np.zeros(257, np.float32)})
+
+
 def test_lengths_must_be_integers() -> None:
     with pytest.raises(ValueError, match=r"episode_lengths.* integers"):
         rollout(episode_lengths=np.ones(K, np.float32))

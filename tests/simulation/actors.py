@@ -166,8 +166,10 @@ class ActorProcess:
     def _main(self) -> None:
         """Do what `daedalus actor` does."""
         try:
-            self.service.run()
-            outcome = "stopped" if self.stop.is_set() else "run over"
+            finished = self.service.run()
+            outcome = "run over" if finished else "stopped"
+            is_right = self.ledger.is_finished if finished else self.stop.is_set()
+            self.ledger.require(is_right, self.process.name, "ends, but was not stopped, and the run is not over")
         except NameInUseError:
             outcome = "name in use"
         except ActorError as error:

@@ -30,8 +30,7 @@ def _disturb_learner(world: World, fault: str, seconds: float) -> None:
     elif fault == "stop learner":
         learner.stop.set()
     elif fault == "freeze learner":
-        learner.process.freeze()
-        world.kernel.after(seconds, learner.process.thaw)
+        _freeze(world, learner.link, seconds)
     elif fault == "hang learner":
         learner.hang_seconds = seconds
     elif not world.settings.embedded:
@@ -49,9 +48,8 @@ def _disturb_actor(world: World, fault: str, seconds: float, actor: ActorProcess
         world.keep_away(actor, seconds)
         world.stop_actor(actor)
     elif fault in ("freeze actor", "twin"):
-        actor.process.freeze()
         actor.is_disturbed = True
-        world.kernel.after(seconds, actor.process.thaw)
+        _freeze(world, actor.link, seconds)
         if fault == "twin":  # as on another machine, while this one does not respond
             world.start_actor(actor.name)
     elif fault == "hang actor":
@@ -62,6 +60,18 @@ def _disturb_actor(world: World, fault: str, seconds: float, actor: ActorProcess
         actor.link.die()
     else:
         actor.link.flicker()
+
+
+def _freeze(world: World, link: Link, seconds: float) -> None:
+    link.process.freeze()
+    link.reachability_changed()
+    world.kernel.after(seconds, _thaw, link)
+
+
+def _thaw(link: Link) -> None:
+    if link.process.frozen:
+        link.process.thaw()
+        link.reachability_changed()
 
 
 def _cut(world: World, link: Link, seconds: float) -> None:
@@ -86,6 +96,5 @@ def heal(world: World) -> None:
     world.learner.hang_seconds = 0.0
     for actor in world.running:
         actor.hang_seconds = 0.0
-    for process in [world.learner.process, *(actor.process for actor in world.running)]:
-        if process.frozen:
-            process.thaw()
+    for link in [world.learner.link, *(actor.link for actor in world.running)]:
+        _thaw(link)

@@ -101,10 +101,13 @@ class LearnerProcess:
             disk.spaces = server.await_spaces(self.stop)  # type: ignore[arg-type] - a simulated Event
             if disk.spaces is not None:
                 self._train(server, counters, before)
+                server.close("finished" if self.is_finished else "stopped", finished=self.is_finished)
+                if self.is_finished:
+                    server.await_departures(self.stop)  # type: ignore[arg-type]
         except TransportError as error:
             self.kernel.log("failed", self.process.name, str(error))
         finally:
-            server.close("the learner was stopped" if self.stop.is_set() else "the learner has finished")
+            server.close("stopped")
             self._check(server, counters, before)
             self.link.close()
         self._end()
@@ -123,7 +126,7 @@ class LearnerProcess:
                 hang, self.hang_seconds = self.hang_seconds, 0.0
                 kernel.sleep(self.settings.train_seconds * kernel.random.random() + hang)
                 self.version += self._updates(rollouts)
-                server.rollouts.count_trained(rollouts, at_fault=[])
+                server.rollouts.count_trained(rollouts, [])
                 server.publisher.publish_if_due(self.version, self._weights(), len(rollouts))
             if kernel.now >= save_at:
                 self.disk.version, self.disk.counters = self.version, counters.state(0.0)

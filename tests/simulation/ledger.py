@@ -43,6 +43,7 @@ class Ledger:
 
     def __init__(self, kernel: Kernel, spec: RunSpec) -> None:
         self._kernel, self._spec = kernel, spec
+        self.is_finished = False  # whether the budget of the run is used up
         self.lives: list[Life] = []
         self.collected: list[RolloutIdentity] = []  # by the number that each rollout carries
         self._numbers: dict[RolloutIdentity, int] = {}

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from daedalus.protocol import keys
 from daedalus.transport.interface import Inbox, OnAnswer, Request, TransportError
 
 from .network import Network, matches
@@ -33,6 +34,10 @@ class Link:
         return self.alive and not (self.cut or self.dead or self.network.cut)
 
     @property
+    def _keeps_alive(self) -> bool:
+        return self.passes() and not self.process.frozen
+
+    @property
     def seconds_to_send(self) -> float:
         """How long the messages under way need."""
         return max(self._sent_until - self.network.kernel.now, 0.0)
@@ -45,7 +50,7 @@ class Link:
 
     def reachability_changed(self) -> None:
         """Lose presence after the lease, or get it back."""
-        if self.passes():
+        if self._keeps_alive:
             if self.expired:
                 self.expired = False
                 self._presence_changed()
@@ -71,7 +76,7 @@ class Link:
                         watch.forget(key)
 
     def _expire(self, session: int) -> None:
-        if not self.passes() and self.session == session and not self.expired:
+        if not self._keeps_alive and self.session == session and not self.expired:
             self.expired = True
             self._presence_changed()
 
@@ -94,7 +99,7 @@ class Link:
     # ---------------------------------------------------------------------------------------------- Transport
 
     def _enter(self, operation: str) -> None:
-        self.network.kernel.preempt()
+        self.network.kernel.perhaps_preempt()
         if not self.alive:
             raise TransportError("the session is closed")
         if not self.passes() and self.network.chance(self.network.weather.refused):
@@ -161,7 +166,7 @@ class Link:
                 if network.chance(network.weather.noticed):
                     kernel.after(kernel.random.random(), query.finish, None)
                 continue
-            request = LinkRequest(server, query, key if "*" in served else served, payload)
+            request = LinkRequest(server, query, keys.intersection(served, key), payload)
             request.finds_others = finds_others
             self.send(self._arrive, request, served, server.session)
 

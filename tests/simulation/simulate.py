@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
+from types import ModuleType
 from typing import Any
 
 from daedalus.actor.session import service
@@ -70,12 +71,13 @@ def simulate(seed: int) -> Result:
     )
 
 
-def _services() -> list[Any]:
+def services() -> list[ModuleType]:
+    """Return the modules of the services, whose threads and time are simulated."""
     return [module for name, module in list(sys.modules.items()) if name.startswith(_PATCHED)]
 
 
 def _fine_files() -> frozenset[str]:
-    return frozenset(str(module.__file__) for module in _services())
+    return frozenset(str(module.__file__) for module in services())
 
 
 @contextlib.contextmanager
@@ -85,6 +87,7 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
         "_HEARTBEAT_SECONDS": settings.heartbeat_seconds,
         "HEARTBEAT_SECONDS": settings.heartbeat_seconds,
         "_PATIENCE_SECONDS": settings.patience_seconds,
+        "PART_BYTES": 64,  # so that a compact snapshot has several parts
     }
     replaced: list[tuple[Any, str, Any]] = []
     fakes = primitives.modules(kernel)
@@ -96,7 +99,7 @@ def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     }
     if not settings.real_codec:
         replacements |= {id(real_codec.encode): codec.encode, id(real_codec.decode): codec.decode}
-    for module in _services():
+    for module in services():
         for attribute, value in list(vars(module).items()):
             if id(value) in replacements or attribute in constants:
                 replaced.append((module, attribute, value))
@@ -152,10 +155,11 @@ def _end(world: World) -> None:
     kernel, learner = world.kernel, world.learner
     world.supervised = False
     if world.settings.ends_by == "finish":
-        learner.is_finished = True
+        fleet = {} if learner.server is None else learner.server.fleet.actors
+        joined = [actor for actor in world.running if fleet[actor.name].incarnation == actor.incarnation]
+        learner.is_finished = world.ledger.is_finished = True
         end = kernel.now + _END_SECONDS
-        while world.running:
-            left = [actor.process.name for actor in world.running]
+        while left := [actor.process.name for actor in joined if not actor.outcome]:
             world.ledger.require(kernel.now < end, left, f"did not end {_END_SECONDS:g} s after the end of the run")
             kernel.sleep(0.1)
     for actor in world.running:

@@ -12,7 +12,7 @@ from .network import Network
 from .settings import Settings
 from .traffic import LinkRequest
 
-_STOP_SECONDS = 11.0  # in which a process ends that is asked to stop: two queries of 5 s may have no answer
+_STOP_SECONDS = 7.0  # in which a process ends that is asked to stop: a query of 5 s may have no answer
 
 
 class World:
@@ -46,7 +46,9 @@ class World:
     # ----------------------------------------------------------------------------------------------- learner
 
     def start_learner(self) -> None:
-        """Start a learner. There must be none."""
+        """Start a learner, unless the simulation ends. There must be none."""
+        if not self.supervised:
+            return
         self._lives += 1
         self.network.cut = False
         self.learner = LearnerProcess(
@@ -77,7 +79,9 @@ class World:
     # ------------------------------------------------------------------------------------------------ actors
 
     def start_actor(self, name: str) -> None:
-        """Start an incarnation of an actor."""
+        """Start an incarnation of an actor, unless the simulation ends."""
+        if not self.supervised:
+            return
         self._incarnations += 1
         actor = ActorProcess(
             self.kernel,

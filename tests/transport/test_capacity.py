@@ -3,7 +3,6 @@
 import socket
 import time
 from contextlib import ExitStack, closing
-from typing import Any
 
 import pytest
 from processes import LIMIT, until
@@ -13,18 +12,18 @@ from daedalus.protocol import keys
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.transport import zenoh_settings
 from daedalus.transport.interface import AddressInUseError, Request, Transport
-from daedalus.transport.zenoh_settings import Capacity
+from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES, Capacity
 from daedalus.transport.zenoh_transport import connect, listen
 
 MIB = 1 << 20
 NO_ANSWER_SECONDS = 2.0
 
 
-def listen_somewhere(**options: Any) -> tuple[str, Transport]:
+def listen_somewhere(max_message_bytes: int = MAX_MESSAGE_BYTES) -> tuple[str, Transport]:
     while True:
         endpoint = free_endpoint()
         try:
-            return endpoint, listen([endpoint], **options)
+            return endpoint, listen([endpoint], max_message_bytes=max_message_bytes)
         except AddressInUseError:
             continue
 
@@ -48,7 +47,7 @@ def test_messages_above_the_limit_are_dropped_and_the_session_goes_on() -> None:
 def test_small_queries_are_filtered_by_their_size() -> None:
     """A router does not forward 400 MB to a learner in a request to join."""
     endpoint, router = listen_somewhere()
-    key = keys.join("r")
+    key = keys.join("r", "arm")
     with closing(router), closing(connect([endpoint])) as learner, closing(connect([endpoint])) as actor:
         learner.serve(key, lambda request: request.reply(b"welcome"))
         until(lambda: actor.query(key, b"x" * JOIN_LIMITS.message_bytes, timeout=LIMIT) == [b"welcome"])

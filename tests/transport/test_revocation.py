@@ -3,6 +3,7 @@
 import datetime
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -16,7 +17,7 @@ from test_access_control import listen_somewhere
 from daedalus.cli.certificate_folder import CertificateFolder, Identity
 from daedalus.protocol import keys
 from daedalus.transport import credentials_watch
-from daedalus.transport.credentials import CredentialsError, load
+from daedalus.transport.credentials import Credentials, CredentialsError, load
 from daedalus.transport.interface import RefusedError, Request, Transport, TransportError
 from daedalus.transport.zenoh_session import session_opener
 from daedalus.transport.zenoh_transport import connect
@@ -39,7 +40,7 @@ def folder(tmp_path: Path) -> CertificateFolder:
 def address(folder: CertificateFolder) -> Iterator[str]:
     """Run a router that answers joins itself."""
     where, router = listen_somewhere(folder.directory / "router")
-    router.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
+    router.serve(keys.join("r", "arm"), lambda request: request.reply(b"welcome"))
     with closing(router):
         yield where
 
@@ -49,7 +50,7 @@ def client(address: str, folder: CertificateFolder, identity: Identity) -> Trans
 
 
 def answered(end: Transport) -> bool:
-    return end.query(keys.join("r"), timeout=LIMIT) == [b"welcome"]
+    return end.query(keys.join("r", "arm"), timeout=LIMIT) == [b"welcome"]
 
 
 def test_revoked_certificate_loses_its_session_and_gets_no_other(address: str, folder: CertificateFolder) -> None:
@@ -121,12 +122,13 @@ def test_requests_that_wait_while_the_session_is_renewed_do_no_harm(folder: Cert
     waiting: list[Request] = []
     renewed = threading.Event()
     with closing(router), closing(client(address, folder, ARM)) as arm:
-        router.serve(keys.join("r"), lambda request: request.reply(b"welcome") if renewed.is_set() else hold(request))
+        key = keys.join("r", "arm")
+        router.serve(key, lambda request: request.reply(b"welcome") if renewed.is_set() else hold(request))
 
         def hold(request: Request) -> None:
             waiting.append(request)
 
-        arm.query_async(keys.join("r"), b"payload", timeout=LIMIT, on_answer=lambda _: None)
+        arm.query_async(keys.join("r", "arm"), b"payload", timeout=LIMIT, on_answer=lambda _: None)
         until(lambda: waiting)
         folder.revoke([BOX])
         until(lambda: any("connections are renewed" in line for line in LINES))
@@ -145,13 +147,24 @@ def test_closed_router_is_not_opened_again(folder: CertificateFolder) -> None:
         client(address, folder, ARM)
 
 
-def test_a_warning_30_days_before_a_certificate_expires(folder: CertificateFolder) -> None:
-    folder.issue([ARM], datetime.timedelta(days=29, hours=1))
-    for identity in (ARM, BOX):
-        session_opener("client", [], [], load(folder.directory / identity.folder, "actor"), 1)
-    warnings = [line for line in LINES if "renew it" in line]
-    assert len(warnings) == 1
-    assert "actor-arm expires in 29 days: renew it (daedalus certs renew)" in warnings[0]
+def test_a_warning_30_days_before_a_certificate_expires(
+    folder: CertificateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short-lived certificate warns only in its last third."""
+    folder.issue([ARM], DAYS)
+    folder.issue([LATE], datetime.timedelta(days=29))
+    arm, late = (load(folder.directory / identity.folder, "actor") for identity in (ARM, LATE))
+
+    def warned(certificate: Credentials, days_later: float) -> bool:
+        LINES.clear()
+        with monkeypatch.context() as patch:
+            now = time.time()
+            patch.setattr(time, "time", lambda: now + days_later * 86_400)
+            session_opener("client", [], [], certificate, 1)
+        return any("renew it (daedalus certs renew)" in line for line in LINES)
+
+    assert [warned(arm, days) for days in (0, 334, 336, 366)] == [False, False, True, False]
+    assert [warned(late, days) for days in (0, 19, 20)] == [False, False, True]
 
 
 def test_client_whose_certificate_expires_in_use_is_told_so(address: str, folder: CertificateFolder) -> None:

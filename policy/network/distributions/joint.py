@@ -10,6 +10,7 @@ from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGau
 from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
 from daedalus.policy.network.distributions.mixture import GaussianMixture
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -23,11 +24,12 @@ class ActionDistribution(nn.Module):
     components lie side by side, in the order of the components.
     """
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise NetworkError if a distribution does not support its component."""
+    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+        """Raise NetworkError if a distribution does not support its component, or may not be imported."""
         super().__init__()
         self._names, self._masked = tuple(spaces.actions), frozenset(spaces.masks)
-        self.components = nn.ModuleList([_distribution(spec, name, space) for name, space in spaces.actions.items()])
+        distributions = [_distribution(spec, name, space, modules) for name, space in spaces.actions.items()]
+        self.components = nn.ModuleList(distributions)
         self._sizes = [component.parameter_count for component in self._distributions()]
         self.parameter_count = sum(self._sizes)
         self.uniform_count = sum(component.uniform_count for component in self._distributions())
@@ -77,12 +79,14 @@ def _sum(terms: list[Tensor]) -> Tensor:
     return terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
 
 
-def _distribution(spec: PolicySpec, name: str, space: DiscreteSpace | ContinuousSpace) -> Distribution:
+def _distribution(
+    spec: PolicySpec, name: str, space: DiscreteSpace | ContinuousSpace, modules: UserModules
+) -> Distribution:
     """Return the distribution of one component. Raises NetworkError if it does not support the component."""
-    if ":" in spec.distribution:
-        return _custom(spec.distribution, name, space)
     if isinstance(space, DiscreteSpace):
         return Categorical(space)
+    if ":" in spec.distribution:
+        return _custom(spec.distribution, name, space, modules)
     if not space.bounded and spec.distribution in ("squashed_gaussian", "kumaraswamy"):
         raise NetworkError(
             f"policy.distribution={spec.distribution} needs bounded actions, but {name!r} is {space}: "
@@ -99,15 +103,15 @@ def _distribution(spec: PolicySpec, name: str, space: DiscreteSpace | Continuous
             return Gaussian(space, initial_std=spec.initial_std, state_dependent=spec.state_dependent_std)
 
 
-def _custom(reference: str, name: str, space: DiscreteSpace | ContinuousSpace) -> Distribution:
-    """Return the user's distribution `module:Class`, for continuous components; discrete ones stay categorical."""
-    if isinstance(space, DiscreteSpace):
-        return Categorical(space)
+def _custom(reference: str, name: str, space: ContinuousSpace, modules: UserModules) -> Distribution:
+    """Return the user's distribution `module:Class` for a continuous component."""
     try:
-        distribution = find_class(reference, Distribution)(space)
+        distribution = find_class("policy.distribution", reference, Distribution, modules)(space)
         counts = (distribution.parameter_count, distribution.uniform_count, distribution.normal_count)
         if not all(isinstance(count, int) and count >= 0 for count in counts) or not counts[0]:
             raise NetworkError(f"has counts {counts}: parameter_count must be at least 1, the others at least 0")
+    except UserModuleError as error:
+        raise NetworkError(str(error)) from error.__cause__
     except NetworkError as error:
         raise NetworkError(f"policy.distribution={reference}, for {name!r}: {error}") from error.__cause__
     except Exception as error:  # the user's code may raise anything

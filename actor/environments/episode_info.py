@@ -1,0 +1,47 @@
+"""Scalars that environments put into `info` at the end of an episode. State; no I/O."""
+
+from typing import Any
+
+import numpy as np
+
+from daedalus.protocol.keys import is_name
+from daedalus.protocol.messages import MAX_INFO_NAMES, MAX_INFO_VALUES
+
+
+class EpisodeInfo:
+    """The scalars of the episodes that ended since the last `take`, by name.
+
+    A scalar is a finite number or a bool under a name of 1 to 64 letters, digits, '.', '_' or '-'. Other entries of
+    `info`, more than MAX_INFO_NAMES names and more than MAX_INFO_VALUES values of a name are left out.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[str, list[float]] = {}
+
+    def add(self, info: dict[str, Any], ended: np.ndarray) -> None:
+        """Add the scalars of the last step of the episodes that ended with it.
+
+        Args:
+          info: of a gymnasium vector environment: `name` [E], and `_name` [E] bool where only some gave a value.
+          ended: [E] bool.
+        """
+        if not ended.any():
+            return
+        for name, values in info.items():
+            if not isinstance(values, np.ndarray) or values.shape != ended.shape or values.dtype.kind not in "biuf":
+                continue
+            known = name in self._values or len(self._values) < MAX_INFO_NAMES
+            if not known or name.startswith("_") or not is_name(name):
+                continue
+            given = ended & info.get(f"_{name}", True)
+            with np.errstate(over="ignore"):
+                scalars = values[given].astype(np.float32)
+            scalars = scalars[np.isfinite(scalars)]
+            if len(scalars):
+                kept = self._values.setdefault(name, [])
+                kept.extend(scalars[: MAX_INFO_VALUES - len(kept)].tolist())
+
+    def take(self) -> dict[str, np.ndarray]:
+        """Return the scalars since the last call: name -> [n] float32, n at least 1."""
+        values, self._values = self._values, {}
+        return {name: np.array(kept, np.float32) for name, kept in values.items()}

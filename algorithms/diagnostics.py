@@ -1,0 +1,68 @@
+"""Diagnostics of a batch before its first update: how far the behaviour policy is, and how wrong the critic. Pure."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+VALUE_ERROR_QUANTILES = {"value_error_p05": 0.05, "value_error_p50": 0.5, "value_error_p95": 0.95}
+
+
+class FirstPass(NamedTuple):
+    """A batch as the network saw it before its first update. All [T, B], without gradients."""
+
+    log_probs: Tensor  # log pi(a_t | s_t) of the target policy
+    behaviour_log_probs: Tensor  # log mu(a_t | s_t)
+    values: Tensor  # V(s_t)
+    targets: Tensor  # value targets
+    valid: Tensor  # float32, 1 or 0
+
+
+def diagnostics(first: FirstPass, rho_clip: float | None) -> dict[str, float]:
+    """Return the diagnostics of a batch by name; empty for a batch without valid rows.
+
+    `rho_clip` is V-trace's bound of rho, or None for an algorithm that does not correct for the policy lag.
+    """
+    rows = first.valid > 0.0
+    log_ratios = (first.log_probs - first.behaviour_log_probs)[rows]  # [N]
+    errors = (first.targets - first.values)[rows]  # [N]
+    if not len(errors):
+        return {}
+    ratios = log_ratios.exp()
+    measured = {
+        "behaviour_kl": behaviour_kl(log_ratios),
+        "rho_mean": ratios.mean(),
+        "rho_effective_share": effective_sample_share(log_ratios),
+    }
+    if rho_clip is not None:
+        measured["rho_clipped_fraction"] = (ratios > rho_clip).float().mean()
+    quantiles = torch.quantile(errors, errors.new_tensor(list(VALUE_ERROR_QUANTILES.values())))
+    measured.update(zip(VALUE_ERROR_QUANTILES, quantiles, strict=True))
+    return {name: float(value) for name, value in measured.items()}
+
+
+def behaviour_kl(log_ratios: Tensor) -> Tensor:
+    """Return an estimate of KL(mu || pi) in nats: the mean of rho - 1 - log rho.
+
+    It is unbiased, never negative, and needs no probabilities of the actions that were not chosen.
+    Schulman (2020), "Approximating KL divergence", the estimator k3.
+
+    Args:
+      log_ratios: [N], log rho = log pi(a | s) - log mu(a | s) of actions of the behaviour policy mu.
+    """
+    return (log_ratios.exp() - 1.0 - log_ratios).mean()
+
+
+def effective_sample_share(log_ratios: Tensor) -> Tensor:
+    """Return the effective sample size of the weights rho, as a share of the N rows.
+
+        (sum rho)^2 / (N sum rho^2)
+
+    It is 1 on-policy, and 1/N if one row outweighs all others. Owen (2013), "Monte Carlo theory, methods and examples",
+    equation 9.13. The largest weight is divided out first, so that no square overflows.
+
+    Args:
+      log_ratios: [N], log rho.
+    """
+    weights = (log_ratios - log_ratios.max()).exp()
+    return weights.sum().square() / (len(weights) * weights.square().sum())

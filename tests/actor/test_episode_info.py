@@ -1,0 +1,100 @@
+"""Scalars of `info` at the end of an episode: which travel, and that they are in the rollout where it ends."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from collectors import collect, started_collector
+from counting_environment import Counting
+
+from daedalus.actor.environments.episode_info import EpisodeInfo
+from daedalus.policy.acting.sampling import RandomSource
+from daedalus.protocol.spec import EnvironmentSpec
+
+ENDED = np.array([True, False, True, True])
+
+
+def taken(info: dict[str, Any], ended: np.ndarray = ENDED) -> dict[str, list[float]]:
+    scalars = EpisodeInfo()
+    scalars.add(info, ended)
+    return {name: values.tolist() for name, values in scalars.take().items()}
+
+
+def test_scalars_of_ended_episodes_are_taken_once() -> None:
+    scalars = EpisodeInfo()
+    scalars.add({"laps": np.array([1, 2, 3, 4])}, ENDED)
+    scalars.add({"laps": np.array([5.5, 6.5, 7.5, 8.5])}, np.array([False, True, False, False]))
+    scalars.add({"laps": np.array([9, 9, 9, 9])}, np.zeros(4, np.bool_))
+    (name,), (values,) = zip(*scalars.take().items(), strict=True)
+    assert (name, values.dtype, values.tolist()) == ("laps", np.float32, [1.0, 3.0, 4.0, 6.5])
+    assert scalars.take() == {}
+
+
+def test_environments_that_gave_no_value_are_left_out() -> None:
+    given = {"crashed": np.array([True, True, False, False]), "_crashed": np.array([True, True, False, True])}
+    assert taken(given) == {"crashed": [1.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        {"image": np.zeros((4, 3, 3))},
+        {"name": np.array(["a", "b", "c", "d"])},
+        {"object": np.array([None] * 4)},
+        {"episode": {"r": np.zeros(4)}},
+        {"_hidden": np.zeros(4)},
+        {"a/b": np.zeros(4), "": np.zeros(4), "x" * 65: np.zeros(4), "\x1b[2J": np.zeros(4)},
+        {"infinite": np.array([np.nan, 1.0, np.inf, 1e300])},
+    ],
+)
+def test_other_entries_are_left_out(info: dict[str, Any]) -> None:
+    assert taken(info) == {}
+
+
+def test_names_and_values_are_limited() -> None:
+    names = taken({f"name{number}": np.zeros(4) for number in range(20)})
+    assert list(names) == [f"name{number}" for number in range(16)]
+    assert len(taken({"a": np.zeros(300)}, np.ones(300, np.bool_))["a"]) == 256
+
+
+class Reporting(Counting):
+    """Counting that reports its episode and step, and at the end of an episode how many steps it had."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        observation, reward, terminated, truncated, _ = super().step(action)
+        info = {"episode": self._episode, "text": "no scalar"}
+        if terminated or truncated:
+            info["steps"] = float(self._step)
+        return observation, reward, terminated, truncated, info
+
+
+class Still:
+    state_size = 0
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        pass
+
+    def act(
+        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+
+
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_rollout_has_the_scalars_of_the_episodes_that_ended_in_it(repeat: int) -> None:
+    """Episodes of 3, 2 and 1 steps, with a reset row between them."""
+    gymnasium.register("Reporting-v0", Reporting)
+    try:
+        spec = EnvironmentSpec(id="Reporting-v0", action_repeat=repeat)
+        collector = started_collector(spec, Still(), count=2, rollout_length=4 if repeat == 1 else 3)
+        found = [{name: values.tolist() for name, values in collect(collector).episode_info.items()} for _ in range(2)]
+        collector.close()
+    finally:
+        del gymnasium.registry["Reporting-v0"]
+    assert found[0] == {"episode": [0.0, 0.0], "steps": [3.0, 3.0]}
+    assert found[1]["episode"][:2] == [1.0, 1.0]
+    assert found[1]["steps"][:2] == [2.0, 2.0]

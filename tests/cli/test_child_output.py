@@ -1,0 +1,116 @@
+"""Test of cli/child_output.py: the output of child processes goes to a log and, within a limit, to the screen."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli import child_output
+from daedalus.cli.child_output import ChildOutput, OutputLog, RateLimit
+
+
+class Screen:
+    """A screen for a test, and the output that is shown on it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.out: list[str] = []
+        self.err: list[str] = []
+        self.log = folder / "output.log"
+        self.output = ChildOutput(self.log, self.out.append, self.err.append)
+
+    def run(self, name: str, program: str, **options: bool) -> None:
+        with self.output.pipes(name, **options) as streams:
+            process = subprocess.Popen(
+                [sys.executable, "-S", "-c", program], stdout=streams.stdout, stderr=streams.stderr
+            )
+        process.wait()
+
+
+@pytest.fixture
+def screen(tmp_path: Path) -> Screen:
+    return Screen(tmp_path)
+
+
+def test_a_flood_is_logged_but_not_shown_and_does_not_hide_errors(screen: Screen) -> None:
+    screen.run("actor-0", "import sys\nfor n in range(30_000): print('line', n)\nprint('fault', file=sys.stderr)")
+    screen.output.close()
+    limit = child_output._SHOWN_AT_ONCE
+    assert screen.out[:limit] == [f"line {n}" for n in range(limit)]
+    assert screen.out[limit] == f"more lines of output are in {screen.log} only"
+    assert screen.out[-1].endswith(f" lines of output were not shown; see {screen.log}")
+    assert len(screen.out) < 2 * limit  # one line every few seconds, on the slowest machine
+    assert screen.err == ["fault"]
+    logged = screen.log.read_text().splitlines()
+    assert [line for line in logged if "fault" not in line] == [f"[actor-0] line {n}" for n in range(30_000)]
+
+
+def test_few_lines_are_all_shown_and_nothing_makes_no_log(screen: Screen) -> None:
+    screen.run("silent", "pass")
+    assert screen.output.unshown("silent") == []
+    assert not screen.log.exists()
+    screen.run("a", "print('one\\rtwo\\n')")
+    screen.run("b", "import os; os.write(2, b'\\xff without end')")
+    screen.output.close()
+    assert screen.out == ["one", "two", ""]
+    assert screen.err == ["\ufffd without end"]
+    assert screen.log.read_text() == "[a] one\n[a] two\n[a] \n[b] \ufffd without end\n"
+
+
+def test_error_lines_that_were_not_shown_are_kept(screen: Screen) -> None:
+    print_errors = "import sys\nfor n in range(100): print('error', n, file=sys.stderr)"
+    screen.run("evaluation-1", print_errors, shown=False)
+    assert screen.output.unshown("evaluation-1") == [f"error {n}" for n in range(60, 100)]
+    screen.run("actor-0", print_errors)
+    assert screen.output.unshown("actor-0")[-1] == "error 99"
+    screen.output.close()
+    assert len(screen.err) < 100
+
+
+def test_unlimited_output_is_shown_and_not_logged(screen: Screen) -> None:
+    with screen.output.unlimited_pipes("learner") as streams:
+        words = [sys.executable, "-S", "-c", "for n in range(1000): print(n)"]
+        subprocess.run(words, stdout=streams.stdout, stderr=streams.stderr, check=True)
+    screen.output.close()
+    assert screen.out == [str(n) for n in range(1000)]
+    assert not screen.log.exists()
+
+
+def test_a_line_without_end_does_not_fill_the_memory(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child_output, "_LONGEST_LINE", 1000)
+    screen.run("a", "import os; os.write(1, b'x' * 30_000)")
+    screen.output.close()
+    assert "".join(screen.out[:31]) == "x" * 30_000
+    assert max(map(len, screen.out[:31])) < 2000
+
+
+def test_a_closed_terminal_or_a_full_disk_stops_nothing(tmp_path: Path) -> None:
+    def fail(_line: str) -> None:
+        raise BrokenPipeError
+
+    output = ChildOutput(tmp_path / "no such folder" / "output.log", fail, fail)
+    with output.pipes("a") as streams:
+        words = [sys.executable, "-S", "-c", "print('x\\n' * 100_000)"]
+        assert subprocess.run(words, stdout=streams.stdout, stderr=streams.stderr).returncode == 0
+    output.close()
+
+
+def test_the_log_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child_output, "_LOG_BYTES", 100)
+    log = OutputLog(tmp_path / "output.log")
+    for number in range(100):
+        log.write([f"line {number:02}\n".encode()])
+    log.close()
+    older, newer = (tmp_path / "output.log.1").read_text(), (tmp_path / "output.log").read_text()
+    assert (older + newer).endswith("line 98\nline 99\n")
+    assert 100 < len(older) < 110
+    assert len(newer) <= 100
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_the_rate_limit_recovers_slowly() -> None:
+    limit = RateLimit(0.0)
+    assert limit.take(100, 0.0) == child_output._SHOWN_AT_ONCE
+    assert limit.take(100, 1.0) == 0
+    assert limit.take(100, 11.0) == 2
+    assert limit.take(100, 1e6) == child_output._SHOWN_AT_ONCE

@@ -1,0 +1,133 @@
+"""The end of a run and of a learner, as actors of every speed see it: learner and actors over the memory transport."""
+
+import threading
+from pathlib import Path
+
+import pytest
+from log_lines import LINES
+from processes import until
+from session_fleet import GatedActor, LearnerProcess
+
+from daedalus.actor.evaluation.evaluator import Evaluator
+from daedalus.actor.session.service import ActorConfig
+from daedalus.learner.serving import actor_server
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+ACTORS = 15
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    return MemoryNetwork()
+
+
+def fleet_inside_rollouts(network: MemoryNetwork) -> list[GatedActor]:
+    """Return actors that have all begun a rollout, and whose gates are closed."""
+    actors = [GatedActor(network, f"actor-{index}") for index in range(ACTORS)]
+    for actor in actors:
+        actor.await_rollout()
+    return actors
+
+
+def count(start: str) -> int:
+    return sum(line.startswith(start) for line in LINES)
+
+
+def test_end_of_the_run_reaches_actors_whose_rollouts_outlive_the_learner(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    actors = fleet_inside_rollouts(network)
+    actors[0].open_gate()  # its rollout ends the run
+    assert learner.join().finished
+    for actor in actors:
+        actor.open_gate()
+    assert [actor.join() for actor in actors] == [True] * ACTORS
+    assert count("the run is over") == ACTORS
+    assert count("joined") == ACTORS
+
+
+def test_learner_answers_that_the_run_is_over_until_all_actors_have_left(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 1e6)
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    actors = fleet_inside_rollouts(network)
+    actors[0].open_gate()
+    assert actors[0].join()
+    late = GatedActor(network, "late")
+    assert late.join()  # it is answered that the run is over
+    assert not learner.ended
+    for actor in actors[1:]:
+        actor.open_gate()
+        assert actor.join()
+    assert learner.join().finished
+
+
+def test_stop_ends_the_wait_for_actors(network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 1e6)
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    actors = fleet_inside_rollouts(network)
+    actors[0].open_gate()
+    assert actors[0].join()
+    learner.stop.set()
+    assert learner.join().finished
+    for actor in actors:
+        actor.stop.set()
+        actor.open_gate()
+        actor.join()
+
+
+def test_actors_wait_for_a_learner_that_was_stopped_and_join_it_again(network: MemoryNetwork, tmp_path: Path) -> None:
+    stopped = LearnerProcess(network, tmp_path / "run")
+    actors = fleet_inside_rollouts(network)
+    for actor in actors[::2]:
+        actor.open_gate()
+    until(lambda: count("joined") == ACTORS)
+    stopped.stop.set()
+    outcome = stopped.join()
+    assert (outcome.finished, outcome.saved) == (False, True)
+    assert count("stopped; checkpoint saved at ") == 1
+    for actor in actors:
+        actor.open_gate()
+    until(lambda: count("the learner was stopped; waiting for it to return") == ACTORS)
+    assert not any(actor.ended for actor in actors)
+    resumed = LearnerProcess(network, tmp_path / "run", resume=True)
+    until(lambda: count("joined") == 2 * ACTORS)
+    resumed.stop.set()
+    resumed.join()
+    for actor in actors:
+        actor.stop.set()
+        assert actor.join() is False
+
+
+def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
+    stopped = LearnerProcess(network, tmp_path / "run")
+    slow, fast = GatedActor(network, "slow"), GatedActor(network, "fast")
+    slow.await_rollout()
+    fast.open_gate()
+    until(lambda: count("joined") == 2)
+    stopped.stop.set()
+    stopped.join()
+    assert LearnerProcess(network, tmp_path / "run", env_steps=1, resume=True).join().finished
+    assert fast.join()
+    slow.open_gate()
+    assert slow.join()
+
+
+def test_evaluator_leaves_between_two_evaluations(network: MemoryNetwork, tmp_path: Path) -> None:
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    transport, actor = MemoryTransport(network), GatedActor(network, "actor")
+    evaluator = Evaluator(ActorConfig(name="evaluator", incarnation=1), transport, threading.Event())
+    actor.await_rollout()
+    working = threading.Thread(target=evaluator.run, daemon=True)
+    working.start()
+    until(lambda: count("run 'run': 10 greedy episodes of CartPole-v1 every 60 s") == 1)
+    actor.open_gate()
+    assert learner.join().finished
+    working.join(30.0)
+    assert not working.is_alive()
