@@ -408,7 +408,7 @@ def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
 def test_rollout_is_fenced_if_its_incarnation_was_replaced_while_it_was_decoded(harness: Harness) -> None:
     content = harness.intake.read("a", encode(good()))
     assert isinstance(content, Rollout)
-    harness.fleet.set_present("a", 1, False)
+    harness.fleet.set_present("a", 1, False, 0.0)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = harness.intake.judge("a", content, VERSION, 0.0)
     assert isinstance(verdict, Rejected)
