@@ -29,9 +29,12 @@ class RequestQueue:
         self._requests.put(request)
         return True
 
-    def take(self) -> Request | None:
-        """Wait for the oldest request and return it, or None if the queue is closed and empty."""
-        request = self._requests.get()
+    def take(self, timeout: float | None = None) -> Request | None:
+        """Wait for the oldest request and return it, or None if the queue is closed and empty.
+
+        Raises queue.Empty if no request comes within `timeout` seconds.
+        """
+        request = self._requests.get(timeout=timeout)
         if request is not None:
             with self._lock:
                 self._bytes -= request.size

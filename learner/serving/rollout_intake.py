@@ -4,11 +4,16 @@
     intake thread         decodes, judges and answers rollouts, and fills the buffer
     learner's thread      `take_batch`: takes complete batches out of the buffer
 
+While the learner computes a batch, answers to accepted rollouts wait until it asks for the next one. So an actor plays
+its next rollout with the snapshot of that batch: without the wait, actors would play far ahead of a learner that is
+slower than they are, and rollouts would have a larger policy lag.
+
 One condition, shared with the actor server, guards the fleet, the buffer, the counters and the version that the policy
 lag of rollouts is relative to.
 """
 
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable, Set
@@ -29,6 +34,7 @@ from daedalus.transport.interface import Request
 
 HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
 _CLOSE_SECONDS = 4.0  # for the intake thread to answer the queued rollouts
+_MOST_HELD_SECONDS = 10.0  # an answer waits no longer: its sender would take the rollout for lost
 
 _logger = logging.getLogger(__name__)
 
@@ -65,6 +71,8 @@ class RolloutIntake:
         self._requests = _queue(spec)
         self._named: set[str] = set()  # actors that were logged as left out
         self._ending: Acknowledgement | None = None  # of all rollouts after the end
+        self._computes_since: float | None = None  # the learner's thread a batch
+        self._held: list[Request] = []  # accepted rollouts that are answered with the next batch
         self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
 
     def open(self) -> None:
@@ -137,11 +145,15 @@ class RolloutIntake:
           version: newest policy version, before this batch.
         """
         with self._lock:
+            self._computes_since = None
+            self._answer_held()
             taken = self._take(version)
             if not taken.rollouts and not taken.stale:
                 self._lock.wait(HEARTBEAT_SECONDS)
                 taken = self._take(version)
             self._count(taken, version)
+            if taken.rollouts:
+                self._computes_since = time.monotonic()
             self._lock.notify_all()
         return taken.rollouts
 
@@ -199,12 +211,39 @@ class RolloutIntake:
     # --------------------------------------------------------------------------------------- the intake thread
 
     def _judge_requests(self) -> None:
-        while (request := self._requests.take()) is not None:
+        while True:
+            try:
+                request = self._requests.take(HEARTBEAT_SECONDS)
+            except queue.Empty:
+                self._end_long_hold()
+                continue
+            if request is None:
+                break
             sender, payload = keys.last_chunk(request.key), request.payload
             content = self._intake.read(sender, payload)
             with self._lock:
                 answer = self._judge(sender, content, len(payload))
-            request.reply(encode(self._ending or answer))
+                is_held = answer.verdict == "accepted" and self._computes_since is not None and self._ending is None
+                if is_held:
+                    self._held.append(request)
+            if not is_held:
+                request.reply(encode(self._ending or answer))
+        with self._lock:
+            self._answer_held()
+
+    def _end_long_hold(self) -> None:
+        with self._lock:
+            if self._computes_since is not None and time.monotonic() > self._computes_since + _MOST_HELD_SECONDS:
+                self._computes_since = None
+                self._answer_held()
+
+    def _answer_held(self) -> None:
+        """Answer the accepted rollouts whose answers wait. The caller holds the lock."""
+        held, self._held = self._held, []
+        for request in held:
+            request.reply(
+                encode(self._ending or Acknowledgement(verdict="accepted", policy_version=self._published_version()))
+            )
 
     def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
