@@ -59,24 +59,34 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
         return
     rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
     order = rows[torch.randperm(len(rows)).to(rows.device)]
-
-    def select(values: Tensor, part: Tensor) -> Tensor:
-        return values[: len(batch.rewards)].flatten(0, 1)[part].unsqueeze(0)
-
+    # One gather for each array and pass, and minibatches that are views of the result: gathering each minibatch would
+    # take as many operations as there are minibatches, and small ones cost as much as large ones. Observations can be
+    # images, of which a second copy of the whole batch would be too much.
+    small = [each(batch.actions, partial(_rows, rows=order)), each(batch.masks, partial(_rows, rows=order))]
+    shuffled = [_rows(values, order) for values in (batch.starts, log_probs, *targets, batch.valid)]
+    start = 0
     for part in order.tensor_split(min(count, len(order))) if len(order) else ():
+        columns = slice(start, start := start + len(part))
+        actions, masks = (each(components, partial(_columns, part=columns)) for components in small)
+        starts, own_log_probs, values, advantages, weights, valid = (array[:, columns] for array in shuffled)
         yield Minibatch(
-            observations=each(batch.observations, partial(select, part=part)),
+            observations=each(batch.observations, partial(_rows, rows=part)),
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
-            starts=select(batch.starts, part),
-            actions=each(batch.actions, partial(select, part=part)),
-            masks=each(batch.masks, partial(select, part=part)),
-            log_probs=select(log_probs, part),
-            targets=select(targets.values, part),
-            advantages=select(targets.advantages, part),
-            weights=select(targets.weights, part),
-            valid=select(batch.valid, part),
+            starts=starts,
+            actions=actions,
+            masks=masks,
+            log_probs=own_log_probs,
+            targets=values,
+            advantages=advantages,
+            weights=weights,
+            valid=valid,
         )
 
 
-def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:
+def _columns(values: Tensor, part: Tensor | slice, rows: int | None = None) -> Tensor:
     return values[:rows, part]
+
+
+def _rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Return rows of [T, B, ...] by their numbers in T x B, as [1, N, ...]."""
+    return values.flatten(0, 1)[rows].unsqueeze(0)

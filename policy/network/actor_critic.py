@@ -33,17 +33,14 @@ class ActorCritic(nn.Module):
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1))
+        # Whether the network has convolutions, which then take most of its time.
+        self.convolutional = any(isinstance(module, nn.Conv2d) for module in self.modules())
         self.value_encoder = build_encoder(spec, spaces.observations, modules) if spec.separate_value_encoder else None
 
     @property
     def state_size(self) -> int:
         """S, the size of the memory's state; 0 without a memory."""
         return self.memory.state_size
-
-    @property
-    def convolutional(self) -> bool:
-        """Whether the network has convolutions, which then take most of its time."""
-        return any(isinstance(module, nn.Conv2d) for module in self.modules())
 
     def learned_parameters(self) -> list[nn.Parameter]:
         """Return the parameters that have gradients: all but the statistics of the normaliser."""
