@@ -51,9 +51,9 @@ class TensorBoardWriter:
         ]
         for name, counts in details.action_counts.items():
             if sum(counts):
-                tag = "rollout/action" if name == "action" else f"rollout/action/{name}"
+                under = "rollout/action" if name == "action" else f"rollout/action/{name}"
                 histogram = self._histogram(np.array(counts), np.arange(len(counts) + 1) - 0.5, ())
-                values.append(self._summary.Value(tag=tag, histo=histogram))
+                values.append(self._summary.Value(tag=under, histo=histogram))
         if details.picture is not None:
             values.append(self._summary.Value(tag="rollout/observation", image=self._image(details.picture)))
         self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.user_modules import UserModules
+from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 
 ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
