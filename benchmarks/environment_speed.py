@@ -7,6 +7,7 @@ import argparse
 import time
 
 import numpy as np
+from random_actions import random_actions
 from running import machine, table
 
 from daedalus.actor.environments.make import make_environments
@@ -31,7 +32,7 @@ def rate(preset: str, backend: str, seconds: float) -> float:
         random = np.random.default_rng(1)
         steps, began, ends = 0, time.process_time(), time.monotonic() + seconds
         while time.monotonic() < ends:
-            environments.step(random.integers(0, environments.spaces.actions["action"].count, _ENVIRONMENTS))
+            environments.step(random_actions(environments.spaces, _ENVIRONMENTS, random))
             steps += _ENVIRONMENTS
         return steps / (time.process_time() - began)
     finally:

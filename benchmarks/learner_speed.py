@@ -61,7 +61,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
 
     def update() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            logits, values = network(observations, state, starts)
+            logits, values = network({"observation": observations}, state, starts)
         loss = values.square().mean() - logits.log_softmax(-1).gather(-1, actions).mean()
         flat.gradients.zero_()
         loss.backward()

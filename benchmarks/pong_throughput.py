@@ -23,15 +23,17 @@ from pathlib import Path
 import numpy as np
 import torch
 from learner_speed import NETWORKS, fastest, updater
+from random_actions import random_actions
 from running import COMMAND, machine, table
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
+from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.spaces import Spaces
 
 ENVIRONMENTS, ROWS = 16, 16  # of an actor; one rollout is the batch of one update
 SETTINGS = {
@@ -77,23 +79,21 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
     environments = make_environments(spec, ENVIRONMENTS)
     try:
         environments.reset(1)
-        actions = np.random.default_rng(1).integers(
-            0, environments.spaces.actions["action"].count, (1000, ENVIRONMENTS)
-        )
+        spaces, random = environments.spaces, np.random.default_rng(1)
+        actions = [random_actions(spaces, ENVIRONMENTS, random) for _ in range(1000)]
         stepping = _per_call(lambda index: environments.step(actions[index % 1000]), seconds)
-        count = environments.spaces.actions["action"].count
     finally:
         environments.close()
     policy, space, _, _ = NETWORKS["nature"]
-    network = ActorCritic(
-        policy, Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(count,))})
-    )
-    runtime = OnnxRuntime(export_program(network, space))
+    spaces = Spaces(observations={"observation": space}, actions=spaces.actions)
+    network = ActorCritic(policy, spaces)
+    runtime = OnnxRuntime(export_program(network, spaces))
     runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
     random = np.random.default_rng(1)
-    seen = random.integers(0, 256, (ENVIRONMENTS, *space.stacked_shape), dtype=np.uint8)
+    seen = {"observation": random.integers(0, 256, (ENVIRONMENTS, *space.stacked_shape), dtype=np.uint8)}
     state = np.zeros((ENVIRONMENTS, network.state_size), np.float32)
-    acting = _per_call(lambda _: runtime.act(seen, state, random), seconds)
+    size = runtime.noise_size
+    acting = _per_call(lambda _: runtime.act(seen, state, draw_noise(size, ENVIRONMENTS, random), {}), seconds)
     torch.set_num_threads(1)
     learning = fastest(updater(policy, space, ROWS, ENVIRONMENTS, bfloat16=True), seconds) / ROWS
     parts = {"environment": stepping, "forward": acting, "update": learning}

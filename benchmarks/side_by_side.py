@@ -22,10 +22,10 @@ _ENLARGED = 3
 
 def drive(environments: VectorEnvironment, seed: int, actions: list[int]) -> tuple[np.ndarray, list[tuple]]:
     """Return frames [T, H, W], and reward, terminated and truncated of each step."""
-    frames, rest = [environments.reset(seed)[0].copy()], []
+    frames, rest = [environments.reset(seed).frames["observation"][0].copy()], []
     for action in actions:
-        shown, rewards, terminated, truncated = environments.step(np.array([action]))
-        frames.append(shown[0].copy())
+        shown, rewards, terminated, truncated = environments.step({"action": np.array([[action]])})
+        frames.append(shown.frames["observation"][0].copy())
         rest.append((float(rewards[0]), bool(terminated[0]), bool(truncated[0])))
     return np.stack(frames), rest
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from daedalus.actor.environments.interface import VectorEnvironment
-from daedalus.policy.acting.noise import draw_noise, neutral_noise
-from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
+from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 NAME, ACTION = "observation", "action"
@@ -67,6 +67,29 @@ def act(
     noise = neutral_noise(size, rows) if random is None else draw_noise(size, rows, random)
     choice = runtime.act({NAME: observations}, state, noise, {})
     return choice.actions[ACTION][:, 0], choice.log_probs, choice.state
+
+
+class PlainPolicy:
+    """A policy of one array and one discrete action, which a test scripts by overriding `choose`."""
+
+    state_size = 0
+    noise_size = NoiseSize(uniform=2, normal=1)
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """Ignore the weights."""
+
+    def act(
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
+        """See PolicyRuntime."""
+        actions, log_probs, next_state = self.choose(plain(observations), state, noise)
+        return Choice({ACTION: actions[:, None]}, log_probs, next_state)
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return actions [E], log-probabilities [E] and the next state [E, S] for observations [E, *stacked_shape]."""
+        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
 
 
 def plain(content: Any) -> Any:

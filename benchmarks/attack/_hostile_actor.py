@@ -12,7 +12,10 @@ from daedalus.protocol.messages import Acknowledgement, Join, Message, Rollout, 
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
-_SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+_SPACES = Spaces(
+    observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+    actions={"action": DiscreteSpace(counts=(2,))},
+)
 _TIMEOUT = 30.0
 
 
@@ -39,13 +42,14 @@ class HostileActor:
         """Declare presence: from now on the learner regards this actor as live."""
         self._transport.declare_presence(keys.presence("run", self._name, self._incarnation))
 
-    def send(self, **replaced: np.ndarray) -> Acknowledgement:
+    def send(self, **replaced: Any) -> Acknowledgement:
         """Send a rollout in which no episode ends, with some arrays replaced, until the learner decides on it."""
         rows, cells = self.rows, (self.rows, 1)
         content: dict[str, Any] = {
-            "frames": np.zeros((rows + 1, 1, 4), np.float32),
+            "frames": {"observation": np.zeros((rows + 1, 1, 4), np.float32)},
             "initial_state": np.zeros((1, 0), np.float32),
-            "actions": np.zeros(cells, np.uint8),
+            "actions": {"action": np.zeros((*cells, 1), np.uint8)},
+            "masks": {},
             "behaviour_log_probs": np.full(cells, -0.7, np.float32),
             "rewards": np.full(cells, 0.05, np.float32),
             "terminated": np.zeros(cells, np.bool_),

@@ -8,6 +8,7 @@ gradient can unmask cost a few updates; then their sender is quarantined.
 
 import sys
 from contextlib import closing
+from typing import Any
 
 import numpy as np
 
@@ -40,11 +41,11 @@ def false_rollouts() -> Verdict:
     )
 
 
-def _kinds(hostile: HostileActor) -> dict[str, dict[str, np.ndarray]]:
+def _kinds(hostile: HostileActor) -> dict[str, dict[str, Any]]:
     """Return what each kind of rollout replaces."""
     cells = (hostile.rows, 1)
     no, yes = np.zeros(cells, np.bool_), np.ones(cells, np.bool_)
-    every: dict[str, np.ndarray] = {"episode_returns": np.full(hostile.rows, 500, np.float32)}
+    every: dict[str, Any] = {"episode_returns": np.full(hostile.rows, 500, np.float32)}
     every["episode_lengths"] = np.full(hostile.rows, 500, np.int32)
     return {
         "returns of episodes that did not end": every,
@@ -52,7 +53,7 @@ def _kinds(hostile: HostileActor) -> dict[str, dict[str, np.ndarray]]:
         "ends everywhere": {"terminated": yes, "truncated": yes, **every},
         "ends in reset rows": {"terminated": yes, "valid": no, **every},
         "rewards of 3e38": {"rewards": np.full(cells, 3e38, np.float32)},
-        "observations of 3e38": {"frames": np.full((hostile.rows + 1, 1, 4), 3e38, np.float32)},
+        "observations of 3e38": {"frames": {"observation": np.full((hostile.rows + 1, 1, 4), 3e38, np.float32)}},
         "log-probabilities of -3e38": {"behaviour_log_probs": np.full(cells, -3e38, np.float32)},
     }
 
@@ -64,8 +65,9 @@ def _is_accepted(hostile: HostileActor, name: str) -> bool:
 
 def _sent_until_quarantine(hostile: HostileActor) -> int:
     """Send rollouts within all bounds that have no finite gradient; return how many until the quarantine."""
-    frames = np.full((hostile.rows + 1, 1, 4), 1e15, np.float32)
-    actions = (np.arange(hostile.rows, dtype=np.uint8) % 2)[:, None]  # one of them has a probability above 0
+    frames = {"observation": np.full((hostile.rows + 1, 1, 4), 1e15, np.float32)}
+    # One of the two actions has a probability above 0.
+    actions = {"action": (np.arange(hostile.rows, dtype=np.uint8) % 2)[:, None, None]}
     for sent in range(_MOST_SENT):
         if hostile.send(frames=frames, actions=actions).verdict == "quarantined":
             return sent

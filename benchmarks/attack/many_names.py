@@ -18,7 +18,10 @@ from daedalus.protocol.messages import Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
-_CARTPOLE = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+_CARTPOLE = Spaces(
+    observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+    actions={"action": DiscreteSpace(counts=(2,))},
+)
 SLOW = True
 _OWNERS, _OF_ONE_OWNER = 905, 400
 _MOST_STATUS_SECONDS = 10.0  # with the start of the process, on a busy machine

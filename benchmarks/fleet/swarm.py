@@ -43,9 +43,10 @@ def recorded(rows: int) -> Rollout:
     return Rollout(
         identity=RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0),
         policy_version=0,
-        frames=random.normal(0, 0.05, (rows + 1, ENVIRONMENTS, 4)).astype(np.float32),
+        frames={"observation": random.normal(0, 0.05, (rows + 1, ENVIRONMENTS, 4)).astype(np.float32)},
         initial_state=np.zeros((ENVIRONMENTS, 0), np.float32),
-        actions=random.integers(0, 2, shape).astype(np.uint8),
+        actions={"action": random.integers(0, 2, (*shape, 1)).astype(np.uint8)},
+        masks={},
         behaviour_log_probs=np.full(shape, -0.7, np.float32),
         rewards=np.ones(shape, np.float32),
         terminated=np.zeros(shape, np.bool_),

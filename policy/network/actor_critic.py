@@ -67,7 +67,7 @@ class ActorCritic(nn.Module):
             return self.policy_head(remembered.float()), self.value_head(critic.float()).squeeze(-1)
 
     def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the policies of one row: state [N, S] -> parameters of the distributions [N, P], next state [N, S]."""
+        """Compute the policies of one row: state [N, S] -> distribution parameters [N, P], next state [N, S]."""
         remembered, state = self.memory.step(self.encoder(self.normalizer(observations)), state)
         return self.policy_head(remembered), state
 

@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from plain import PlainEnvironments
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
@@ -37,7 +38,7 @@ def _original(seed: int, actions: list[int], limit: int) -> list[tuple]:
 
 
 def _ours(backend: str, seed: int, actions: list[int], limit: int) -> list[tuple]:
-    environments = make_environments(_spec(backend=backend, max_episode_steps=limit), 1)
+    environments = PlainEnvironments(make_environments(_spec(backend=backend, max_episode_steps=limit), 1))
     try:
         rows = [(environments.reset(seed)[0], 0.0, False, False)]
         for action in actions:
@@ -80,7 +81,7 @@ def accelerating() -> dict[str, np.ndarray]:
     """Road pixels at each physics step of 0.02 s at full gas, [81, 84, 96, 3], of both renderers."""
     frames = {}
     for backend in ("fast", "gymnasium"):
-        environments = make_environments(_spec(backend=backend, action_repeat=1), 1)
+        environments = PlainEnvironments(make_environments(_spec(backend=backend, action_repeat=1), 1))
         shown = [environments.reset(11)[0].copy()]
         shown += [environments.step(np.array([1]))[0][0].copy() for _ in range(80)]
         environments.close()
@@ -125,8 +126,8 @@ def brightened(environment: gymnasium.Env) -> gymnasium.Env:
 
 def test_user_wrapper_receives_the_frames() -> None:
     plain, wrapped = (
-        make_environments(_spec(), 1),
-        make_environments(_spec(wrap=f"{__name__}:brightened"), 1, modules=TEST_MODULES),
+        PlainEnvironments(make_environments(_spec(), 1)),
+        PlainEnvironments(make_environments(_spec(wrap=f"{__name__}:brightened"), 1, modules=TEST_MODULES)),
     )
     try:
         np.testing.assert_array_equal(wrapped.reset(3), np.minimum(plain.reset(3), 235) + 20)

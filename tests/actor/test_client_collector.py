@@ -80,7 +80,7 @@ def drive(client: ClientCollector, robot: Robot, steps: int) -> None:
 
 def begun(played: Played) -> tuple[ClientCollector, Robot]:
     environment = gymnasium.make(played.spec.environment.id).unwrapped
-    client = ClientCollector(environment.observation_space, environment.action_space)
+    client = ClientCollector(environment.observation_space, environment.action_space, None)
     assert client.prepare(played.spec) == (played.spaces, 1)
     client.begin(played.runtime(), played.spec, 3)
     client.load(played.snapshot(0))
@@ -162,7 +162,7 @@ def test_synchronous_run_is_refused() -> None:
     spec = run_spec().model_copy(update={"training": run_spec().training.model_copy(update={"algorithm": "a2c"})})
     environment = gymnasium.make(spec.environment.id)
     with pytest.raises(ActorError, match="a client cannot wait: use another algorithm"):
-        ClientCollector(environment.observation_space, environment.action_space).prepare(spec)
+        ClientCollector(environment.observation_space, environment.action_space, None).prepare(spec)
 
 
 def test_terminated_episode_needs_its_last_observation_where_terminations_are_bootstrapped() -> None:
@@ -181,6 +181,6 @@ def test_run_whose_settings_only_an_environment_of_ours_applies_is_refused(setti
     spec = run_spec()
     environment = gymnasium.make(spec.environment.id)
     changed = spec.model_copy(update={"environment": spec.environment.model_copy(update={setting: value})})
-    client = ClientCollector(environment.observation_space, environment.action_space)
+    client = ClientCollector(environment.observation_space, environment.action_space, None)
     with pytest.raises(ActorError, match=rf"environment\.{setting}={value}"):
         client.prepare(changed)

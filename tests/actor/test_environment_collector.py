@@ -8,16 +8,17 @@ import gymnasium
 import numpy as np
 import pytest
 from collectors import collect, started_collector
-from daedalus.policy.acting.sampling import RandomSource
+from plain import PlainPolicy, plain, vector_spaces
 
+from daedalus.actor.environments.interface import Observed, Step
+from daedalus.policy.acting.noise import Noise
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 
 
-class Scripted:
+class Scripted(PlainPolicy):
     """A policy that chooses 0, 1, 2, ... in turn, the same in every environment.
 
     Its memory is two numbers: the rows that it remembers, and the sum of the steps that it observed in them.
@@ -31,11 +32,8 @@ class Scripted:
         self.calls = 0
         self.seen: list[np.ndarray] = []
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        pass
-
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.seen.append(observations.copy())
         self.remembered.append(state.copy())
@@ -71,10 +69,10 @@ def rows(rollouts: list[Rollout], name: str) -> np.ndarray:
 
 def test_each_row_holds_its_observation_action_and_reward(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, policy = collected
-    observations = np.concatenate([rollout.frames[:-1, 0] for rollout in rollouts])
+    observations = np.concatenate([plain(rollout.frames)[:-1, 0] for rollout in rollouts])
     np.testing.assert_array_equal(observations, np.stack([EPISODE, STEP], axis=1))
     np.testing.assert_array_equal(observations, np.concatenate(policy.seen))
-    np.testing.assert_array_equal(rows(rollouts, "actions"), ACTION)
+    np.testing.assert_array_equal(np.concatenate([plain(rollout.actions)[:, 0, 0] for rollout in rollouts]), ACTION)
     np.testing.assert_allclose(rows(rollouts, "rewards"), REWARD, rtol=1e-6)
     np.testing.assert_allclose(rows(rollouts, "behaviour_log_probs"), -0.5 * np.arange(1, 13))
 
@@ -89,14 +87,14 @@ def test_rows_distinguish_termination_truncation_and_resets(collected: tuple[lis
 def test_reset_row_holds_the_true_last_observation_of_the_episode(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     # Row 2 ends episode 0; row 3 still shows its observation 3, which the value of row 2's successor needs.
-    np.testing.assert_array_equal(rollouts[0].frames[3, 0], [0, 3])
-    np.testing.assert_array_equal(rollouts[1].frames[2, 0], [1, 2])
+    np.testing.assert_array_equal(plain(rollouts[0].frames)[3, 0], [0, 3])
+    np.testing.assert_array_equal(plain(rollouts[1].frames)[2, 0], [1, 2])
 
 
 def test_last_observation_of_a_rollout_is_the_first_of_the_next(collected: tuple[list[Rollout], Scripted]) -> None:
     rollouts, _ = collected
     for before, after in itertools.pairwise(rollouts):
-        np.testing.assert_array_equal(before.frames[-1], after.frames[0])
+        np.testing.assert_array_equal(plain(before.frames)[-1], plain(after.frames)[0])
 
 
 def test_episode_returns_are_in_the_rollout_where_the_episode_ends(
@@ -144,8 +142,8 @@ def test_bootstrap_terminations_turns_terminations_into_truncations() -> None:
     assert not rows(bootstrapped, "terminated").any()
     np.testing.assert_array_equal(rows(bootstrapped, "truncated"), terminated | truncated)
     for name in ("valid", "rewards", "episode_returns", "episode_lengths"):
-        for ours, plain in zip(bootstrapped, episodic, strict=True):
-            np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
+        for ours, theirs in zip(bootstrapped, episodic, strict=True):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
 class _Losing(gymnasium.Env[np.ndarray, np.int64]):
@@ -209,8 +207,8 @@ def test_rollout_of_a_policy_without_memory_has_an_empty_state() -> None:
 class Memoryless(Scripted):
     state_size = 0
 
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert state.shape == (len(observations), 0)
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
@@ -223,11 +221,11 @@ def test_each_frame_is_in_a_rollout_once_after_the_stack_of_the_first_row() -> N
     collector = started_collector(STACKED, Memoryless(), rollout_length=4)
     rollouts = [copy.deepcopy(collect(collector)) for _ in range(3)]
     shown = [frame.tolist() for frame in np.stack([EPISODE, STEP], axis=1)]
-    assert rollouts[0].frames[:, 0].tolist() == [shown[0]] * 2 + shown[:5]
+    assert plain(rollouts[0].frames)[:, 0].tolist() == [shown[0]] * 2 + shown[:5]
     # Row 4 is the first of episode 1: its stack has no frame of episode 0.
-    assert rollouts[1].frames[:, 0].tolist() == [shown[4]] * 2 + shown[4:9]
+    assert plain(rollouts[1].frames)[:, 0].tolist() == [shown[4]] * 2 + shown[4:9]
     # Row 8 is the reset row of episode 2, which was two frames long.
-    assert rollouts[2].frames[:, 0].tolist() == [shown[7], shown[7], *shown[8:], [3, 3]]
+    assert plain(rollouts[2].frames)[:, 0].tolist() == [shown[7], shown[7], *shown[8:], [3, 3]]
 
 
 def test_cartpole_vector_entry_point_resets_after_truncations_too() -> None:
@@ -238,27 +236,27 @@ def test_cartpole_vector_entry_point_resets_after_truncations_too() -> None:
     assert not rollout.terminated.any()
     assert not rollout.valid[[5, 11]].any()
     assert rollout.valid.sum() == 3 * 10
-    assert (np.abs(rollout.frames[6]) <= 0.05).all()  # the start of an episode
-    assert (np.abs(rollout.frames[5]) > 0.05).any()  # the true last observation
+    assert (np.abs(plain(rollout.frames)[6]) <= 0.05).all()  # the start of an episode
+    assert (np.abs(plain(rollout.frames)[5]) > 0.05).any()  # the true last observation
     np.testing.assert_array_equal(rollout.episode_lengths, [5] * 6)
 
 
-class Seeds:
-    """Environments that keep the seed of their reset, and a policy that keeps its random numbers."""
+class Seeds(PlainPolicy):
+    """Environments that keep the seed of their reset, and a policy that keeps its noise."""
 
-    count, state_size = 1, 0
-    spaces = Spaces(observation=ArraySpace(shape=(2,), dtype="float32"), action=DiscreteSpace(count=4))
+    count = 1
+    spaces = vector_spaces(2, 4)
 
     def __init__(self) -> None:
         self.seed = -1
-        self.random: RandomSource | None = None
+        self.noise: Noise | None = None
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, seed: int) -> Observed:
         self.seed = seed
-        return np.zeros((1, 2), np.float32)
+        return self._observed()
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        return np.zeros((1, 2), np.float32), np.zeros(1), np.zeros(1, np.bool_), np.zeros(1, np.bool_)
+    def step(self, actions: dict[str, np.ndarray]) -> Step:
+        return self._observed(), np.zeros(1), np.zeros(1, np.bool_), np.zeros(1, np.bool_)
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         return {}
@@ -266,14 +264,15 @@ class Seeds:
     def close(self) -> None:
         pass
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        pass
-
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        self.random = self.random or copy.deepcopy(random)
-        return np.zeros(1, np.int64), np.zeros(1, np.float32), state
+        self.noise = self.noise or noise
+        return super().choose(observations, state, noise)
+
+    @staticmethod
+    def _observed() -> Observed:
+        return Observed({"observation": np.zeros((1, 2), np.float32)}, {})
 
 
 def test_environments_and_actions_draw_from_different_random_numbers() -> None:
@@ -282,7 +281,7 @@ def test_environments_and_actions_draw_from_different_random_numbers() -> None:
     for seed in (1, 2):
         both = Seeds()
         collect(started_collector(COUNTING, both, rollout_length=1, seed=seed, environments=both))
-        assert both.random is not None
-        of_environment = np.random.default_rng(both.seed).random(4, np.float32).tolist()
-        drawn += [of_environment, both.random.random(4, np.float32).tolist()]
+        assert both.noise is not None
+        of_environment = np.random.default_rng(both.seed).random(2, np.float32).tolist()
+        drawn += [of_environment, both.noise.uniform[0].tolist()]
     assert len({tuple(numbers) for numbers in drawn}) == 4

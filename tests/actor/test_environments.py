@@ -7,10 +7,12 @@ import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -29,7 +31,9 @@ from daedalus.protocol.spec import EnvironmentSpec
 def test_environments_follow_the_next_step_rule(name: str, backend: Literal["gymnasium", "envpool", "ale"]) -> None:
     """After an episode's end a step has reward 0 and observes the first frame, with every backend."""
     _needs(backend)
-    environments = make_environments(EnvironmentSpec(id=name, backend=backend, max_episode_steps=4), 2)
+    environments = PlainEnvironments(
+        make_environments(EnvironmentSpec(id=name, backend=backend, max_episode_steps=4), 2)
+    )
     observations = environments.reset(5)
     assert observations.shape == (2, *environments.spaces.observations["observation"].shape)
     for step in range(1, 11):
@@ -45,7 +49,9 @@ def test_reset_step_ignores_its_action(backend: Literal["gymnasium", "envpool"])
     _needs(backend)
     starts = []
     for action in (0, 1):
-        environments = make_environments(EnvironmentSpec(id="CartPole-v1", backend=backend, max_episode_steps=3), 2)
+        environments = PlainEnvironments(
+            make_environments(EnvironmentSpec(id="CartPole-v1", backend=backend, max_episode_steps=3), 2)
+        )
         environments.reset(5)
         for _ in range(3):
             environments.step(np.zeros(2, np.int64))
@@ -74,11 +80,15 @@ def test_missing_module_is_named() -> None:
         )
 
 
-def test_continuous_actions_require_a_table() -> None:
-    with pytest.raises(
-        EnvironmentSetupError, match=r"action space Box.*must be Discrete.*environment.action_table, 1 number"
-    ):
-        make_environments(EnvironmentSpec(id="Pendulum-v1"), 1)
+def test_continuous_actions_are_scaled_from_their_bounds() -> None:
+    """Pendulum's torque lies between -2 and 2, and its reward decreases by 0.001 of the squared torque."""
+    rewards = []
+    for action in (0.0, 0.5, 1.0, 7.0):  # the last lies beyond the bounds
+        environments = make_environments(EnvironmentSpec(id="Pendulum-v1"), 1)
+        assert environments.spaces.actions == {"action": ContinuousSpace(low=(-2.0,), high=(2.0,))}
+        environments.reset(1)
+        rewards.append(float(environments.step({"action": np.array([[action]], np.float32)})[1][0]))
+    assert (rewards[0] - np.array(rewards)).tolist() == pytest.approx([0.0, 0.001, 0.004, 0.004])
 
 
 @pytest.mark.parametrize(
@@ -104,16 +114,24 @@ def test_table_rows_are_the_actions() -> None:
     """Pendulum's reward decreases by 0.001 of the squared torque."""
     rewards = []
     for table in (((0.0,), (0.0,)), ((0.0,), (2.0,))):
-        environments = make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1)
+        environments = PlainEnvironments(make_environments(EnvironmentSpec(id="Pendulum-v1", action_table=table), 1))
         environments.reset(1)
-        assert environments.spaces.actions["action"].count == 2
+        assert choices(environments.spaces) == 2
         rewards.append(float(environments.step(np.array([1]))[1][0]))
     assert rewards[0] - rewards[1] == pytest.approx(0.004)
 
 
+class _Telling(gymnasium.Env):
+    """An environment whose observation is a text."""
+
+    observation_space = gymnasium.spaces.Text(8)
+    action_space = gymnasium.spaces.Discrete(2)
+
+
 def test_unsupported_observation_space_is_named() -> None:
-    with pytest.raises(EnvironmentSetupError, match=r"observation space Discrete.*must be a Box"):
-        make_environments(EnvironmentSpec(id="Taxi-v4"), 1)
+    gymnasium.register("Telling-v0", lambda **_kwargs: _Telling())
+    with pytest.raises(EnvironmentSetupError, match=r"observation space Text.*is not supported: use Box, Discrete"):
+        make_environments(EnvironmentSpec(id="Telling-v0"), 1)
 
 
 @pytest.mark.parametrize("backend", ["envpool", "ale"])
@@ -145,7 +163,7 @@ class _StartsAtFive(gymnasium.Env):
 
 def test_action_indices_start_at_zero_for_a_discrete_space_that_does_not() -> None:
     gymnasium.register("StartsAtFive-v0", lambda **_kwargs: _StartsAtFive())
-    environments = make_environments(EnvironmentSpec(id="StartsAtFive-v0"), 2)
+    environments = PlainEnvironments(make_environments(EnvironmentSpec(id="StartsAtFive-v0"), 2))
     environments.reset(1)
-    assert environments.spaces.actions["action"].count == 2
+    assert choices(environments.spaces) == 2
     np.testing.assert_array_equal(environments.step(np.array([0, 1]))[1], [5.0, 6.0])

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments
@@ -58,10 +59,12 @@ def test_repeated_actions_equal_single_steps(
 ) -> None:
     """Frames, rewards and ends of every row, including reset rows and ends in the middle of a repeat."""
     count = 3
-    environments = make_environments(_spec(name, action_repeat=repeat, max_episode_steps=limit, action_table=table), 3)
+    environments = PlainEnvironments(
+        make_environments(_spec(name, action_repeat=repeat, max_episode_steps=limit, action_table=table), 3)
+    )
     oracle = _OneByOne(name, count, seed=5, repeat=repeat, limit=limit)
     np.testing.assert_array_equal(environments.reset(5), oracle.first)
-    actions = np.random.default_rng(1).integers(0, environments.spaces.actions["action"].count, (rows, count))
+    actions = np.random.default_rng(1).integers(0, choices(environments.spaces), (rows, count))
     ends = np.zeros(2, np.int64)
     for row in actions:
         chosen = np.asarray(table, np.float32)[row] if table else row
@@ -77,7 +80,7 @@ def test_repeated_actions_equal_single_steps(
 
 def test_episode_truncated_by_no_reward_limit_resets_at_the_next_step() -> None:
     """MountainCar rewards every step with -1 and starts at rest, between -0.6 and -0.4."""
-    environments = make_environments(_spec("MountainCar-v0", no_reward_limit=3, action_repeat=2), 2)
+    environments = PlainEnvironments(make_environments(_spec("MountainCar-v0", no_reward_limit=3, action_repeat=2), 2))
     environments.reset(1)
     for row in range(1, 13):
         frames, rewards, terminated, truncated = environments.step(np.array([2, 0]))
@@ -91,7 +94,9 @@ def test_episode_truncated_by_no_reward_limit_resets_at_the_next_step() -> None:
 
 def test_no_reward_limit_is_counted_per_environment() -> None:
     """The first environment drives over tiles, the second stands still."""
-    environments = make_environments(_spec("CarRacing-v3", no_reward_limit=4, action_repeat=4, action_table=GAS), 2)
+    environments = PlainEnvironments(
+        make_environments(_spec("CarRacing-v3", no_reward_limit=4, action_repeat=4, action_table=GAS), 2)
+    )
     environments.reset(1)
     cuts = np.stack([environments.step(np.array([0, 1]))[3] for _ in range(6)])
     environments.close()
@@ -130,7 +135,7 @@ def test_termination_takes_precedence_over_no_reward_limit(
 
 
 def test_car_racing_episode_has_a_thousand_frames() -> None:
-    environments = make_environments(_spec("CarRacing-v3", action_repeat=64, action_table=GAS), 1)
+    environments = PlainEnvironments(make_environments(_spec("CarRacing-v3", action_repeat=64, action_table=GAS), 1))
     environments.reset(1)
     cuts = [bool(environments.step(np.array([1]))[3][0]) for _ in range(17)]
     environments.close()
@@ -146,7 +151,9 @@ def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
     fields = {"action_table": table, "action_repeat": 2, "crop": (0, 12, 6, 6), "grey": True, "frame_stack": 4}
     shown = {}
     for backend in ("gymnasium", "envpool"):
-        environments = make_environments(EnvironmentSpec(id="CarRacing-v3", backend=backend, **fields), 2)
+        environments = PlainEnvironments(
+            make_environments(EnvironmentSpec(id="CarRacing-v3", backend=backend, **fields), 2)
+        )
         first = environments.reset(1)
         frames = environments.step(np.array([0, 11]))[0]
         shown[backend] = environments.spaces, first.shape, first.dtype, frames.shape, frames.dtype
@@ -156,7 +163,7 @@ def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
     assert (
         spaces.observations["observation"].shape,
         spaces.observations["observation"].frames,
-        spaces.actions["action"].count,
+        choices(spaces),
     ) == ((84, 84), 4, 12)
     assert (shape, dtype) == ((2, 84, 84), np.uint8)
 
@@ -172,7 +179,7 @@ def test_car_racing_has_the_same_spaces_as_with_gymnasium() -> None:
     ],
 )
 def test_atari_frames_are_single_and_have_the_specified_shape(fields: dict, shape: tuple[int, ...]) -> None:
-    environments = make_environments(_spec("Pong-v5", frame_stack=4, action_repeat=4, **fields), 2)
+    environments = PlainEnvironments(make_environments(_spec("Pong-v5", frame_stack=4, action_repeat=4, **fields), 2))
     assert environments.spaces.observations["observation"].shape == shape
     assert environments.reset(1).shape == (2, *shape)
     frames, rewards, _, _ = environments.step(np.zeros(2, np.int64))
@@ -181,7 +188,7 @@ def test_atari_frames_are_single_and_have_the_specified_shape(fields: dict, shap
 
 
 def test_atari_episode_limit_counts_frames() -> None:
-    environments = make_environments(_spec("Pong-v5", action_repeat=4, max_episode_steps=10), 1)
+    environments = PlainEnvironments(make_environments(_spec("Pong-v5", action_repeat=4, max_episode_steps=10), 1))
     environments.reset(1)
     assert [bool(environments.step(np.zeros(1, np.int64))[3][0]) for _ in range(5)] == [
         False,
@@ -194,7 +201,7 @@ def test_atari_episode_limit_counts_frames() -> None:
 
 
 def test_every_seed_is_accepted_and_determines_the_episodes() -> None:
-    environments = make_environments(_spec("CartPole-v1"), 2)
+    environments = PlainEnvironments(make_environments(_spec("CartPole-v1"), 2))
     first = environments.reset(2**32 - 1)
     np.testing.assert_array_equal(environments.reset(2**32 - 1), first)
     assert (environments.reset(1) != first).any()

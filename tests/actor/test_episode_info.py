@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from collectors import collect, started_collector
 from counting_environment import Counting
+from plain import PlainPolicy
 
 from daedalus.actor.environments.episode_info import EpisodeInfo
-from daedalus.policy.acting.sampling import RandomSource
 from daedalus.protocol.spec import EnvironmentSpec
 
 ENDED = np.array([True, False, True, True])
@@ -72,25 +72,13 @@ class Reporting(Counting):
         return observation, reward, terminated, truncated, info
 
 
-class Still:
-    state_size = 0
-
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        pass
-
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
-
-
 @pytest.mark.parametrize("repeat", [1, 2])
 def test_rollout_has_the_scalars_of_the_episodes_that_ended_in_it(repeat: int) -> None:
     """Episodes of 3, 2 and 1 steps, with a reset row between them."""
     gymnasium.register("Reporting-v0", Reporting)
     try:
         spec = EnvironmentSpec(id="Reporting-v0", action_repeat=repeat)
-        collector = started_collector(spec, Still(), count=2, rollout_length=4 if repeat == 1 else 3)
+        collector = started_collector(spec, PlainPolicy(), count=2, rollout_length=4 if repeat == 1 else 3)
         found = [{name: values.tolist() for name, values in collect(collector).episode_info.items()} for _ in range(2)]
         collector.close()
     finally:

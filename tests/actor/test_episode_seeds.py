@@ -8,11 +8,12 @@ import pytest
 import torch
 from allowed_modules import TEST_MODULES
 from counting_environment import Counting
-from daedalus.policy.acting.sampling import RandomSource
+from plain import PlainPolicy
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import Evaluation, play_episodes
+from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -29,7 +30,7 @@ def runtime(spaces: Spaces, **policy: Any) -> OnnxRuntime:
     network = ActorCritic(PolicySpec.model_validate(policy), spaces)
     with torch.no_grad():
         network.policy_head.weight.mul_(100.0)  # a new head is nearly uniform
-    loaded = OnnxRuntime(export_program(network, spaces.observation))
+    loaded = OnnxRuntime(export_program(network, spaces))
     loaded.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
     return loaded
 
@@ -146,20 +147,17 @@ def test_environment_stands_still_after_its_episode() -> None:
         del gymnasium.registry["Steps-v0"]
 
 
-class SmallestBatch:
+class SmallestBatch(PlainPolicy):
     """A policy that remembers its smallest batch."""
 
     state_size = 1
     rows = 1000
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        pass
-
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.rows = min(self.rows, len(observations), len(state))
-        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+        return super().choose(observations, state, noise)
 
 
 def test_single_environment_is_computed_as_a_batch_of_two() -> None:

@@ -6,27 +6,26 @@ from typing import Any
 import numpy as np
 from allowed_modules import TEST_MODULES
 from counting_environment import Counting
-from daedalus.policy.acting.sampling import RandomSource
+from plain import PlainPolicy
 
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
+from daedalus.policy.acting.noise import Noise
 from daedalus.protocol.spec import EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 
 
-class AlwaysZero:
-    state_size = 0
+class AlwaysZero(PlainPolicy):
+    """A policy that is asked for greedy actions."""
 
-    def load(self, weights: dict[str, np.ndarray]) -> None:
-        pass
-
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        assert random is None
-        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+        assert (noise.uniform == 0.5).all()
+        assert (noise.normal == 0.0).all()
+        return super().choose(observations, state, noise)
 
 
 class Remembering(AlwaysZero):
@@ -34,8 +33,8 @@ class Remembering(AlwaysZero):
 
     state_size = 2
 
-    def act(
-        self, observations: np.ndarray, state: np.ndarray, random: RandomSource | None
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         chosen = [one_action(stack, memory) for stack, memory in zip(observations, state, strict=True)]
         actions, memories = zip(*chosen, strict=True)

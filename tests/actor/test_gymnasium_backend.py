@@ -6,6 +6,7 @@ import sys
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,16 +14,21 @@ import pytest
 from allowed_modules import TEST_MODULES
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
+from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments import make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps, make_gymnasium
-from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spec import EnvironmentSpec
 
-make_environments = partial(make.make_environments, modules=TEST_MODULES)
+created = partial(make.make_environments, modules=TEST_MODULES)
+
+
+def make_environments(spec: EnvironmentSpec, count: int, **options: Any) -> PlainEnvironments:
+    return PlainEnvironments(created(spec, count, **options))
+
 
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5
 
@@ -35,7 +41,7 @@ def _picture(**fields) -> EnvironmentSpec:
     return EnvironmentSpec(id="picture_environment:Picture-v0", action_table=TABLE, **fields)
 
 
-def _rows(environments: VectorEnvironment, actions: list[int]) -> list[tuple]:
+def _rows(environments: PlainEnvironments, actions: list[int]) -> list[tuple]:
     """(frame, reward, terminated, truncated) of the first environment for each action in turn."""
     rows = []
     for action in actions:
@@ -268,7 +274,7 @@ def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
     environments = make_environments(spec, 2)
     assert environments.reset(1).shape == (2, 84, 84)
     assert environments.step(np.zeros(2, np.int64))[0].shape == (2, 84, 84)
-    assert environments.spaces.actions["action"].count == 6
+    assert choices(environments.spaces) == 6
     environments.close()
     plain = make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
     assert plain.spaces.observations["observation"].shape == (210, 160, 3)

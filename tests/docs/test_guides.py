@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from pages import DOCS, code_blocks
+from plain import PlainEnvironments, act, choices, plain_spaces
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
@@ -15,7 +16,7 @@ from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
 
@@ -53,7 +54,6 @@ def test_the_preset_is_a_run(folder: Path) -> None:
 
 def test_the_network_becomes_a_program(folder: Path) -> None:
     (folder / "my_network.py").write_text(example("network.md"))
-    space = ArraySpace(shape=(12, 12), dtype="uint8", frames=3)
     spaces = plain_spaces(ArraySpace(shape=(12, 12), dtype="uint8", frames=3), 4)
     learner = Learner(
         TrainingSpec(), PolicySpec(encoder="my_network:Encoder"), spaces, UserModules(frozenset({"my_network"}))
@@ -61,7 +61,7 @@ def test_the_network_becomes_a_program(folder: Path) -> None:
     runtime = OnnxRuntime(learner.program())
     runtime.load(learner.weights())
     observations = np.full((5, 3, 12, 12), 255, np.uint8)
-    actions = runtime.act(observations, np.zeros((5, 0), np.float32), np.random.default_rng(0))[0]
+    actions = act(runtime, observations, np.zeros((5, 0), np.float32), np.random.default_rng(0))[0]
     assert actions.shape == (5,)
 
 

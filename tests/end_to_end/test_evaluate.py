@@ -15,6 +15,7 @@ import pytest
 import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
+from plain import act
 from processes import Running, processes_mentioning
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
@@ -77,7 +78,7 @@ def play_one_by_one(checkpoint: Path, episodes: int) -> tuple[list[float], set[i
         seen, total, over = [frame] * 4, 0.0, False
         memory = np.zeros((1, runtime.state_size), np.float32)
         while not over:
-            actions, _, memory = runtime.act(np.stack(seen[-4:])[None], memory, None)
+            actions, _, memory = act(runtime, np.stack(seen[-4:])[None], memory)
             frame, reward, terminated, truncated, _ = environment.step(actions[0])
             taken.add(int(actions[0]))
             seen.append(frame)

@@ -86,9 +86,9 @@ class RecordingLearner:
         if join.spaces is not None:  # an actor declares its presence before it joins
             assert self.present[join.actor, join.incarnation]
         if join.spaces is not None and not self.weights:
-            network = ActorCritic(self.spec.policy, join.spaces)
-            self.model = export_program(network, join.spaces)
-            self.weights = {name: p.detach().numpy().copy() for name, p in network.named_parameters()}
+            self.network = ActorCritic(self.spec.policy, join.spaces)
+            self.model = export_program(self.network, join.spaces)
+            self.weights = {name: p.detach().numpy().copy() for name, p in self.network.named_parameters()}
             self.weights = {name: self.weights[name] for name in OnnxRuntime(self.model).weight_names}
         request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=11, spec=self.spec)))
 

@@ -12,11 +12,12 @@ import node
 import numpy as np
 import pytest
 import torch
+from plain import ACTION, NAME, plain
 from processes import LIMIT, Running, until
 from recording_learner import ONE_AT_A_TIME, SPEC, RecordingLearner
 
 from daedalus.bridge.service import Bridge
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.messages import Acknowledgement, Refusal
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec, TrainingSpec
@@ -91,29 +92,25 @@ def test_every_row_agrees_with_the_program_and_with_gymnasium(
         rollout = learner.next()
         assert (rollout.identity.sequence, rollout.identity.learner_epoch) == (expected, 2**62 + 5)
         assert rollout.identity.incarnation == learner.joins[-1].incarnation
-        assert rollout.frames.shape == (49, 6, 4)
-        assert rollout.frames.dtype == np.float32
-        runtime = OnnxRuntime(learner.model)
-        runtime.load(learner.weights)
-        assert tail is None or np.array_equal(rollout.frames[0], tail)
+        frames, actions = plain(rollout.frames), plain(rollout.actions)
+        assert (frames.shape, frames.dtype, actions.shape) == ((49, 6, 4), np.float32, (48, 6, 1))
+        assert tail is None or np.array_equal(frames[0], tail)
         assert state is None or np.allclose(rollout.initial_state, state, atol=1e-5)
         state, finished = rollout.initial_state, []
         for row in range(48):
-            seen = rollout.frames[row]
-            logits, state = acted(runtime, seen, state)
-            log_probs = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
-            chosen = log_probs[np.arange(6), rollout.actions[row]]
+            seen = frames[row]
+            chosen, state = log_prob_and_state(learner.network, seen, actions[row], state)
             assert np.allclose(rollout.behaviour_log_probs[row], chosen, atol=1e-5)
             assert np.array_equal(rollout.valid[row], ~ended)
             assert np.allclose(rollout.rewards[row], 0.05 * ~ended)
             for e in range(6):
-                after = rollout.frames[row + 1, e]
+                after = frames[row + 1, e]
                 if ended[e]:
                     assert (np.abs(after) <= 0.05).all()
                     assert not rollout.terminated[row, e]
                     assert not rollout.truncated[row, e]
                     continue
-                expected_frame, terminated = gymnasium_step(seen[e], int(rollout.actions[row, e]))
+                expected_frame, terminated = gymnasium_step(seen[e], int(actions[row, e, 0]))
                 assert np.allclose(after, expected_frame, atol=1e-4)
                 assert rollout.terminated[row, e] == terminated
             running += rollout.valid[row]
@@ -122,7 +119,7 @@ def test_every_row_agrees_with_the_program_and_with_gymnasium(
             ended = rollout.terminated[row] | rollout.truncated[row]
             finished += running[ended].tolist()
             running[ended] = 0
-        tail = rollout.frames[-1]
+        tail = frames[-1]
         assert rollout.episode_lengths.tolist() == finished
         assert rollout.episode_returns.tolist() == finished
     learner.end_run()
@@ -130,10 +127,14 @@ def test_every_row_agrees_with_the_program_and_with_gymnasium(
     process.expect("the run is over: the test is over")
 
 
-def acted(runtime: OnnxRuntime, observations: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run the program and return logits and next state."""
-    outputs = runtime._session.run({**runtime._feed, "observations": observations, "state": state})
-    return np.asarray(outputs[0]), np.asarray(outputs[1])
+def log_prob_and_state(
+    network: ActorCritic, observations: np.ndarray, actions: np.ndarray, state: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return log-probabilities [E] of actions [E, 1] and the next state, as torch computes them."""
+    with torch.no_grad():
+        parameters, after = network.step({NAME: torch.from_numpy(observations.copy())}, torch.from_numpy(state.copy()))
+        chosen = {ACTION: torch.from_numpy(actions.astype(np.int64))}
+        return network.distribution.log_prob(parameters, chosen, {}).numpy(), after.numpy()
 
 
 def test_the_actor_obeys_each_verdict(play: Callable[..., tuple[RecordingLearner, Running]]) -> None:
@@ -142,7 +143,7 @@ def test_the_actor_obeys_each_verdict(play: Callable[..., tuple[RecordingLearner
         learner.verdicts.put(Acknowledgement(verdict=verdict, policy_version=0))
     again = [learner.next() for _ in range(3)]  # busy: the actor sends the same rollout again
     assert [rollout.identity.sequence for rollout in again] == [0, 0, 0]
-    assert all(np.array_equal(rollout.frames, again[0].frames) for rollout in again)
+    assert all(np.array_equal(plain(rollout.frames), plain(again[0].frames)) for rollout in again)
     assert (
         learner.next().identity.sequence == 1
     )  # a rejected rollout is not sent again; the answer to this one is fenced

@@ -100,9 +100,10 @@ class PlainLearner:
             for t in range(rows + 1):
                 if batch.starts[t, b]:
                     state = torch.zeros_like(state)
-                seen = plain(batch.observations)[t, b : b + 1]
-                _, value = self.network(seen.unsqueeze(0), state, torch.zeros(1, 1, dtype=torch.bool))
-                logits, state = self.network.act(seen, state)
+                seen = {name: values[t, b : b + 1] for name, values in batch.observations.items()}
+                row = {name: values.unsqueeze(0) for name, values in seen.items()}
+                _, value = self.network(row, state, torch.zeros(1, 1, dtype=torch.bool))
+                logits, state = self.network.step(seen, state)
                 values[t, b] = value.squeeze()
                 if t < rows:
                     policy = torch.distributions.Categorical(logits=logits[0])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from building import identity, make_rollout
 from log_lines import LINES
+from plain import vector_spaces
 from processes import LIMIT, until
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
@@ -29,7 +30,6 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, StatusReport
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -194,7 +194,7 @@ def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_trainin
         until(lambda: len(training_run.rows()) > 1)
         status = decode(hostile.query(keys.status("run"), timeout=LIMIT)[0], Limits())
         assert isinstance(status, StatusReport)
-        spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+        spaces = vector_spaces(4, 2)
         join = Join(actor="hostile", incarnation=1, spaces=spaces, environments=1)
         hostile.query(keys.join("run", "hostile"), encode(join), timeout=LIMIT)
         answer, sequence = Acknowledgement(verdict="busy"), 0

@@ -102,10 +102,10 @@ def test_every_tag_is_in_a_group() -> None:
 
 def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Path) -> None:
     picture = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
-    details = Details(returns=[1.0, 1.0, 5.0], lengths=[3, 4, 4], action_counts=[2, 0, 5], picture=picture)
+    details = Details(returns=[1.0, 1.0, 5.0], lengths=[3, 4, 4], action_counts={"action": [2, 0, 5]}, picture=picture)
     writer = TensorBoardWriter(tmp_path)
     writer.write({"env_steps": 100}, details)
-    writer.write({"env_steps": 200}, Details(action_counts=[0, 0, 0]))  # no new values
+    writer.write({"env_steps": 200}, Details(action_counts={"action": [0, 0, 0]}))  # no new values
     writer.close()
     events = EventAccumulator(str(tmp_path))
     events.Reload()

@@ -60,10 +60,10 @@ def test_learner_and_actor_log_probabilities_are_equal_under_the_same_weights(
     for _ in range(6):
         rollout: Any = copy.deepcopy(decode(encode(collector.collect(IDENTITY)), Limits()))
         assert isinstance(rollout, Rollout)
-        batch = join([rollout], spaces.observations["observation"])
+        batch = join([rollout], spaces)
         with torch.no_grad():
             parameters, _ = network(batch.observations, batch.initial_state, batch.starts)
-            log_probs, _ = network.distribution.log_prob_and_entropy(parameters[:-1], batch.actions)
+            log_probs, _ = network.distribution.log_prob_and_entropy(parameters[:-1], batch.actions, batch.masks)
         valid = rollout.valid
         assert np.ptp(log_probs.numpy()[valid]) > 0.1
         np.testing.assert_allclose(log_probs.numpy()[valid], rollout.behaviour_log_probs[valid], atol=1e-4)

@@ -87,9 +87,7 @@ def test_join_with_observations_too_large_for_memory_is_refused_and_fixes_no_spa
     """Such a Join once ended the learner: it allocated the batch."""
     responses, fleet = make_responses()
     huge = ArraySpace.model_construct(kind="array", shape=(2**40,), dtype="float32", frames=1)
-    spaces = Spaces.model_construct(
-        observations={"observation": huge}, actions={"action": DiscreteSpace(counts=(2,))}
-    )
+    spaces = Spaces.model_construct(observations={"observation": huge}, actions={"action": DiscreteSpace(counts=(2,))})
     answer = read(responses.join("a", encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
     assert isinstance(answer, Refusal)
     assert "use at most" in answer.reason

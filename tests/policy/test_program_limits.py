@@ -13,18 +13,27 @@ from onnx import TensorProto, helper, numpy_helper
 from daedalus.policy.acting import call_watchdog, program_check
 from daedalus.policy.acting.call_watchdog import CallWatchdog
 from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.acting.noise import neutral_noise
 from daedalus.policy.acting.program_session import ProgramSession
 from daedalus.policy.acting.runtime import OnnxRuntime
 
 OBSERVATIONS = np.ones((2, 2), np.float32)
 NO_STATE = np.zeros((2, 0), np.float32)
-INPUT = helper.make_tensor_value_info("observations", TensorProto.FLOAT, [None, 2])
-OUTPUT = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [None, 2])
-COPY = helper.make_node("Identity", ["observations"], ["logits"])
+SEEN = "observations/observation"
+INPUT = helper.make_tensor_value_info(SEEN, TensorProto.FLOAT, [None, 2])
+ACTIONS = helper.make_tensor_value_info("actions/action", TensorProto.FLOAT, [None, 2])
+LOG_PROB = helper.make_tensor_value_info("log_prob", TensorProto.FLOAT, [None])
+COPY = helper.make_node("Identity", [SEEN], ["y"])
 
 
 def model(nodes: Sequence[onnx.NodeProto], *initializers: TensorProto) -> onnx.ModelProto:
-    graph = helper.make_graph(nodes, "program", [INPUT], [OUTPUT], initializers)
+    """Return a program whose `nodes` compute y [N, 2]: the action, and by its columns' sum the log-probability."""
+    ends = [
+        helper.make_node("Identity", ["y"], ["actions/action"]),
+        constant("axis", 1),
+        helper.make_node("ReduceSum", ["y", "axis"], ["log_prob"], keepdims=0),
+    ]
+    graph = helper.make_graph([*nodes, *ends], "program", [INPUT], [ACTIONS, LOG_PROB], initializers)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
@@ -43,16 +52,16 @@ def endless() -> onnx.ModelProto:
     )
     scalars = (np.array(2**63 - 1), np.array(True), np.array(1, np.float32))
     tensors = [numpy_helper.from_array(scalar, name) for scalar, name in zip(scalars, ("n", "go", "x0"), strict=True)]
-    loop = helper.make_node("Loop", ["n", "go", "x0"], ["y"], body=body)
-    return model([loop, helper.make_node("Mul", ["observations", "y"], ["logits"])], *tensors)
+    loop = helper.make_node("Loop", ["n", "go", "x0"], ["z"], body=body)
+    return model([loop, helper.make_node("Mul", [SEEN, "z"], ["y"])], *tensors)
 
 
 def huge(*, constant_shape: bool) -> list[onnx.NodeProto]:
-    """Return nodes that compute the logits by way of a tensor of 4 GiB, or of 256 MiB if its shape is a constant."""
+    """Return nodes that compute y by way of a tensor of 4 GiB, or of 256 MiB if its shape is a constant."""
     shape = [constant("shape", 1 << 26)]
     if not constant_shape:
         shape = [
-            helper.make_node("Shape", ["observations"], ["rows_columns"]),
+            helper.make_node("Shape", [SEEN], ["rows_columns"]),
             constant("factor", 1 << 14, 1 << 14),
             helper.make_node("Mul", ["rows_columns", "factor"], ["shape"]),
         ]
@@ -60,7 +69,7 @@ def huge(*, constant_shape: bool) -> list[onnx.NodeProto]:
         *shape,
         helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
         helper.make_node("ReduceSum", ["zeros"], ["sum"], keepdims=0),
-        helper.make_node("Add", ["observations", "sum"], ["logits"]),
+        helper.make_node("Add", [SEEN, "sum"], ["y"]),
     ]
 
 
@@ -68,8 +77,8 @@ def huge(*, constant_shape: bool) -> list[onnx.NodeProto]:
 
 
 def nested_in_an_allowed_operator() -> onnx.ModelProto:
-    inner = helper.make_graph([COPY], "inner", [INPUT], [OUTPUT])
-    return model([helper.make_node("Identity", ["observations"], ["logits"], body=inner)])
+    inner = helper.make_graph([COPY], "inner", [INPUT], [ACTIONS])
+    return model([helper.make_node("Identity", [SEEN], ["y"], body=inner)])
 
 
 def function() -> onnx.ModelProto:
@@ -90,28 +99,28 @@ def sparse() -> onnx.ModelProto:
 def heavy_constant() -> onnx.ModelProto:
     """Return a model whose operator takes 4 TiB for itself, and whose result is one number."""
     ones = [numpy_helper.from_array(np.ones(1000, np.float32), name) for name in "abcd"]
-    einsum = helper.make_node("Einsum", [*"abcd", *"abcd"], ["y"], equation="i,j,k,l,i,j,k,l->")
-    return model([einsum, helper.make_node("Add", ["observations", "y"], ["logits"])], *ones)
+    einsum = helper.make_node("Einsum", [*"abcd", *"abcd"], ["z"], equation="i,j,k,l,i,j,k,l->")
+    return model([einsum, helper.make_node("Add", [SEEN, "z"], ["y"])], *ones)
 
 
 def heavy_constant_of_a_shape() -> onnx.ModelProto:
     """Return a model in which onnxruntime replaces the shape of an input by a constant."""
-    shape = [helper.make_node("Shape", ["observations"], ["s"]), helper.make_node("ConstantOfShape", ["s"], ["x"])]
-    einsum = helper.make_node("Einsum", ["x"], ["y"], equation="ij->")
-    return model([*shape, einsum, helper.make_node("Add", ["observations", "y"], ["logits"])])
+    shape = [helper.make_node("Shape", [SEEN], ["s"]), helper.make_node("ConstantOfShape", ["s"], ["x"])]
+    einsum = helper.make_node("Einsum", ["x"], ["z"], equation="ij->")
+    return model([*shape, einsum, helper.make_node("Add", [SEEN, "z"], ["y"])])
 
 
 def constant_observations() -> onnx.ModelProto:
-    return model([COPY], numpy_helper.from_array(OBSERVATIONS, "observations"))
+    return model([COPY], numpy_helper.from_array(OBSERVATIONS, SEEN))
 
 
 @pytest.mark.parametrize(
     ("program", "reason"),
     [
         (endless(), "the operator 'Loop', which is not allowed"),
-        (model([helper.make_node("RandomNormalLike", ["observations"], ["logits"])]), "'RandomNormalLike'"),
+        (model([helper.make_node("RandomNormalLike", [SEEN], ["y"])]), "'RandomNormalLike'"),
         (
-            model([helper.make_node("Identity", ["observations"], ["logits"], domain="com.microsoft")]),
+            model([helper.make_node("Identity", [SEEN], ["y"], domain="com.microsoft")]),
             "only those of ONNX",
         ),
         (nested_in_an_allowed_operator(), "nested graphs"),
@@ -120,7 +129,7 @@ def constant_observations() -> onnx.ModelProto:
         (heavy_constant(), "Einsum from constants alone"),
         (heavy_constant_of_a_shape(), "Einsum from constants alone"),
         (constant_observations(), "constants in place of its inputs"),
-        (model([COPY] * 5000), "5000 nodes, the limit is 4096"),
+        (model([COPY] * 4997), "5000 nodes, the limit is 4096"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -154,7 +163,7 @@ def test_program_in_the_format_of_onnxruntime_is_refused() -> None:
 )
 def test_bytes_that_parsers_could_read_differently_are_refused(garbage: bytes) -> None:
     with pytest.raises(PolicyError, match="not an ONNX model"):
-        program_check.check_program(garbage, ())
+        program_check.check_program(garbage, lambda _: False)
 
 
 # --------------------------------------------------------------------------------------------------- memory
@@ -164,8 +173,8 @@ def test_memory_of_a_program_is_limited() -> None:
     runtime = OnnxRuntime(model(huge(constant_shape=False)).SerializeToString())
     runtime.load({})
     with pytest.raises(PolicyError, match="the program failed"):
-        runtime.act(OBSERVATIONS, NO_STATE, None)
-    assert len(model(huge(constant_shape=False)).SerializeToString()) < 400
+        runtime.act({"observation": OBSERVATIONS}, NO_STATE, neutral_noise(runtime.noise_size, 2), {})
+    assert len(model(huge(constant_shape=False)).SerializeToString()) < 500
 
 
 def test_large_constants_are_not_computed_when_a_program_is_loaded() -> None:
@@ -195,7 +204,7 @@ def started(stop: threading.Event | None = None) -> ProgramSession:
 def test_call_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(call_watchdog, "CALL_SECONDS", 0.3)
     with pytest.raises(PolicyError, match="took too long"):
-        started().run({"observations": OBSERVATIONS})
+        started().run({SEEN: OBSERVATIONS})
 
 
 def test_stop_ends_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +213,7 @@ def test_stop_ends_a_call(monkeypatch: pytest.MonkeyPatch) -> None:
     timer = threading.Timer(0.2, stop.set)
     timer.start()
     with pytest.raises(PolicyError, match="took too long"):
-        started(stop).run({"observations": OBSERVATIONS})
+        started(stop).run({SEEN: OBSERVATIONS})
     assert stop.is_set()
     timer.join()
 
@@ -215,7 +224,7 @@ def test_calls_within_the_limit_are_not_ended(monkeypatch: pytest.MonkeyPatch) -
     stop.set()
     session = ProgramSession(model([COPY]).SerializeToString(), CallWatchdog(stop))
     for _ in range(3):
-        np.testing.assert_array_equal(session.run({"observations": OBSERVATIONS})[0], OBSERVATIONS)
+        np.testing.assert_array_equal(session.run({SEEN: OBSERVATIONS})[0], OBSERVATIONS)
         threading.Event().wait(0.3)  # the watchdog has looked between two calls
 
 

@@ -97,12 +97,12 @@ def test_a_rollout_needs_observations_and_actions() -> None:
 
 @pytest.mark.parametrize("dtype", [np.float64, np.bool_, np.float16])
 def test_actions_are_integers_or_float32(dtype: type) -> None:
-    with pytest.raises(ValueError, match="^actions/action must be float32 or integers"):
+    with pytest.raises(ValueError, match=r"^actions/action must be float32 or integers"):
         rollout(actions={"action": np.zeros((T, E, 1), dtype)})
 
 
 def test_masks_are_bool() -> None:
-    with pytest.raises(ValueError, match="^masks/action must be bool"):
+    with pytest.raises(ValueError, match=r"^masks/action must be bool"):
         rollout(masks={"action": np.ones((T, E, 4), np.uint8)})
 
 
@@ -140,7 +140,8 @@ def test_at_most_256_values_of_a_name_travel() -> None:
     rows = {name: np.zeros((300, 1), getattr(rollout(), name).dtype) for name in ROW_ARRAYS}
     long: dict[str, Any] = {
         **rows,
-        "frames": np.zeros((301, 1, 4), np.float32),
+        "frames": {"observation": np.zeros((301, 1, 4), np.float32)},
+        "actions": {"action": np.zeros((300, 1, 1), np.int64)},
         "initial_state": np.zeros((1, 0), np.float32),
         "episode_returns": np.zeros(300, np.float32),
         "episode_lengths": np.ones(300, np.int32),

@@ -20,7 +20,10 @@ from .network import Network
 from .primitives import Event
 from .process import Process
 
-_SPACES = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+_SPACES = Spaces(
+    observations={"observation": ArraySpace(shape=(4,), dtype="float32")},
+    actions={"action": DiscreteSpace(counts=(2,))},
+)
 _FALSE = np.zeros((1, 1), np.bool_)
 _ZERO = np.zeros((1, 1), np.float32)
 _KEPT = 2  # rollouts that a client keeps while it cannot send
@@ -82,9 +85,10 @@ class ScriptedCollector:
         return Rollout(
             identity=identity,
             policy_version=snapshot.policy_version,
-            frames=frames,
+            frames={"observation": frames},
             initial_state=np.zeros((1, 0), np.float32),
-            actions=np.zeros((1, 1), np.int64),
+            actions={"action": np.zeros((1, 1, 1), np.int64)},
+            masks={},
             behaviour_log_probs=_ZERO,
             rewards=_ZERO,
             terminated=_FALSE,

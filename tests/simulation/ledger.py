@@ -117,7 +117,7 @@ class Ledger:
         life.added[identity] = None
         self._kernel.log("accept", identity.actor, identity.sequence, rollout.policy_version)
         self.require(identity.learner_epoch == life.epoch, "a rollout of another epoch is accepted:", identity)
-        *weights, number = rollout.frames[0, 0].tolist()
+        *weights, number = rollout.frames["observation"][0, 0].tolist()
         is_right = weights == self.token(life.number, rollout.policy_version)
         self.require(is_right, identity, "claims version", rollout.policy_version, "but its weights were", weights)
         self.require(self._numbers.get(identity) == int(number), "carries another rollout's content:", identity)
