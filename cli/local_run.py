@@ -50,6 +50,8 @@ class LocalRun:
     started: float  # on the monotonic clock; the seconds of the run count from this time
     lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
+    trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
+    init_from: Path | None = None  # another run, whose weights the learner begins with
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False
@@ -81,7 +83,7 @@ def run_locally(
     Raises RunFailedError or RunStoppedError.
     """
     try:
-        status = _train(run, stopping, output, learner_streams)
+        status = _train(run, stopping, output, learner_streams) if run.trained is None else run.trained
         if stopping.is_set():
             raise RunStoppedError
         if status not in _FINISHED:
@@ -157,6 +159,8 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
         arguments += _logging_options(run.log_level, run.log_json)
         arguments += allow_settings(run.spec.policy.user_modules)
+        if run.init_from is not None:
+            arguments += ["--init-from", str(run.init_from)]
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:

@@ -61,6 +61,12 @@ def add_settings(options: argparse.ArgumentParser) -> None:
         metavar="MODULE:FUNCTION",
         help="your function that takes each gymnasium environment and returns the one to play (environment.wrap)",
     )
+    options.add_argument(
+        "--init-from",
+        type=Path,
+        metavar="RUN_DIR",
+        help="begin with the weights of another run, or of one of its checkpoints. The network must be the same",
+    )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     options.add_argument(
         "--set",

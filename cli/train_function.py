@@ -55,6 +55,7 @@ def train(
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     wrap: str | None = None,
+    init_from: str | Path | None = None,
     quiet: bool = False,
 ) -> RunResult:
     """Train with a learner and actors as processes of this machine, evaluate the policy, and return the result.
@@ -72,6 +73,7 @@ def train(
       run_dir: a new directory for the run (default: a new folder in runs/).
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
+      init_from: another run, or one of its checkpoints, whose weights to begin with; the network must be the same.
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TrainingError if a process failed.
@@ -86,8 +88,16 @@ def train(
     check_environment(env, chosen)
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
-        end = _run(LocalRun(directory=lock.directory, spec=spec, started=started, lock=lock.inheritable), quiet)
+    weights = None if init_from is None else Path(init_from)
+    with run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock:
+        run = LocalRun(
+            directory=lock.directory,
+            spec=spec,
+            started=started,
+            lock=lock.inheritable,
+            init_from=weights,
+        )
+        end = _run(run, quiet)
     return _result(lock.directory, end)
 
 

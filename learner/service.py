@@ -23,6 +23,8 @@ from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -63,6 +65,7 @@ class LearnerService:
         *,
         started: float,
         restored: "Checkpoint | None" = None,
+        initial: SavedPolicy | None = None,
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
@@ -77,11 +80,13 @@ class LearnerService:
           open_writers: functions that open the metrics writers.
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
+          initial: policy of another run whose weights to begin with, unless there is a checkpoint to continue from.
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
-        self._open_writers, self._restored, self._modules = open_writers, restored, modules
+        self._open_writers, self._modules = open_writers, modules
+        self._restored, self._initial = restored, initial if restored is None else None
         self._counters = RunCounters(spec.training.target_episodes)
         self._annealing = Annealing(budget=spec.training.env_steps)
         if restored is not None:
@@ -120,7 +125,7 @@ class LearnerService:
         """Serve actors and train until the target is reached, the budget is used or the stop event is set.
 
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
-        learner serves the run, CheckpointMismatchError if the checkpoint does not fit the settings, NetworkError if
+        learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
         the policy does not support the spaces, SettingsError if the device is not available.
         """
         try:
@@ -138,9 +143,14 @@ class LearnerService:
                 if learner.learning_rate(self._annealing.at(self._counters.env_steps)) == 0.0:
                     _logger.warning(
                         "the learning rate has been annealed to 0: the policy changes no more; "
-                        "start a new run with the larger budget"
+                        "start a new run from its weights, with --init-from"
                     )
-            return self._learn(learner, self._checkpointer(learner))
+            if self._initial is not None:
+                _load(learner, self._initial)
+            checkpointer = self._checkpointer(learner)
+            if self._initial is not None:
+                checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
+            return self._learn(learner, checkpointer)
         finally:
             self._server.close(_STOPPED)  # unless it is closed
 
@@ -174,7 +184,7 @@ class LearnerService:
         finally:
             ended = time.monotonic()
             self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
-            recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
+            recorder.record(self._reporter.row(learner, ended, last=True), self._reporter.details(learner))
             recorder.close()
             saved = checkpointer.save()
         solved = seconds_to_target is not None
@@ -251,3 +261,12 @@ def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:
     """Return the annealing of a run that continues from a checkpoint, perhaps with another budget."""
     saved = restored.counters.get("annealing", {"budget": restored.policy.spec.training.env_steps})
     return Annealing(**saved).resumed(restored.counters["env_steps"], spec.training.env_steps)
+
+
+def _load(learner: "Learner", policy: SavedPolicy) -> None:
+    """Begin with the weights of another run. Raises CheckpointMismatchError."""
+    try:
+        learner.load(policy.weights)
+    except CheckpointMismatchError as error:
+        raise CheckpointMismatchError(f"--init-from {policy.directory}: {error}") from None
+    _logger.info("initial weights: policy version %d of %s", policy.policy_version, policy.directory)

@@ -29,6 +29,7 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -36,7 +37,7 @@ from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.saving.saved_policy import checkpoints
+from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
 from daedalus.protocol.spec import RunSpec
@@ -99,19 +100,26 @@ def _serve(
     """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
-    restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
+    restored = None
+    if arguments.resume and run.exists:
+        finished = finished_run(run.directory, run.spec)
+        if finished is not None:
+            _logger.info("nothing to do: %s", finished.reason)
+            return NOT_REACHED if finished.missed else REACHED
+        restored = _newest_checkpoint(run.directory)
+    initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
         return stopped
     stack.callback(transport.close)
     if not run.exists:
-        lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
-        stack.enter_context(lock)
+        new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
+        lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, started, restored, credentials)
+        outcome = _train(run, transport, stop, progress, started, restored, initial, credentials)
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)
@@ -160,6 +168,7 @@ def _train(
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
+    initial: SavedPolicy | None,
     credentials: Credentials | None,
 ) -> Outcome:
     """Run the learner to its end."""
@@ -173,6 +182,7 @@ def _train(
         [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
         started=started,
         restored=restored,
+        initial=initial,
         modules=run.modules,
         certificate_days_left=lambda: certificate_days_left(credentials),
     )

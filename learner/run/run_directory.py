@@ -59,13 +59,14 @@ def create(directory: Path, spec: RunSpec) -> None:
     create_locked(directory, spec).close()
 
 
-def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False) -> RunLock:
+def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, init_from: Path | None = None) -> RunLock:
     """Create the directory of a new run, with config.toml and versions.json, and return its lock.
 
     Args:
       directory: its path.
       spec: the settings of the run.
       numbered: add a number to the name if the directory exists; the lock has the resulting path.
+      init_from: run whose weights the new run begins with, for versions.json.
 
     Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
@@ -78,7 +79,8 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False) -> 
         try:
             check_free(directory)  # another process may have held the lock before
             write_config(directory, spec)
-            write_json(directory / VERSIONS, _versions())
+            origin = {} if init_from is None else {"init_from": str(init_from)}
+            write_json(directory / VERSIONS, {**_versions(), **origin})
         except BaseException:
             lock.close()
             raise
@@ -155,10 +157,3 @@ def _versions() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
     return versions
-
-
-def with_budget(spec: RunSpec, env_steps: int) -> RunSpec:
-    """Return the specification with another budget. Raises SettingsError if `env_steps` is out of range."""
-    settings = spec.model_dump(mode="json", exclude_none=True)
-    settings["training"]["env_steps"] = env_steps
-    return run_spec(settings)
