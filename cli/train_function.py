@@ -38,6 +38,7 @@ class RunResult:
     episode_return_mean: float | None  # mean of the newest training episodes; None if none has ended
     evaluation_return_mean: float  # over evaluation.final_episodes episodes of the best policy
     evaluation_return_std: float
+    confirmation_return_mean: float | None  # over new sampled episodes; None unless training stopped at the target
     wall_seconds: float  # training, without the final evaluation
     seconds_to_target: float | None
     env_steps_per_second: float

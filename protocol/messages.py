@@ -14,7 +14,7 @@ import numpy as np
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 
@@ -177,16 +177,19 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotRequest:
-    """Request of an actor on a slow link for one part of a CompactSnapshot. Actor -> learner, on `snapshots`.
+    """Request of an actor for the newest snapshot. Actor -> learner, on `snapshots`.
 
-    The request for part 0 makes the learner encode its newest snapshot as differences to `held_version`; the requests
-    for the other parts give the policy version of that snapshot.
+    If `compact` is false, the answer is the newest Snapshot, or a Refusal `not_ready` if the actor holds it.
+    If `compact` is true, the answer is one part of a CompactSnapshot, for a slow link. The request for part 0 makes the
+    learner encode its newest snapshot as differences to `held_version`; the requests for the other parts give the
+    policy version of that snapshot.
     """
 
     actor: str
     held_version: int | None  # the version that the actor holds; None: no version
     policy_version: int | None = None  # of the snapshot; None: the newest
     part: int = 0
+    compact: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -265,9 +268,23 @@ class RunEnded:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
-    """State of the run and its actors, in answer to a `status` query."""
+    """State of the run and its first actors, in answer to a `status` query without payload."""
 
     status: RunStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsRequest:
+    """Request of an operator for the next actors of the status. Operator -> learner, on `status`."""
+
+    after: str  # the last name that the operator has
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsReport:
+    """The actors with the next names, in answer to an ActorsRequest; none after the last."""
+
+    page: ActorsPage
 
 
 Message = (
@@ -285,4 +302,6 @@ Message = (
     | EvaluationReport
     | RunEnded
     | StatusReport
+    | ActorsRequest
+    | ActorsReport
 )

@@ -64,11 +64,12 @@ class ScriptedLearner:
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.transport.declare_presence(keys.learner("r"))
         self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
         self.transport.serve(keys.snapshots("r"), self._newest)
         self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.serve(keys.join("r"), self._join)
+        self.transport.serve(keys.join("r", "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
@@ -83,7 +84,12 @@ class ScriptedLearner:
             return
         message = decode(request.payload, Limits())
         assert isinstance(message, SnapshotRequest)
-        request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+        if message.compact:
+            request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+            return
+        self.fetches.append(message)
+        if self.snapshot:  # otherwise the answer is lost
+            request.reply(self.snapshot)
 
     def _program(self, request: Request) -> None:
         model = self.policy.model

@@ -162,12 +162,12 @@ def evaluated(directory: Path, seed: int) -> tuple[float, int]:
     saved = find_policy(directory)
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
-    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1)
+    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1, for_evaluation=True)
     try:
         evaluation = play_episodes(runtime, environments, 1, seed, sampled=False)
     finally:
         environments.close()
-    return float(evaluation.returns[0]), int(np.random.SeedSequence(seed).generate_state(1)[0])
+    return float(evaluation.returns[0]), int(np.random.SeedSequence(seed).generate_state(1)[0]) % 2**30
 
 
 @pytest.mark.parametrize("memory", ["none", "gru"])

@@ -44,8 +44,12 @@ class Request(Protocol):
         """Payload of the query; each access copies it."""
         ...
 
-    def reply(self, payload: bytes) -> None:
-        """Send the answer; later calls have no effect."""
+    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+        """Send the answer; later calls have no effect.
+
+        `may_drop`: drop an answer that a congested link cannot take, instead of waiting. Use it for large answers that
+        their reader requests again: a frozen reader must not hold up the answers to others.
+        """
         ...
 
 

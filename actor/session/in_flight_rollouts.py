@@ -42,7 +42,11 @@ class InFlightRollouts:
     @property
     def has_room(self) -> bool:
         """Whether one more rollout may be collected and sent."""
-        return len(self.rollouts) < self.window
+        return self.has_room_for(1)
+
+    def has_room_for(self, count: int) -> bool:
+        """Return whether `count` more rollouts may be collected and sent."""
+        return len(self.rollouts) + count <= self.window
 
     def size_window(self, collect_seconds: float, least: int, most: int) -> None:
         """Size the in-flight window to the link's latency: more rollouts would only grow stale at the learner.

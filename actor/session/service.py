@@ -16,6 +16,7 @@ from daedalus.actor.session.learner_queries import ActorError, LearnerLostError,
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
+from daedalus.actor.session.snapshot_source import FIRST_PUSH_SECONDS, MISSED_PUSH_SECONDS, SnapshotSource
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
@@ -29,8 +30,6 @@ from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
-_MISSED_PUSH_SECONDS = 1.0  # without the awaited snapshot for so long, request it
-_FIRST_PUSH_SECONDS = 0.02  # before the first snapshot: the learner may be about to have one; doubles
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout: how often newer weights are looked for
 _SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # a link is slow beyond this latency and so many bytes a second
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
@@ -74,6 +73,7 @@ class ActorService:
         self._end = RunEndWatch(transport, stop, self._lock.announce_change)
         self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, self._end)
         self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
+        self._snapshots = SnapshotSource(self._feed, self._monitor, self._uploads)
         self._runs: set[str] = set()  # in which this actor's presence is declared
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout in this learner epoch
@@ -128,7 +128,8 @@ class ActorService:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
         self._collector.begin(self._make_runtime(confirmed, spaces), confirmed.spec, confirmed.seed)
-        self._feed.subscribe()  # only after the link was measured: pushed snapshots would clog a slow one
+        if confirmed.spec.algorithm.synchronous:
+            self._feed.subscribe()
         self._collect_and_upload(confirmed)
 
     def _declare_presence(self, run: str) -> None:
@@ -147,7 +148,7 @@ class ActorService:
 
     def _await_program(self, welcome: Welcome) -> bytes:
         """Return the program once the learner has it; measure the link by the time that it takes."""
-        pause = _FIRST_PUSH_SECONDS
+        pause = FIRST_PUSH_SECONDS
         while True:
             began = time.monotonic()
             program = self._queries.program(welcome.run)
@@ -156,7 +157,7 @@ class ActorService:
             self._feed.subscribe()  # nothing is pushed yet: the first snapshot says that the program is there too
             self._monitor.wait_for_message(pause)
             self._feed.read()
-            pause = min(2 * pause, _MISSED_PUSH_SECONDS)
+            pause = min(2 * pause, MISSED_PUSH_SECONDS)
         if self._config.link == "auto" and not welcome.spec.algorithm.synchronous:
             self._measure_link(welcome, time.monotonic() - began, len(program[1]))
         return program[1]
@@ -184,11 +185,13 @@ class ActorService:
     def _collect_and_upload(self, welcome: Welcome) -> None:
         """Collect and upload until something raises: the session's end, or an error."""
         synchronous, window = welcome.spec.algorithm.synchronous, welcome.spec.collection.window
-        snapshot, self._loaded_version = self._await_snapshot(newer_than=-1), -1
+        snapshot, self._loaded_version = self._snapshots.await_newer(-1), -1
+        if not synchronous:
+            self._feed.use_fetches()
         while True:
-            self._monitor.wait_for_room()  # before collecting, so that the rollout is of the newest policy
+            waited = self._wait_for_room()  # before collecting, so that the rollout is of the newest policy
             self._warn_of_rejections()
-            self._load(snapshot if synchronous else self._newest_snapshot())
+            self._load(snapshot if synchronous else self._snapshots.newest(waited))
             began = time.monotonic()
             payload = encode(self._collect(welcome.learner_epoch))
             if self._feed.uses_compact_snapshots:
@@ -197,7 +200,13 @@ class ActorService:
             self._uploads.send(self._sequence, payload)
             self._sequence += 1
             if synchronous:
-                snapshot = self._await_snapshot(newer_than=self._loaded_version)
+                snapshot = self._snapshots.await_newer(self._loaded_version)
+
+    def _wait_for_room(self) -> float:
+        """Wait until one more rollout may be sent; return the seconds that it took."""
+        began = time.monotonic()
+        self._monitor.wait_for_room()
+        return time.monotonic() - began
 
     def _load(self, snapshot: Snapshot) -> None:
         if snapshot.policy_version != self._loaded_version:
@@ -212,10 +221,17 @@ class ActorService:
             sequence=self._sequence,
             learner_epoch=learner_epoch,
         )
-        while (rollout := self._collector.collect(identity, self._end.check)) is None:
+        self._snapshots.begin_rollout()
+        while (rollout := self._collector.collect(identity, self._on_row)) is None:
             if not self._monitor.wait(self._collector.has_rollout, _REFRESH_SECONDS):
-                self._load(self._newest_snapshot())
+                self._snapshots.fetch_if_due()
+                self._load(self._snapshots.newest_that_came())
+        self._snapshots.end_rollout()
         return rollout
+
+    def _on_row(self) -> None:
+        self._end.check()
+        self._snapshots.fetch_if_due()
 
     def _warn_of_rejections(self) -> None:
         """Warn once that the learner rejects every rollout; it quarantines senders of unfit rollouts much earlier."""
@@ -228,37 +244,6 @@ class ActorService:
                 _MANY_REJECTIONS,
                 reason,
             )
-
-    def _await_snapshot(self, newer_than: int) -> Snapshot:
-        """Wait for a snapshot newer than a version; request it in case a push was lost.
-
-        Return early if the rollout that the version depends on was rejected: the actor must replace it. Not if a newer
-        version is out, whose push was late or lost: a rollout of this version would be rejected again.
-        """
-        first = newer_than < 0
-
-        def ready() -> bool:
-            self._feed.read()
-            newest, in_flight = self._feed.newest, self._uploads.in_flight
-            if newest is not None and newest.policy_version > newer_than:
-                return True
-            return in_flight.last_was_rejected and not first and in_flight.newest_version <= newer_than
-
-        pause = _FIRST_PUSH_SECONDS if first else _MISSED_PUSH_SECONDS
-        while not self._monitor.wait(ready, pause):
-            pause = min(2 * pause, _MISSED_PUSH_SECONDS)
-            self._feed.request_newest()
-        self._uploads.clear_rejection()
-        assert self._feed.newest is not None
-        return self._feed.newest
-
-    def _newest_snapshot(self) -> Snapshot:
-        """Return the newest snapshot that has come; request one that acknowledgements mention and that did not."""
-        self._feed.read()
-        self._monitor.check()
-        self._feed.request_if_behind(self._uploads.in_flight.newest_version)
-        assert self._feed.newest is not None
-        return self._feed.newest
 
 
 def _check_size(payload: bytes, spec: RunSpec) -> None:

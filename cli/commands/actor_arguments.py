@@ -71,7 +71,7 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
         "--link",
         choices=("auto", "lan", "wan"),
         default="auto",
-        help="lan: receive every snapshot in full. wan: fetch snapshots as bfloat16 differences, as often as the link "
+        help="lan: fetch whole snapshots. wan: fetch snapshots as bfloat16 differences, as often as the link "
         "allows (default: %(default)s, which measures the link)",
     )
     options.add_argument(

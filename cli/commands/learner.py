@@ -30,6 +30,7 @@ from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.finished import finished_run
+from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -100,13 +101,13 @@ def _serve(
     """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
-    restored = None
-    if arguments.resume and run.exists:
-        finished = finished_run(run.directory, run.spec)
-        if finished is not None:
-            _logger.info("nothing to do: %s", finished.reason)
-            return NOT_REACHED if finished.missed else REACHED
-        restored = _newest_checkpoint(run.directory)
+    Heartbeat(run.directory).clear()  # before a router is waited for
+    resumed = arguments.resume and run.exists
+    finished = finished_run(run.directory, run.spec) if resumed else None
+    if finished is not None:
+        _logger.info("nothing to do: %s", finished.reason)
+        return NOT_REACHED if finished.missed else REACHED
+    restored = _newest_checkpoint(run.directory) if resumed else None
     initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0

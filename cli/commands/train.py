@@ -30,7 +30,8 @@ _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. Training stops when the target is
 reached or the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes). If the run was
 evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as many new episodes
-each to select the best. Otherwise the newest policy is used."""
+each to select the best. Otherwise the newest policy is used. If the target was reached, the policy of that moment also
+plays 100 new sampled episodes (training.target_episodes) to confirm it."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -227,4 +228,18 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
-    return "\n".join([trained, evaluated, *evaluation["notes"], folder])
+    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+
+
+def _confirmed(summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
+        "of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
+    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]

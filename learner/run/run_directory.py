@@ -4,6 +4,7 @@ config.toml      all settings; reproduces the run      metrics.csv   one row for
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
 learner.lock     locked by the learner that runs
+heartbeat        its age shows that the learner works (heartbeat.py)
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 """
 
@@ -19,6 +20,7 @@ from typing import Any
 
 import tomli_w
 
+from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.protocol.spec import RunSpec
@@ -103,7 +105,7 @@ def remove_failed(directory: Path) -> None:
     """Remove the files of a run that failed before it had a result, and the directory unless it has other files."""
     if (directory / METRICS).exists() or any((directory / "checkpoints").glob("*")):
         return
-    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, "events.out.*", ".*.partial"):
+    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, HEARTBEAT, "events.out.*", ".*.partial"):
         for file in directory.glob(pattern):
             with suppress(OSError):
                 file.unlink()

@@ -11,8 +11,9 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Program, Snapshot
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS
+from daedalus.protocol.messages import Program, Refusal, Snapshot, SnapshotRequest
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request, Transport, TransportError
 
@@ -52,7 +53,7 @@ class SnapshotPublisher:
         self._key, self._spec, self._epoch = keys.snapshots(run), spec, learner_epoch
         self._transport, self._responses, self._counters = transport, responses, counters
         self._fleet, self._lock = fleet, lock
-        self._compact = CompactSnapshotServer(learner_epoch, responses.snapshot, self._count_compact)
+        self._compact = CompactSnapshotServer(learner_epoch, responses.snapshot, self._count_answer)
         self._unpublished_rollouts = 0  # trained on since the last snapshot
         self._program_hash = ""
         self.version = start_version  # the newest published version
@@ -67,10 +68,22 @@ class SnapshotPublisher:
 
     def answer(self, request: Request) -> None:
         """Answer a query on `snapshots`, or queue it if it requests a compact snapshot. Does not block."""
-        if request.size:
-            self._compact.offer(request)
-        else:
+        if not request.size:
             request.reply(self._responses.snapshot())
+            return
+        try:
+            message = decode(request.payload, SNAPSHOT_REQUEST_LIMITS)
+        except ProtocolError as error:
+            request.reply(encode(Refusal(code="malformed", reason=str(error))))
+            return
+        if not isinstance(message, SnapshotRequest):
+            request.reply(encode(Refusal(code="malformed", reason="expected a SnapshotRequest")))
+        elif message.compact:
+            self._compact.offer(request, message)
+        else:
+            answer = self._responses.snapshot(message.held_version)
+            request.reply(answer, may_drop=True)
+            self._count_answer(message, len(answer))
 
     def offer_program(self, model: bytes) -> None:
         """Make the policy program available to queries."""
@@ -106,7 +119,7 @@ class SnapshotPublisher:
                 weights=weights,
             )
         )
-        self._responses.offer_snapshot(snapshot)
+        self._responses.offer_snapshot(snapshot, policy_version)
         self.version, self._unpublished_rollouts = policy_version, 0
         self._push(snapshot)
         self._fleet.pushed_bytes += len(snapshot)
@@ -120,9 +133,10 @@ class SnapshotPublisher:
         with contextlib.suppress(TransportError):  # the session is being replaced; actors query a missed snapshot
             self._transport.publish(self._key, payload)
 
-    def _count_compact(self, name: str, size: int) -> None:
-        """Count an answer to an actor. Called on the thread of the compact snapshot server."""
+    def _count_answer(self, request: SnapshotRequest, size: int) -> None:
+        """Count an answer to an actor. Any thread may call this method."""
         with self._lock:
-            actor = self._fleet.actors.get(name)
+            actor = self._fleet.actors.get(request.actor)
             if actor is not None:
-                actor.compact_snapshots, actor.answered_bytes = True, actor.answered_bytes + size
+                actor.fetches, actor.compact_snapshots = True, request.compact
+                actor.answered_bytes += size

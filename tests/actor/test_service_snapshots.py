@@ -79,6 +79,38 @@ def test_actor_collects_with_the_newest_snapshot(network: MemoryNetwork, actor: 
     assert versions[-1] >= 5
 
 
+def test_actor_fetches_its_snapshots_once_or_twice_for_a_rollout_and_is_pushed_none(
+    network: MemoryNetwork, actor: RunningActor
+) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    rollouts = 40
+    for version in range(1, rollouts + 1):
+        rollout, request = learner.receive()
+        learner.publish(version)
+        acknowledge(request, "accepted", version)
+    assert rollout.policy_version >= rollouts - 3  # two rollouts are in flight
+    assert rollouts / 2 <= len(learner.fetches) <= 2 * rollouts + 2
+    assert all(not fetch.compact and fetch.actor == "a" for fetch in learner.fetches)
+    assert [fetch.held_version for fetch in learner.fetches] == sorted(fetch.held_version for fetch in learner.fetches)
+    subscriptions = {inbox.key for inbox in actor.transport._inboxes} - {""}  # without those that were closed
+    assert subscriptions == {keys.run_end("r")}
+
+
+def test_actor_plays_with_its_snapshot_if_a_fetch_has_no_answer(network: MemoryNetwork, actor: RunningActor) -> None:
+    learner = ScriptedLearner(network)
+    learner.publish(3)
+    _, request = learner.receive()
+    learner.snapshot = b""
+    acknowledge(request, "accepted", 4)
+    rollout, request = learner.receive()
+    assert rollout.policy_version == 3
+    learner.publish(5)
+    while rollout.policy_version < 5:
+        acknowledge(request, "accepted", 5)
+        rollout, request = learner.receive()
+
+
 class SlowClient(EnvironmentCollector):
     """A collector whose rollouts are complete only after weights of version 1 came."""
 

@@ -292,7 +292,7 @@ def test_arbitrary_bytes_on_any_key_change_nothing(
                     damaged[noise.randrange(len(damaged))] = noise.randrange(256)
                 payload = bytes(damaged)
             for key in (
-                keys.join(run),
+                keys.join(run, "stranger"),
                 keys.program(run, "0" * 64),
                 keys.rollouts(run, "good"),
                 keys.rollouts(run, "stranger"),

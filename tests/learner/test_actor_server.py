@@ -25,6 +25,7 @@ from daedalus.protocol.messages import (
     Refusal,
     RunEnded,
     Snapshot,
+    SnapshotRequest,
 )
 from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.status import RunStatus
@@ -83,7 +84,7 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
         return acknowledgement.verdict
 
     try:
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         assert verdict(0, version=1) == "rejected"
         assert verdict(1, version=0) == "accepted"
         assert len(server.rollouts.take_batch(0)) == 1
@@ -106,7 +107,7 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
     try:
         server.offer_policy(b"program", state_size)
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         rollout = make_rollout(identity("a"), state_size=state_size)
         actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         rollouts = server.rollouts.take_batch(0)
@@ -124,7 +125,7 @@ def test_rows_that_only_reset_are_not_counted_for_their_actor(network: MemoryNet
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
     try:
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         rollout = make_rollout(identity("a"))
         actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         server.rollouts.count_trained(server.rollouts.take_batch(0), [])
@@ -321,7 +322,7 @@ def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(net
     actor = MemoryTransport(network)
     try:
         actor.query(
-            keys.join("r"),
+            keys.join("r", "a"),
             encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)),
             timeout=LIMIT,
         )
@@ -353,7 +354,7 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
     answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
         join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         held = max(spec.training.batch_rollouts or 2, 2)
         for sequence in range(held + 1):
             payload = encode(make_rollout(identity("a", sequence)))
@@ -379,7 +380,7 @@ def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> Memor
     actors = MemoryTransport(network)
     for number in range(count):
         join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actors.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actors.query(keys.join("r", f"a{number}"), encode(join), timeout=LIMIT)
         actors.declare_presence(keys.presence("r", f"a{number}", 1))
     return actors
 
@@ -409,6 +410,39 @@ def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(
         server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
         published.add(server.publisher.version)
     assert published == {0, 8, 16, 24, 32, 40}
+
+
+def test_requested_snapshot_is_sent_unless_the_actor_holds_it_and_counts_for_the_actor(
+    network: MemoryNetwork, server: ActorServer
+) -> None:
+    actors = with_fleet(network, server, 1)
+    weights = {"w": np.zeros(2, np.float32)}
+
+    def request(held: int | None) -> bytes:
+        payload = encode(SnapshotRequest(actor="a0", held_version=held, compact=False))
+        return actors.query(keys.snapshots("r"), payload, timeout=LIMIT)[0]
+
+    assert isinstance(decode(request(None), Limits()), Refusal)
+    server.publisher.publish(3, weights)
+    answers = [request(held) for held in (None, 2, 3)]
+    whole = server.publisher.newest()
+    assert answers[:2] == [whole, whole]
+    unchanged = decode(answers[2], Limits())
+    assert isinstance(unchanged, Refusal)
+    assert unchanged.code == "not_ready"
+    actor = server.fleet.actors["a0"]
+    assert (actor.fetches, actor.compact_snapshots) == (True, False)
+    assert actor.answered_bytes > 2 * len(whole)
+    server.close("solved", finished=True)
+    assert isinstance(decode(request(3), Limits()), RunEnded)
+
+
+def test_invalid_request_for_a_snapshot_is_refused_as_malformed(network: MemoryNetwork, server: ActorServer) -> None:
+    for payload in (b"\xff" * 20, encode(EvaluationRequest(evaluator="e"))):
+        (answer,) = MemoryTransport(network).query(keys.snapshots("r"), payload, timeout=LIMIT)
+        refusal = decode(answer, Limits())
+        assert isinstance(refusal, Refusal)
+        assert refusal.code == "malformed"
 
 
 def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -> None:

@@ -16,7 +16,7 @@ class UnansweredRequest:
     def __init__(self, size: int) -> None:
         self.payload, self.size = bytes(size), size
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
         raise AssertionError("the queue must not reply")
 
 
