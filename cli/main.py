@@ -4,6 +4,8 @@ import os
 import sys
 from collections.abc import Callable
 
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status
+
 USAGE = """\
 usage: daedalus COMMAND ...
 
@@ -34,6 +36,10 @@ for the shell:
 
 def main() -> int:
     """Run the command that the command line names, and return its exit status."""
+    return exit_status(_run)
+
+
+def _run() -> int:
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
@@ -49,8 +55,6 @@ def main() -> int:
         hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
         print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
         return 2
-    from daedalus.cli.processes import exit_on_thread_exceptions
-
     exit_on_thread_exceptions()
     return _COMMANDS[command](rest)
 

@@ -20,6 +20,7 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import (
     STOPPED,
     exit_on_thread_exceptions,
+    exit_status,
     exit_with_parent,
     raise_descriptor_limit,
     stop_on_signals,
@@ -45,6 +46,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.reachable import reachable
 from daedalus.transport.security import (
     SECURITY_ERRORS,
     certificate_days_left,
@@ -119,7 +121,7 @@ def _serve(
         lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         run = replace(run, directory=lock.directory)
     try:
-        _announce(run, arguments)
+        _announce(run, arguments, credentials)
         outcome = _train(run, transport, stop, progress, started, restored, initial, credentials)
     except _FAILURES:
         if not run.exists:
@@ -153,13 +155,20 @@ def _open_transport(
     return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
-def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
+def _how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
+    """Return the command of an actor, with the other addresses that it may use."""
+    address, *others = reachable(listening, credentials.hosts() if credentials else ())
+    tls = ["--tls", "DIR"] if credentials else []
+    command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.environment.user_modules)]
+    return " ".join([*command, *([f"(or at {', '.join(others)})"] if others else [])])
+
+
+def _announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Credentials | None) -> None:
     """Log how actors join."""
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        options = [", ".join(_addresses(arguments)), *allow_settings(spec.environment.user_modules)]
-        _logger.info("actors join with: daedalus actor --connect %s", " ".join(options))
+        _logger.info("actors join with: %s", _how_to_join(_addresses(arguments), credentials, spec))
 
 
 def _train(
@@ -213,4 +222,4 @@ def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main())
+    sys.exit(exit_status(main))

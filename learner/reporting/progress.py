@@ -4,6 +4,7 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TextIO
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
@@ -32,24 +33,26 @@ class Progress:
         parts = _parts(row, self._budget, rate)
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
-            self._stream.write(f"\r\x1b[K{line}")
+            self._write(f"\r\x1b[K{line}")
             self._rewriting = True
         else:
-            self._stream.write("  ".join(parts) + "\n")
-        self._stream.flush()
+            self._write("  ".join(parts) + "\n")
 
     def say(self, text: str) -> None:
         """Print a permanent line."""
         self.end()
-        self._stream.write(text + "\n")
-        self._stream.flush()
+        self._write(text + "\n")
 
     def end(self) -> None:
         """End the line that is being rewritten."""
         if self._rewriting:
-            self._stream.write("\n")
-            self._stream.flush()
+            self._write("\n")
             self._rewriting = False
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):  # nobody reads it any more: training goes on
+            self._stream.write(text)
+            self._stream.flush()
 
     def _rate(self, row: Mapping[str, float]) -> float:
         """Return env_steps a second over the newest rows: slow environments make steps in few of the rows."""
