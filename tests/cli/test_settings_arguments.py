@@ -11,7 +11,8 @@ def test_two_environments_are_refused() -> None:
     words = ["--env", "CartPole-v1", "--set", "environment.id=Acrobot-v1"]
     with pytest.raises(SettingsError, match=r"--env CartPole-v1 and environment.id=Acrobot-v1 are two environments"):
         resolve(learner_parser().parse_args(words))
-    assert resolve(learner_parser().parse_args([*words[:3], "environment.id=CartPole-v1"]))
+    spec, _ = resolve(learner_parser().parse_args([*words[:3], "environment.id=CartPole-v1"]))
+    assert spec.environment.id == "CartPole-v1"
 
 
 @pytest.mark.parametrize(("name", "named"), [("config.toml", "Acrobot-v1"), ("mine.toml", "mine")])

@@ -135,6 +135,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 200)
     collector = StatusCollector()
     collector.transport = operator
+    samples = []
     for _ in range(2):
         samples = [sample for family in collector.collect() for sample in family.samples]
     counts = {sample.labels["state"]: sample.value for sample in samples if sample.name == "daedalus_actors"}

@@ -18,7 +18,8 @@ def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(
     settings = [word for each in sizes for word in ("--set", each)]
     words = ("learner", "--env", "slow_environment:Slow-v0", "--env-steps", 900, "--listen", address, *settings)
     learner = start(*words, "--run-dir", "run", "--resume")
-    actors = [start("actor", "--connect", address, "--name", name) for name in ("a", "b")]
+    allow = ("--allow-module", "slow_environment")
+    actors = [start("actor", "--connect", address, "--name", name, *allow) for name in ("a", "b")]
     learner.expect(r"updates .*/s")
     learner.process.terminate()
     assert learner.wait() == 0, learner.output
