@@ -155,7 +155,7 @@ def _open_transport(
     return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
-def _how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
+def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
     """Return the command of an actor, with the other addresses that it may use."""
     address, *others = reachable(listening, credentials.hosts() if credentials else ())
     tls = ["--tls", "DIR"] if credentials else []
@@ -168,7 +168,7 @@ def _announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Creden
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        _logger.info("actors join with: %s", _how_to_join(_addresses(arguments), credentials, spec))
+        _logger.info("actors join with: %s", how_to_join(_addresses(arguments), credentials, spec))
 
 
 def _train(
