@@ -14,6 +14,7 @@ Actor-critic reinforcement learning with one learner and any number of actors, o
 on this machine:
   train      start a learner and actors, show their progress, evaluate the result
   resume     continue a run from its newest checkpoint
+  check      play an environment with random actions, and report its faults, its speed and what train would choose
 
 on several machines, one process at a time:
   learner    own the weights, and train them on the rollouts of actors
@@ -74,6 +75,12 @@ def _resume(arguments: list[str]) -> int:
     return resume(arguments)
 
 
+def _check(arguments: list[str]) -> int:
+    from daedalus.cli.commands.check import check
+
+    return check(arguments)
+
+
 def _status(arguments: list[str]) -> int:
     from daedalus.cli.commands.status import status
 
@@ -113,6 +120,7 @@ def _completion(arguments: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
+    "check": _check,
     "router": _router,
     "status": _status,
     "exporter": _exporter,

@@ -27,6 +27,7 @@ from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
@@ -67,6 +68,7 @@ class LearnerService:
         started: float,
         restored: "Checkpoint | None" = None,
         initial: SavedPolicy | None = None,
+        spaces: Spaces | None = None,
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
@@ -82,6 +84,7 @@ class LearnerService:
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
           initial: policy of another run whose weights to begin with, unless there is a checkpoint to continue from.
+          spaces: spaces that all actors must have, if they are known; those of a checkpoint have precedence.
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
         """
@@ -107,7 +110,7 @@ class LearnerService:
             self._status,
             learner_epoch=epoch,
             start_version=restored.policy.policy_version if restored else 0,
-            spaces=restored.policy.spaces if restored else None,
+            spaces=restored.policy.spaces if restored else spaces,
         )
         self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
@@ -134,10 +137,11 @@ class LearnerService:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop, self._heartbeat.beat)
-            if spaces is None:
-                _logger.info("stopped before the first actor joined")
-                return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
+            fleet = self._server.fleet
+            if fleet.spaces is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+                return _stopped_without_actors()
+            spaces = fleet.spaces
+            assert spaces is not None
             learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy
@@ -152,6 +156,8 @@ class LearnerService:
             checkpointer = self._checkpointer(learner)
             if self._initial is not None:
                 checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
+            if self._restored is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+                return _stopped_without_actors()
             return self._learn(learner, checkpointer)
         finally:
             self._server.close(_STOPPED)  # unless it is closed
@@ -259,6 +265,11 @@ class LearnerService:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
             _logger.warning("summary not written: %s", error.strerror)
+
+
+def _stopped_without_actors() -> Outcome:
+    _logger.info("stopped before the first actor joined")
+    return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
 
 
 def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:

@@ -25,6 +25,7 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
+from daedalus.cli.quick_check import expected_spaces
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -42,6 +43,7 @@ from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
@@ -110,6 +112,9 @@ def _serve(
         _logger.info("nothing to do: %s", finished.reason)
         return NOT_REACHED if finished.missed else REACHED
     restored = _newest_checkpoint(run.directory) if resumed else None
+    spaces = arguments.spaces
+    if restored is None and arguments.prepared is None:
+        spaces = expected_spaces(run.spec, run.modules, stop)
     initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
@@ -122,7 +127,7 @@ def _serve(
         run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments, credentials)
-        outcome = _train(run, transport, stop, progress, started, restored, initial, credentials)
+        outcome = _train(run, transport, stop, progress, started, restored, initial, spaces, credentials)
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)
@@ -179,6 +184,7 @@ def _train(
     started: float,
     restored: "Checkpoint | None",
     initial: SavedPolicy | None,
+    spaces: Spaces | None,
     credentials: Credentials | None,
 ) -> Outcome:
     """Run the learner to its end."""
@@ -193,6 +199,7 @@ def _train(
         started=started,
         restored=restored,
         initial=initial,
+        spaces=spaces,
         modules=run.modules,
         certificate_days_left=lambda: certificate_days_left(credentials),
     )

@@ -11,18 +11,21 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
-from daedalus.cli.settings_arguments import add_settings, resolve
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
+from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
 from daedalus.learner.run.finished import FinishedRun, finished_run
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
     UserModules,
     allow_settings,
 )
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 
@@ -66,31 +69,35 @@ def train(arguments: list[str]) -> int:
     """Run `daedalus train` and return its exit status."""
     started = process_started()
     parsed = train_parser().parse_args(arguments)
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
+        if parsed.run_dir is not None:
+            run_directory.check_free(directory)  # before the environment is made
+        spaces = checked_spaces(spec, fork=True)
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
-    except RunInUseError as error:
+    except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stopped")
         return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
     with lock:
-        return _run(lock, spec, parsed, started, resume=False)
+        return _run(lock, spec, parsed, started, resume=False, spaces=spaces)
 
 
 def resume(arguments: list[str]) -> int:
     """Run `daedalus resume` and return its exit status."""
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     try:
         _check_listening(parsed)
-        spec = run_directory.read_config(parsed.directory)
-        source = str(parsed.directory / run_directory.CONFIG)
-        UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
-        budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
-        spec = with_changes(spec, [*parsed.set, *budget], parsed.directory)
+        spec = _resumed_spec(parsed)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
         print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
@@ -106,14 +113,29 @@ def resume(arguments: list[str]) -> int:
         if finished is not None and not finished.to_evaluate:
             print(f"nothing to do: {finished.reason}")
             return _MISSED if finished.missed else 0
+        try:
+            spaces = None if checkpoints(parsed.directory) else checked_spaces(spec, fork=True)
+        except EnvironmentProblemError as error:
+            print(f"daedalus resume: {error}", file=sys.stderr)
+            return 1
         run_directory.write_config(parsed.directory, spec)
-        return _run(lock, spec, parsed, started, resume=True, finished=finished)
+        return _run(lock, spec, parsed, started, resume=True, spaces=spaces, finished=finished)
+
+
+def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
+    """Return the specification of a run with the changes of the command line. Raises SettingsError, UserModuleError."""
+    spec = run_directory.read_config(parsed.directory)
+    source = str(parsed.directory / run_directory.CONFIG)
+    UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
+    budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
+    return with_changes(spec, [*parsed.set, *budget], parsed.directory)
 
 
 def train_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus train`."""
     options = command_parser("train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
+    add_new_run(options)
     _add_machine_options(options)
     return options
 
@@ -158,6 +180,7 @@ def _run(
     started: float,
     *,
     resume: bool,
+    spaces: Spaces | None = None,
     finished: FinishedRun | None = None,
 ) -> int:
     """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
@@ -167,6 +190,7 @@ def _run(
         spec=spec,
         started=started,
         lock=lock.inheritable,
+        spaces=spaces,
         init_from=None if resume else parsed.init_from,
         resume=resume,
         trained=None if finished is None else _MISSED if finished.missed else 0,
@@ -176,7 +200,6 @@ def _run(
         log_level=parsed.log_level,
         log_json=parsed.log_json,
     )
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
     try:
         with output:
