@@ -96,6 +96,13 @@ def _flags(name: str, mask: np.ndarray, space: DiscreteSpace | None) -> np.ndarr
     return flat.astype(np.bool_)
 
 
+def only_of_masks(action_mask: Any) -> Any:
+    """Return the only mask, or map of masks, of a batch of one."""
+    if isinstance(action_mask, dict):
+        return {name: mask[0] for name, mask in action_mask.items()}
+    return action_mask[0]
+
+
 def mask_of_one(action_mask: Any) -> Any:
     """Return a mask, or a map of masks, with a first axis of 1."""
     if isinstance(action_mask, dict):

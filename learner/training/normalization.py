@@ -11,6 +11,7 @@ from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.protocol.messages import Rollout, RolloutIdentity
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
+_LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 _MAX_STREAMS = 4096  # actors whose running returns are kept
 
 
@@ -56,6 +57,14 @@ class ObservationStatistics:
             name: RunningMoments(tuple(mean.shape))
             for name, mean in zip(normalizer.names, normalizer.means, strict=True)
         }
+
+    def take_from_network(self) -> None:
+        """Continue from the normaliser's statistics, which came with weights, as if they were of many observations."""
+        for name, moments in self.moments.items():
+            mean, variance = self._normalizer.statistics(name)
+            moments.mean.copy_(mean)
+            moments.squares.copy_(variance * _LOADED_COUNT)
+            moments.count.fill_(_LOADED_COUNT)
 
     def add(self, batch: Batch) -> None:
         """Add the observations of the valid rows, and set the normaliser's statistics.

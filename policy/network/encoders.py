@@ -111,10 +111,23 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
     return CompositeEncoder(images, {name: space for name, space in spaces.items() if name not in images}, spec)
 
 
+def encoder_names(spec: PolicySpec, spaces: ObservationSpaces) -> str:
+    """Return the names of the encoders that `build_encoder` makes, such as `nature and mlp`."""
+    if ":" in spec.encoder or spec.encoder == "mlp":
+        return spec.encoder
+    images = [space for space in spaces.values() if isinstance(space, ArraySpace) and space.is_image]
+    names = [_image_encoder_name(spec.encoder, space) for space in images]
+    return " and ".join(dict.fromkeys([*names, *(["mlp"] if len(images) < len(spaces) else [])]))
+
+
+def _image_encoder_name(name: str, space: ArraySpace) -> str:
+    if name != "auto":
+        return name
+    return "nature" if min(sorted(space.shape)[-2:]) >= _SMALLEST_FOR_NATURE else "impala"
+
+
 def _image_encoder(name: str, space: ArraySpace) -> ImageEncoder:
-    if name == "auto":
-        name = "nature" if min(sorted(space.shape)[-2:]) >= _SMALLEST_FOR_NATURE else "impala"
-    match name:
+    match _image_encoder_name(name, space):
         case "nature":
             return nature(space)
         case "small":

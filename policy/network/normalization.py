@@ -37,6 +37,11 @@ class ObservationNormalizer(nn.Module):
             normalized[name] = ((observations[name].to(torch.float32) - mean) * scale).clamp(-_LARGEST, _LARGEST)
         return normalized
 
+    def statistics(self, name: str) -> tuple[Tensor, Tensor]:
+        """Return mean and variance [*stacked_shape] of one component."""
+        index = self._names.index(name)
+        return self.means[index].detach(), self.scales[index].detach().square().reciprocal() - _SMALLEST_VARIANCE
+
     @torch.no_grad()
     def set_statistics(self, name: str, mean: Tensor, variance: Tensor) -> None:
         """Set the statistics of one component: mean and variance [*stacked_shape]."""
