@@ -42,7 +42,7 @@ def test_a_foreign_join_that_comes_first_is_refused_and_leaves_no_trace(tmp_path
         until(lambda: client.query(keys.program("run", "*"), timeout=1.0))
         # The policy is ready before an actor joins.
         until(lambda: isinstance(ask(keys.program("run", "*")), Program))
-        foreign = SPACES.model_copy(update={"observation": ArraySpace(shape=(5,), dtype="float32")})
+        foreign = SPACES.model_copy(update={"observations": {"observation": ArraySpace(shape=(5,), dtype="float32")}})
         refusal = ask(
             keys.join("run", "stranger"), encode(Join(actor="stranger", incarnation=1, spaces=foreign, environments=1))
         )
