@@ -51,6 +51,23 @@ def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
     return report.spaces
 
 
+def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *, fork: bool = False) -> Spaces | None:
+    """Return the spaces after the transforms of `spec`; `spaces` are those with the transforms of `before`.
+
+    Raises EnvironmentProblemError.
+    """
+    if spec.environment == before.environment or spaces is None:
+        return spaces
+    try:
+        modules = UserModules(frozenset(modules_of(spec.user_modules)))
+        report = quick_check(spec.environment, modules, play=False, fork=fork)
+    except CheckTimeoutError:
+        return None
+    if report.problems:
+        raise EnvironmentProblemError(report.problems[0])
+    return report.spaces
+
+
 def expected_spaces(spec: RunSpec, modules: UserModules, stop: threading.Event) -> Spaces | None:
     """Return the spaces of a run's environment, or None where it cannot be made. Only makes the environment.
 

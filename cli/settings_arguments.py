@@ -1,6 +1,8 @@
 """Options of a run's settings, which `daedalus train` and `daedalus learner` share, and the options of the learner."""
 
 import argparse
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +10,7 @@ from typing import Any
 from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS
@@ -82,53 +85,70 @@ def add_new_run(options: argparse.ArgumentParser) -> None:
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
 
 
-def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
-    """Return the specification and the run directory that the arguments define. Raises SettingsError."""
-    spec = resolve_spec(arguments)
+def resolve(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> tuple[RunSpec, Path]:
+    """Return the specification and the run directory that the arguments define. Raises SettingsError.
+
+    `defaults` are the settings that --env begins with; None: those for spaces that are not known.
+    """
+    spec = resolve_spec(arguments, defaults)
     return spec, arguments.run_dir or named_directory(arguments.preset, spec)
 
 
-def resolve_spec(arguments: argparse.Namespace) -> RunSpec:
-    """Return the specification that the arguments define. Raises SettingsError."""
-    settings = chosen_settings(
-        arguments.preset,
-        arguments.env,
-        arguments.algorithm,
+def resolve_spec(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> RunSpec:
+    """Return the specification that the arguments define. See resolve."""
+    chosen = Choice(
+        preset=arguments.preset,
+        env=arguments.env,
+        algorithm=arguments.algorithm,
         seed=arguments.seed,
         env_steps=arguments.env_steps,
         actors=arguments.actors,
         wrap=arguments.wrap,
     )
-    override(settings, arguments.set)
-    check_environment(arguments.env, settings)
-    return run_spec(settings)
+    return chosen.spec(lambda settings: override(settings, arguments.set), defaults)
 
 
-def chosen_settings(
-    preset: str | None,
-    env: str | None,
-    algorithm: str | None,
-    *,
-    seed: int | None,
-    env_steps: int | None,
-    actors: int | None,
-    wrap: str | None,
-) -> dict[str, Any]:
-    """Return the settings of a preset or an environment with the most used settings applied. Raises SettingsError."""
-    if (preset is None) == (env is None):
-        raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
-    settings: dict[str, Any] = {"environment": {"id": env}} if preset is None else read_preset(preset)
-    choose_algorithm(settings, algorithm)
-    shortcuts = {
-        ("training", "seed"): seed,
-        ("training", "env_steps"): env_steps,
-        ("collection", "actors"): actors,
-        ("environment", "wrap"): wrap,
-    }
-    for (section, key), value in shortcuts.items():
-        if value is not None:
-            settings.setdefault(section, {})[key] = value
-    return settings
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """A preset or an environment, and the most used settings, as a user chose them; None: not chosen."""
+
+    preset: str | None
+    env: str | None
+    algorithm: str | None
+    seed: int | None
+    env_steps: int | None
+    actors: int | None
+    wrap: str | None
+
+    def spec(self, change: Callable[[dict[str, Any]], None], defaults: dict[str, Any] | None = None) -> RunSpec:
+        """Return the specification.
+
+        Args:
+          change: applies further settings, in place.
+          defaults: settings that an environment begins with; None: those for spaces that are not known.
+
+        Raises SettingsError.
+        """
+        if (self.preset is None) == (self.env is None):
+            raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
+        if self.preset is not None:
+            settings = read_preset(self.preset)
+        else:
+            settings = default_settings(None) if defaults is None else copy.deepcopy(defaults)
+            settings.setdefault("environment", {})["id"] = self.env
+        choose_algorithm(settings, self.algorithm)
+        shortcuts = {
+            ("training", "seed"): self.seed,
+            ("training", "env_steps"): self.env_steps,
+            ("collection", "actors"): self.actors,
+            ("environment", "wrap"): self.wrap,
+        }
+        for (section, key), value in shortcuts.items():
+            if value is not None:
+                settings.setdefault(section, {})[key] = value
+        change(settings)
+        check_environment(self.env, settings)
+        return run_spec(settings)
 
 
 def check_environment(env: str | None, settings: dict[str, Any]) -> None:
@@ -170,7 +190,8 @@ def choose_run(arguments: argparse.Namespace) -> ChosenRun:
         run_directory.check_free(directory)
     else:
         spec = run_directory.read_config(directory)
-        if named and resolve(arguments)[0] != spec:
+        # The settings that --env begins with depend on the environment, which need not be made for this.
+        if named and resolve_spec(arguments, spec.model_dump(mode="json", exclude_none=True)) != spec:
             raise SettingsError(
                 f"the run in {directory} has other settings: leave out PRESET, --env and all settings to continue it, "
                 "or name another --run-dir"

@@ -8,15 +8,17 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
-from daedalus.cli.settings_arguments import check_environment, chosen_settings, named_directory
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
+from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.settings import SettingsError, assign, run_spec
+from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -83,17 +85,17 @@ def train(
     Raises SettingsError for invalid settings, TrainingError if a process failed.
     """
     started = time.monotonic()
-    chosen = chosen_settings(preset, env, algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap)
-    for path, value in (settings or {}).items():
-        try:
-            assign(chosen, path, value)
-        except SettingsError as error:
-            raise SettingsError(f"settings {path!r}: {error}") from None
-    check_environment(env, chosen)
-    spec = run_spec(chosen)
+    choice = Choice(
+        preset=preset, env=env, algorithm=algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap
+    )
+    spec = choice.spec(partial(_assign, changes=settings or {}))
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     run_directory.check_free(directory)  # before the environment is made
     spaces = _checked_spaces(spec, quiet)
+    if env is not None:
+        chosen = choice.spec(partial(_assign, changes=settings or {}), default_settings(spaces))
+        spaces, spec = _transformed_spaces(chosen, spec, spaces), chosen
+        directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     weights = None if init_from is None else Path(init_from)
     with run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock:
         run = LocalRun(
@@ -106,6 +108,21 @@ def train(
         )
         end = _run(run, quiet)
     return _result(lock.directory, end)
+
+
+def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    for path, value in changes.items():
+        try:
+            assign(settings, path, value)
+        except SettingsError as error:
+            raise SettingsError(f"settings {path!r}: {error}") from None
+
+
+def _transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None) -> Spaces | None:
+    try:
+        return transformed_spaces(spec, before, spaces)
+    except EnvironmentProblemError as error:
+        raise TrainingError(str(error)) from None
 
 
 def _checked_spaces(spec: RunSpec, quiet: bool) -> Spaces | None:

@@ -13,6 +13,7 @@ from daedalus.actor.checking.play import check_environment
 from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
+from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spec import RunSpec
@@ -66,6 +67,8 @@ def check(arguments: list[str]) -> int:
             environment = spec.environment
             report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
             notes = () if report.problems else gymnasium_notes(environment, modules)
+            if parsed.env is not None:
+                spec = resolve_spec(parsed, default_settings(report.spaces))
             network = _network(spec, report, modules)
     except KeyboardInterrupt:
         print("daedalus check: stopped", file=sys.stderr)

@@ -309,7 +309,9 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
 
 def test_rollout_of_exactly_64_mib_is_not_refused() -> None:
     """(6 + 2) x 4,096 x (2,019 + 27) bytes, and 64 KiB."""
-    spaces = SPACES.model_copy(update={"observation": ArraySpace(shape=(2019,), dtype="uint8", frames=2)})
+    spaces = SPACES.model_copy(
+        update={"observations": {"observation": ArraySpace(shape=(2019,), dtype="uint8", frames=2)}}
+    )
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=4096, spaces=spaces))
     verdict = intake.read("a", b"no message")
     assert isinstance(verdict, Rejected)

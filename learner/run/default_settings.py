@@ -1,0 +1,43 @@
+"""Default settings of an environment without a preset, chosen by its spaces and by nothing else about it."""
+
+import importlib.resources
+import tomllib
+from typing import Any, Literal
+
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
+
+Kind = Literal["vectors_discrete", "vectors_continuous", "images", "large_images"]
+_UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not known
+_LARGE = 128  # pixels of the longer side
+
+
+def default_settings(spaces: Spaces | None) -> dict[str, Any]:
+    """Return the default settings for the spaces of an environment, as a preset has them.
+
+    Args:
+      spaces: of the environment without transforms; None if they are not known.
+    """
+    kind = _UNKNOWN if spaces is None else kind_of(spaces)
+    file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
+    settings = tomllib.loads(file.read_text("utf-8"))
+    if kind == "large_images" and spaces is not None and not all(map(_has_colours, _images(spaces))):
+        del settings["environment"]["grey"]
+    return settings
+
+
+def kind_of(spaces: Spaces) -> Kind:
+    """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only."""
+    images = _images(spaces)
+    if images:
+        return "large_images" if any(max(space.shape) > _LARGE for space in images) else "images"
+    if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
+        return "vectors_continuous"
+    return "vectors_discrete"
+
+
+def _images(spaces: Spaces) -> list[ArraySpace]:
+    return [space for space in spaces.observations.values() if isinstance(space, ArraySpace) and space.is_image]
+
+
+def _has_colours(space: ArraySpace) -> bool:
+    return len(space.shape) == 3 and space.shape[-1] == 3

@@ -1,0 +1,1 @@
+"""Default settings for each kind of spaces, for environments without a preset."""
