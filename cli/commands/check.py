@@ -16,6 +16,7 @@ from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
 _DESCRIPTION = """\
@@ -69,7 +70,10 @@ def check(arguments: list[str]) -> int:
             notes = () if report.problems else gymnasium_notes(environment, modules)
             if parsed.env is not None:
                 spec = resolve_spec(parsed, default_settings(report.spaces))
-            network = _network(spec, report, modules)
+            spaces = report.spaces
+            if spec.environment != environment:
+                spaces = check_environment(spec.environment, modules, seconds=0.0, env_steps=0).spaces
+            network = _network(spec, spaces, modules)
     except KeyboardInterrupt:
         print("daedalus check: stopped", file=sys.stderr)
         return 1
@@ -120,19 +124,19 @@ def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     return [text for text in (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1)) if text]
 
 
-def _network(spec: RunSpec, report: EnvironmentReport, modules: UserModules) -> tuple[str, str]:
+def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:
     """Return a description of the network and an empty string, or an empty string and why it cannot be built."""
-    if report.spaces is None:
+    if spaces is None:
         return "", ""
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
     from daedalus.policy.network.errors import NetworkError
 
     try:
-        network = ActorCritic(spec.policy, report.spaces, modules)
+        network = ActorCritic(spec.policy, spaces, modules)
     except NetworkError as error:
         return "", str(error)
     memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"
     parameters = sum(parameter.numel() for parameter in network.parameters())
-    encoder = encoder_names(spec.policy, report.spaces.observations)
+    encoder = encoder_names(spec.policy, spaces.observations)
     return f"encoder {encoder}{memory}, {parameters:,} parameters", ""

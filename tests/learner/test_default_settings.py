@@ -1,0 +1,59 @@
+"""learner/run/default_settings.py: which settings an environment gets by its spaces."""
+
+from typing import Any
+
+import pytest
+
+from daedalus.learner.run.default_settings import default_settings, kind_of
+from daedalus.learner.run.settings import run_spec
+from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+
+VECTOR = ArraySpace(shape=(17,), dtype="float32")
+CHOICES, JOINTS = DiscreteSpace(counts=(4,)), ContinuousSpace(low=(-1.0,), high=(1.0,))
+
+
+def spaces(action: ActionSpace, *observations: ArraySpace | DiscreteSpace) -> Spaces:
+    return Spaces(observations={str(index): space for index, space in enumerate(observations)}, actions={"a": action})
+
+
+def image(*shape: int) -> ArraySpace:
+    return ArraySpace(shape=shape, dtype="uint8")
+
+
+@pytest.mark.parametrize(
+    ("where", "kind"),
+    [
+        (spaces(CHOICES, VECTOR), "vectors_discrete"),
+        (spaces(CHOICES, DiscreteSpace(counts=(500,))), "vectors_discrete"),
+        (spaces(CHOICES, image(7, 7, 3)), "vectors_discrete"),
+        (spaces(JOINTS, VECTOR), "vectors_continuous"),
+        (spaces(JOINTS, VECTOR, image(96, 96, 3)), "images"),
+        (spaces(CHOICES, image(128, 96)), "images"),
+        (spaces(CHOICES, image(210, 160, 3)), "large_images"),
+    ],
+)
+def test_kind_follows_the_spaces(where: Spaces, kind: str) -> None:
+    assert kind_of(where) == kind
+
+
+def test_a_discrete_and_a_continuous_component_make_a_continuous_action() -> None:
+    where = Spaces(observations={"o": VECTOR}, actions={"a": CHOICES, "b": JOINTS})
+    assert kind_of(where) == "vectors_continuous"
+
+
+@pytest.mark.parametrize(
+    "where", [None, spaces(CHOICES, VECTOR), spaces(JOINTS, VECTOR), spaces(CHOICES, image(96, 96, 3))]
+)
+def test_default_settings_are_valid(where: Spaces | None) -> None:
+    settings: dict[str, Any] = default_settings(where)
+    settings.setdefault("environment", {})["id"] = "Any-v0"
+    spec = run_spec(settings)
+    assert spec.training.normalize_rewards
+    assert spec.training.target_return is None
+
+
+@pytest.mark.parametrize(("shape", "grey"), [((210, 160, 3), True), ((210, 160), False), ((210, 160, 1), False)])
+def test_only_images_with_colours_are_made_grey(shape: tuple[int, ...], grey: bool) -> None:
+    environment = default_settings(spaces(CHOICES, image(*shape)))["environment"]
+    assert environment.get("grey", False) is grey
+    assert environment["resize"] == [84, 84]
