@@ -228,7 +228,14 @@ def make_gymnasium(
             f"environment {spec.id} has autoreset mode {environment.metadata.get('autoreset_mode')}: "
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
-    return GymnasiumEnvironments(environment)
+    try:
+        return GymnasiumEnvironments(environment)
+    except EnvironmentSetupError:
+        environment.close()
+        raise
+    except Exception as error:  # broad: as above
+        environment.close()
+        raise EnvironmentSetupError(f"environment {spec.id} cannot be reset: {first_line(error)}") from error
 
 
 def make_single(spec: EnvironmentSpec, modules: UserModules) -> gymnasium.Env | None:

@@ -15,10 +15,11 @@ from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
-_ROW_BYTES = 27  # per environment and row, without the observation, rounded up
+# Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
+_ROW_BYTES, _INTEGER_BYTES = 23, 8
 _SLACK_BYTES = 64 << 10
 _OTHER_ARRAYS = 16  # besides observations, actions, masks and scalars of info
 # Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
@@ -173,7 +174,8 @@ class Intake:
     def _limits(self, spaces: Spaces, environments: int) -> Limits:
         """Return the size limits of a rollout, from the specification and the actor's number of environments."""
         row = _ROW_BYTES + sum(spaces.masks.values())
-        row += sum(space.size * np.dtype(space.dtype).itemsize for space in spaces.actions.values())
+        for space in spaces.actions.values():
+            row += space.size * (_INTEGER_BYTES if isinstance(space, DiscreteSpace) else 4)
         rows = self._spec.collection.rollout_length
         size = rows * row + 4 * self.state_size
         for space in spaces.observations.values():

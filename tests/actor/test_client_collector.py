@@ -113,7 +113,7 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
         found.append(take(client))
         for name in Rollout.__dataclass_fields__:
             left, right = getattr(found[-1], name), getattr(expected, name)
-            assert np.array_equal(left, right), (version, name, left, right)
+            np.testing.assert_equal(left, right, f"{name} of version {version}")
     assert sum(len(rollout.episode_returns) for rollout in found) > 5
     collector.close()
 

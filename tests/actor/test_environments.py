@@ -125,7 +125,10 @@ class _Telling(gymnasium.Env):
     """An environment whose observation is a text."""
 
     observation_space = gymnasium.spaces.Text(8)
-    action_space = gymnasium.spaces.Discrete(2)
+    action_space = gymnasium.spaces.Box(-1, 1)
+
+    def reset(self, *, seed=None, options=None):
+        return "", {}
 
 
 def test_unsupported_observation_space_is_named() -> None:

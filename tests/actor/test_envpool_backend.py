@@ -220,7 +220,6 @@ def test_every_seed_is_accepted_and_determines_the_episodes() -> None:
         ),
         (_spec("CartPole-v1", kwargs={"num_threads": 4}), "names num_threads, but other settings"),
         (_spec("Pong-v5", kwargs={"stack_num": 4, "frame_skip": 2}), "names frame_skip and stack_num"),
-        (_spec("Pendulum-v1"), "environment.action_table"),
     ],
 )
 def test_setup_error_is_one_line(spec: EnvironmentSpec, reason: str) -> None:

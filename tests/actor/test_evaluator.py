@@ -6,9 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from log_lines import LINES
+from plain import NAME
 from processes import LIMIT
 from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_spec
 
+from daedalus.actor.environments.interface import Observed, Step
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol.messages import (
     Join,
@@ -181,14 +183,14 @@ class Endless:
         self.seeds: list[int] = []
         self.playing, self.closed = threading.Event(), threading.Event()
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, seed: int) -> Observed:
         self.seeds.append(seed)
-        return np.zeros((2, 2), np.float32)
+        return Observed({NAME: np.zeros((2, 2), np.float32)}, {})
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: dict[str, np.ndarray]) -> Step:
         self.playing.set()
-        over = np.full(2, self.over)
-        return np.zeros((2, 2), np.float32), np.zeros(2), over, np.zeros(2, np.bool_)
+        observed = Observed({NAME: np.zeros((2, 2), np.float32)}, {})
+        return observed, np.zeros(2), np.full(2, self.over), np.zeros(2, np.bool_)
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         return {}

@@ -18,6 +18,7 @@ from building import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain import plain
 
 from daedalus.learner.reporting.report import episode_statistics
 from daedalus.learner.run.counters import RunCounters
@@ -28,7 +29,8 @@ from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 CELLS = (ROWS, ENVIRONMENTS)
-POLICIES = (POLICY, RECURRENT, PolicySpec(hidden=(8,), activation="relu"))
+NORMALIZED = PolicySpec(hidden=(8,), activation="relu", normalize_observations=True)
+POLICIES = (POLICY, RECURRENT, PolicySpec(hidden=(8,), activation="relu"), NORMALIZED)
 # The bounds of the intake, numbers around them, and the ends of float32.
 NUMBERS = [0.0, -0.0, 1e-45, 1.0, -1.0, 1e-4, 1e6, -1e6, 1e9, -1e9, 1e15, -1e15, 1e20, 3.4e38, -3.4e38]
 SPECIAL = [np.nan, np.inf, -np.inf]
@@ -36,27 +38,27 @@ BOUNDS = {"frames": 1e15, "initial_state": 1.0, "behaviour_log_probs": 1e6, "rew
 
 
 @st.composite
-def arrays(draw: st.DrawFn, name: str, plain: np.ndarray) -> np.ndarray:
-    """Return a plain array, an array of one extreme number, or a plain array with some; mostly within the bounds."""
+def arrays(draw: st.DrawFn, name: str, honest: np.ndarray) -> np.ndarray:
+    """Return an honest array, one extreme number everywhere, or some in an honest array; mostly within the bounds."""
     within = [number for number in NUMBERS if abs(number) <= BOUNDS[name]]
     if name == "behaviour_log_probs":
         within = [-abs(number) for number in within]
     number = st.sampled_from(within if draw(st.integers(0, 9)) else NUMBERS + SPECIAL)
-    kind = draw(st.sampled_from(["plain", "one", "some"]))
+    kind = draw(st.sampled_from(["honest", "one", "some"]))
     if kind == "one":
-        return np.full_like(plain, draw(number))
-    array = plain.copy()
+        return np.full_like(honest, draw(number))
+    array = honest.copy()
     for _ in range(draw(st.integers(1, 4)) if array.size and kind == "some" else 0):
         array.flat[draw(st.integers(0, array.size - 1))] = draw(number)
     return array
 
 
 @st.composite
-def episodes(draw: st.DrawFn, plain: Rollout) -> dict[str, np.ndarray]:
+def episodes(draw: st.DrawFn, honest: Rollout) -> dict[str, np.ndarray]:
     """Return ends, valid rows, returns and lengths: mostly of a right kind."""
-    kind = draw(st.sampled_from(["plain", "none", "alternating", "random"]))
-    if kind == "plain":
-        terminated, truncated, valid = plain.terminated, plain.truncated, plain.valid
+    kind = draw(st.sampled_from(["honest", "none", "alternating", "random"]))
+    if kind == "honest":
+        terminated, truncated, valid = honest.terminated, honest.truncated, honest.valid
     elif kind == "random":
         bits = np.array(draw(st.lists(st.booleans(), min_size=3 * 18, max_size=3 * 18)), np.bool_)
         terminated, truncated, valid = bits.reshape(3, *CELLS)
@@ -80,14 +82,14 @@ def episodes(draw: st.DrawFn, plain: Rollout) -> dict[str, np.ndarray]:
 
 @st.composite
 def hostile(draw: st.DrawFn, sequence: int, state_size: int) -> Rollout:
-    plain = make_rollout(seed=sequence, state_size=state_size)
+    honest = make_rollout(seed=sequence, state_size=state_size)
     content: dict[str, Any] = {
-        name: draw(arrays(name, getattr(plain, name)))
-        for name in ("frames", "initial_state", "behaviour_log_probs", "rewards")
+        name: draw(arrays(name, getattr(honest, name))) for name in ("initial_state", "behaviour_log_probs", "rewards")
     }
+    content["frames"] = draw(arrays("frames", plain(honest.frames)))
     actions = np.full(CELLS, draw(st.sampled_from([0, 3, 4, -1, 2**63 - 1])), np.int64)
-    content["actions"] = draw(st.sampled_from([plain.actions, plain.actions, plain.actions, actions]))
-    content |= draw(episodes(plain))
+    content["actions"] = draw(st.sampled_from([honest.actions, honest.actions, honest.actions, actions]))
+    content |= draw(episodes(honest))
     if len(content["episode_returns"]):
         number = draw(st.sampled_from([None, 1.0, 3.4e38, -3.4e38]))
         content["episode_info"] = {} if number is None else {"x": np.full(1, number, np.float32)}
@@ -102,6 +104,7 @@ def test_extreme_rollouts_do_not_break_the_learner(data: st.DataObject) -> None:
     optimizer = data.draw(st.sampled_from(["adam", "rmsprop"]))
     normalize = data.draw(st.booleans())
     training = {"algorithm": algorithm, "optimizer": optimizer, "normalize_advantages": normalize}
+    training["normalize_rewards"] = data.draw(st.booleans())
     learner = Learner(TrainingSpec.model_validate({**training, "passes": 2, "minibatches": 2}), policy, SPACES)
     counters = RunCounters(10)
     for sequence in range(4):

@@ -115,9 +115,9 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 
 def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
-    weights = {str(number): np.zeros(1, np.float32) for number in range(33)}
+    weights = {str(number): np.zeros(1, np.float32) for number in range(36)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    assert_rejected(harness, data, "malformed", "33 arrays, the limit is 32")
+    assert_rejected(harness, data, "malformed", "36 arrays, the limit is 35")
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -284,7 +284,7 @@ def test_frames_with_environment_first_memory_layout_are_decoded_equally() -> No
 def test_frames_with_wrong_stack_or_size_are_rejected(frames: np.ndarray) -> None:
     verdict = stacked_harness().receive(encode(good(frames=frames)))
     assert isinstance(verdict, Rejected)
-    assert ("the limit is" if verdict.cause == "malformed" else "frames are uint8") in verdict.reason
+    assert ("the limit is" if verdict.cause == "malformed" else "frames/observation is uint8") in verdict.reason
 
 
 def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_frames() -> None:
@@ -308,10 +308,8 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
 
 
 def test_rollout_of_exactly_64_mib_is_not_refused() -> None:
-    """(6 + 2) x 4,096 x (2,019 + 27) bytes, and 64 KiB."""
-    spaces = SPACES.model_copy(
-        update={"observations": {"observation": ArraySpace(shape=(2019,), dtype="uint8", frames=2)}}
-    )
+    """4,096 x (6 x 31 + (6 + 3) x 1,798) bytes, and 64 KiB."""
+    spaces = plain_spaces(ArraySpace(shape=(1798,), dtype="uint8", frames=3), 4)
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=4096, spaces=spaces))
     verdict = intake.read("a", b"no message")
     assert isinstance(verdict, Rejected)
@@ -329,9 +327,9 @@ def test_message_as_large_as_the_queue_is_not_refused() -> None:
 
 
 def test_size_limit_is_the_documented_one() -> None:
-    """(T + k) E (frame bytes + 27) + 4 E S + 64 KiB, and the header: docs/wire.md."""
+    """E (T (23 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
     harness = stacked_harness(state_size=7)
-    limit = (ROWS + 4) * ENVIRONMENTS * (60 * 80 * 3 + 27) + 4 * ENVIRONMENTS * 7 + (64 << 10)
+    limit = ENVIRONMENTS * (ROWS * (23 + 8) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
     message = Limits(max_bytes=limit).message_bytes
     assert harness.intake.refuse_size("a", message) is None
     refused = harness.intake.refuse_size("a", message + 1)
@@ -352,7 +350,7 @@ def test_rollouts_of_too_many_environments_are_refused_before_they_are_decoded(
     shape: tuple[int, ...], environments: int, refused: bool
 ) -> None:
     """4,096 environments of zeros compress to nothing, and would take gigabytes."""
-    spaces = SPACES.model_copy(update={"observation": STACKED.model_copy(update={"shape": shape})})
+    spaces = plain_spaces(STACKED.model_copy(update={"shape": shape}), 4)
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=environments, spaces=spaces))
     verdict = intake.read("a", b"no message")
     assert isinstance(verdict, Rejected)
@@ -551,7 +549,7 @@ def test_rows_that_break_the_reset_rule_are_rejected_as_unfit(
     ("name", "largest", "reason"),
     [
         ("rewards", 1e9, "rewards has a value beyond +-1e+09: set environment.reward_scale"),
-        ("frames", 1e15, "frames has a value beyond +-1e+15: scale or clip the observations"),
+        ("frames", 1e15, "frames/observation has a value beyond +-1e+15: scale or clip the observations"),
         ("behaviour_log_probs", 1e6, "behaviour_log_probs has a value beyond +-1e+06"),
     ],
 )

@@ -119,7 +119,7 @@ def test_unknown_setting_error_suggests_similar_names() -> None:
 
 
 def test_unknown_setting_error_lists_the_section_when_none_is_similar() -> None:
-    assert "the settings are activation, encoder, hidden" in error_message("policy.zzz=1")
+    assert "the settings are activation, distribution, encoder, hidden" in error_message("policy.zzz=1")
 
 
 @pytest.mark.parametrize(
