@@ -18,20 +18,34 @@ class CustomEncoder(nn.Module):
     def __init__(self, name: str, space: ArraySpace, modules: UserModules) -> None:
         """Raise NetworkError, naming the encoder, if it may not be imported, or cannot be constructed or called."""
         super().__init__()
+        contract = ""  # for errors of the class, not for those of its module
         try:
-            self.module = _find(name, modules)(space.stacked_shape)
+            found = _find(name, modules)
+            contract = f"; {_contract(space)}"
+            self.module = found(space.stacked_shape)
             self.features = _checked_features(self.module, space)
         except UserModuleError as error:
             raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:
-            raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
+            raise NetworkError(f"policy.encoder={name}: {error}{contract}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
             first_line = next(iter(str(error).strip().splitlines()), "")
-            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}") from error
+            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}{contract}") from error
 
     def forward(self, observations: Tensor) -> Tensor:
         """Encode observations: [N, *stacked_shape] -> [N, features]."""
         return self.module(observations)
+
+
+def _contract(space: ArraySpace) -> str:
+    """Return the arguments of the constructor and of the calls."""
+    shape = space.stacked_shape
+    scale = "uint8 from 0 to 255" if space.dtype == "uint8" else "float32"
+    stacked = f", {space.frames} frames first" if space.frames > 1 else ""
+    return (
+        f"it is constructed with the shape {shape}, and called with observations "
+        f"[N, {', '.join(map(str, shape))}] of {scale}, not scaled, axes as in the environment{stacked}"
+    )
 
 
 def _find(name: str, modules: UserModules) -> type[nn.Module]:
