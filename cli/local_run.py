@@ -7,7 +7,7 @@ import logging
 import subprocess
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,30 @@ class RunStoppedError(Exception):
     """Error of a run that was stopped before its end."""
 
 
+class RunObserver:
+    """Observer of the training of a run. This one does nothing."""
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """File descriptors that the learner inherits."""
+        return ()
+
+    @property
+    def learner_options(self) -> list[str]:
+        """Options of the learner."""
+        return []
+
+    def begin(self) -> None:
+        """Called before the processes start."""
+
+    def end(self) -> None:
+        """Called after they have ended, in any way."""
+
+    def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+        """Do what is due, and return whether training has to end. Called many times a second."""
+        return False
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalRun:
     """Settings of one run on this machine. Its directory and config.toml exist already.
@@ -60,6 +84,7 @@ class LocalRun:
     insecure: bool = False
     log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
     log_json: bool = False
+    observer: RunObserver = field(default_factory=RunObserver)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,8 +126,12 @@ def run_locally(
 
 def _train(run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
-    with private_address() as address:
-        return _train_at(address, run, stopping, output, learner_streams)
+    run.observer.begin()
+    try:
+        with private_address() as address:
+            return _train_at(address, run, stopping, output, learner_streams)
+    finally:
+        run.observer.end()
 
 
 def _train_at(
@@ -129,7 +158,7 @@ def _train_at(
         )
         if spec.evaluation.seconds is not None:
             actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
-        return watch(learner, actors, spec, stopping)
+        return watch(learner, actors, spec, stopping, run.observer)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
 
@@ -156,11 +185,12 @@ def _listening(run: LocalRun, own: str) -> list[str]:
 
 def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenStreams) -> Supervised:
     """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
+    descriptors = *run.lock, *run.observer.descriptors
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         since = run.started if first else time.monotonic()
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
-        arguments += _logging_options(run.log_level, run.log_json)
+        arguments += [*_logging_options(run.log_level, run.log_json), *run.observer.learner_options]
         arguments += allow_settings(run.spec.policy.user_modules)
         if run.spaces is not None:
             arguments += ["--spaces", run.spaces.model_dump_json()]
@@ -169,18 +199,28 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:
-            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=run.lock)
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 
 
-def watch(learner: Supervised, actors: list[Supervised], spec: RunSpec, stopping: threading.Event) -> int:
+def watch(
+    learner: Supervised,
+    actors: list[Supervised],
+    spec: RunSpec,
+    stopping: threading.Event,
+    observer: RunObserver | None = None,
+) -> int:
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
-    Raises FailedError if the learner failed too often, or if too few actors are left.
+    Return 0 if the observer ends training. Raises FailedError if the learner failed too often, or if too few actors are
+    left.
     """
+    observer = observer or RunObserver()
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
+        if observer.poll(learner.process) and status is None:
+            return 0
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
         _warn(learner.check())

@@ -20,6 +20,7 @@ STOPPED = 128 + signal.SIGTERM
 UNREAD = 128 + signal.SIGPIPE  # exit status, as of other programs
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
+_LONGEST_LINE = 1 << 16  # bytes, from the parent
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
 
 
@@ -82,12 +83,19 @@ def _exit_if_stuck(stop: threading.Event, responded: threading.Event) -> None:
         os._exit(1)
 
 
-def exit_with_parent(stop: threading.Event) -> None:
-    """Set `stop` when standard input ends: the parent holds it open while it runs."""
+def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = lambda _: None) -> None:
+    """Set `stop` when standard input ends: the parent holds it open while it runs.
+
+    `on_line` is called with each line that the parent writes, on a thread of its own.
+    """
 
     def watch() -> None:
-        while os.read(sys.stdin.fileno(), 4096):
-            pass
+        rest = b""
+        while data := os.read(sys.stdin.fileno(), 4096):
+            *lines, rest = (rest + data).split(b"\n")
+            rest = rest[-_LONGEST_LINE:]
+            for line in lines:
+                on_line(line)
         stop.set()
 
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()

@@ -11,11 +11,14 @@ import signal
 import sys
 import threading
 import time
+from typing import TYPE_CHECKING
 
-from daedalus.actor.checking.report import EnvironmentReport, slow_steps
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+if TYPE_CHECKING:
+    from daedalus.actor.checking.report import EnvironmentReport
 
 _logger = logging.getLogger(__name__)
 
@@ -37,6 +40,8 @@ def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
 
     The user has named the modules of the environment. See quick_check. Raises EnvironmentProblemError.
     """
+    from daedalus.actor.checking.report import slow_steps  # a process that checks nothing does not need it
+
     try:
         report = quick_check(spec.environment, UserModules(frozenset(modules_of(spec.user_modules))), fork=fork)
     except CheckTimeoutError as error:
@@ -95,7 +100,7 @@ def quick_check(
     play: bool = True,
     fork: bool = False,
     stop: threading.Event | None = None,
-) -> EnvironmentReport:
+) -> "EnvironmentReport":
     """Make one environment, play it for up to 0.3 s, close it, and return what was found.
 
     Args:
@@ -108,6 +113,8 @@ def quick_check(
 
     Raises CheckTimeoutError.
     """
+    from daedalus.actor.checking.report import EnvironmentReport
+
     words = json.dumps({"spec": spec.model_dump(mode="json"), "modules": sorted(modules.allowed), "play": play})
     reading, writing = os.pipe()
     with open(reading, "rb", buffering=0) as results:

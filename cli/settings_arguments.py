@@ -238,6 +238,7 @@ def learner_parser() -> argparse.ArgumentParser:
     # Options for `daedalus train`, which has created the run directory and its config.toml.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
+    options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
     options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options

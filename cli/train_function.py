@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
+from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
@@ -37,6 +38,7 @@ class RunResult:
     solved: bool  # the target return was reached
     finished: bool  # solved, or the budget is used up
     exit_status: int  # as of `daedalus train`: 0, or 3 if the budget was used up before the target
+    stop_reason: str | None  # the reason that a callback gave to end training
     env_steps: int
     updates: int
     episodes: int
@@ -62,6 +64,7 @@ def train(
     settings: Mapping[str, Any] | None = None,
     wrap: str | None = None,
     init_from: str | Path | None = None,
+    callback: Callback | None = None,
     quiet: bool = False,
 ) -> RunResult:
     """Train with a learner and actors as processes of this machine, evaluate the policy, and return the result.
@@ -80,6 +83,7 @@ def train(
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       init_from: another run, or one of its checkpoints, whose weights to begin with; the network must be the same.
+      callback: called with each row of metrics; it can log metrics of its own and end training.
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TrainingError if a process failed.
@@ -97,7 +101,10 @@ def train(
         spaces, spec = _transformed_spaces(chosen, spec, spaces), chosen
         directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     weights = None if init_from is None else Path(init_from)
-    with run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock:
+    with (
+        run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,
+        observed(callback, lock.directory) as (observer, control),
+    ):
         run = LocalRun(
             directory=lock.directory,
             spec=spec,
@@ -105,9 +112,10 @@ def train(
             lock=lock.inheritable,
             spaces=spaces,
             init_from=weights,
+            observer=observer,
         )
         end = _run(run, quiet)
-    return _result(lock.directory, end)
+    return _result(lock.directory, end, control.stop_reason)
 
 
 def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
@@ -186,7 +194,9 @@ def _records_to(handler: logging.Handler) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _result(directory: Path, end: RunEnd) -> RunResult:
-    names = RunResult.__dataclass_fields__.keys() - {"directory", "exit_status", "summary"}
+def _result(directory: Path, end: RunEnd, stop_reason: str | None) -> RunResult:
+    names = RunResult.__dataclass_fields__.keys() - {"directory", "exit_status", "stop_reason", "summary"}
     fields = {name: end.summary[name] for name in names}
-    return RunResult(directory=directory, exit_status=end.status, summary=end.summary, **fields)
+    return RunResult(
+        directory=directory, exit_status=end.status, stop_reason=stop_reason, summary=end.summary, **fields
+    )

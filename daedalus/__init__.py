@@ -12,28 +12,33 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from daedalus.actor.client import Client
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
+    from daedalus.cli.callbacks import Callback, TrainingRun
     from daedalus.cli.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.settings import SettingsError
 
     __version__: str
 
 __all__ = [
+    "Callback",
     "Client",
     "Policy",
     "RunResult",
     "SettingsError",
     "TrainingError",
+    "TrainingRun",
     "__version__",
     "load_policy",
     "train",
 ]
 
 _MODULES = {
+    "Callback": "daedalus.cli.callbacks",
     "Client": "daedalus.actor.client",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
     "RunResult": "daedalus.cli.train_function",
     "SettingsError": "daedalus.learner.run.settings",
     "TrainingError": "daedalus.cli.train_function",
+    "TrainingRun": "daedalus.cli.callbacks",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
     "train": "daedalus.cli.train_function",
 }

@@ -17,6 +17,7 @@ from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
+from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.heartbeat import Heartbeat
@@ -71,6 +72,7 @@ class LearnerService:
         spaces: Spaces | None = None,
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
+        user_metrics: UserMetrics | None = None,
     ) -> None:
         """Construct the service.
 
@@ -87,6 +89,7 @@ class LearnerService:
           spaces: spaces that all actors must have, if they are known; those of a checkpoint have precedence.
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
+          user_metrics: metrics of the program that started the run.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._modules = open_writers, modules
@@ -124,6 +127,7 @@ class LearnerService:
             evaluations=self._evaluations,
             health=self._health,
             started=started,
+            user_metrics=user_metrics or UserMetrics(),
         )
 
     def run(self) -> Outcome:

@@ -7,9 +7,10 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -96,6 +97,32 @@ def test_train_prints_its_log_records_unless_quiet(tmp_path: Path, quiet: bool) 
     assert any(line.startswith("CartPole-v1: impala, seed 1, 2 actors") for line in lines) != quiet
     assert len(lines) == 1 or not quiet
     assert not output.stderr or not quiet
+
+
+def test_a_callback_logs_metrics_and_ends_training(tmp_path: Path) -> None:
+    class Watch(daedalus.Callback):
+        calls: ClassVar[list[str]] = []
+
+        def on_start(self, run: daedalus.TrainingRun) -> None:
+            self.calls.append("start")
+
+        def on_metrics(self, run: daedalus.TrainingRun, row: Mapping[str, float]) -> None:
+            self.calls.append("row")
+            run.log({"twice": 2 * row["env_steps"]})
+            if "user/twice" in row:
+                run.stop("it came back")
+
+        def on_end(self, run: daedalus.TrainingRun) -> None:
+            self.calls.append("end")
+
+    settings = {"evaluation.final_episodes": 3, "service.log_seconds": 0.1}
+    arguments = {"env_steps": 10**9, "actors": 1, "run_dir": tmp_path / "run", "quiet": True, "settings": settings}
+    result = daedalus.train(env="CartPole-v1", **arguments, callback=Watch())
+    assert (result.stop_reason, result.finished, result.exit_status) == ("it came back", False, 0)
+    assert result.evaluation_return_mean > 0
+    assert (Watch.calls[0], Watch.calls[-1]) == ("start", "end")
+    assert set(Watch.calls[1:-1]) == {"row"}
+    assert "user/twice" in (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0]
 
 
 def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:

@@ -8,8 +8,6 @@ from contextlib import redirect_stdout
 
 import numpy as np
 
-from daedalus.actor.checking.checker import gymnasium_notes
-from daedalus.actor.checking.play import check_environment
 from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
@@ -61,29 +59,39 @@ def check(arguments: list[str]) -> int:
     if not parsed.seconds > 0.0:
         print(f"daedalus check: --seconds is {parsed.seconds:g}: choose a number above 0", file=sys.stderr)
         return 2
-    modules = UserModules(frozenset(modules_of(spec.user_modules)))
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
-            seed = spec.training.seed
-            environment = spec.environment
-            report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
-            notes = () if report.problems else gymnasium_notes(environment, modules)
-            if parsed.env is not None:
-                spec = resolve_spec(parsed, default_settings(report.spaces))
-            spaces = report.spaces
-            if spec.environment != environment:
-                spaces = check_environment(spec.environment, modules, seconds=0.0, env_steps=0).spaces
-            network = _network(spec, spaces, modules)
+            lines = _checked(spec, parsed)
     except KeyboardInterrupt:
         print("daedalus check: stopped", file=sys.stderr)
         return 1
-    problems = [*report.problems, *([network[1]] if network[1] else [])]
-    lines = [*_description(spec, report), *_choices(spec, network[0])]
-    lines += [("warning", text) for text in report.warnings]
-    lines += [("note", text) for text in (*notes, *_advice(spec, report))]
-    lines += [("problem", text) for text in problems] or [("result", "no problem found")]
     print("\n".join(f"{name:<14}{text}" for name, text in lines))
-    return 1 if problems else 0
+    return 1 if any(name == "problem" for name, _ in lines) else 0
+
+
+def _checked(spec: RunSpec, parsed: argparse.Namespace) -> list[tuple[str, str]]:
+    """Return the lines of the report, each with its name."""
+    from daedalus.actor.checking.checker import gymnasium_notes  # gymnasium, which the parser does not need
+    from daedalus.actor.checking.play import check_environment
+
+    environment, modules = spec.environment, UserModules(frozenset(modules_of(spec.user_modules)))
+    seed = spec.training.seed
+    report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
+    notes = () if report.problems else gymnasium_notes(environment, modules)
+    spaces = report.spaces
+    if parsed.env is not None:
+        spec = resolve_spec(parsed, default_settings(spaces))
+        if spec.environment != environment:
+            spaces = check_environment(spec.environment, modules, seconds=0.0, env_steps=0).spaces
+    network, fault = _network(spec, spaces, modules)
+    problems = [*report.problems, *([fault] if fault else [])]
+    return [
+        *_description(spec, report),
+        *_choices(spec, network),
+        *(("warning", text) for text in report.warnings),
+        *(("note", text) for text in (*notes, *_advice(spec, report))),
+        *([("problem", text) for text in problems] or [("result", "no problem found")]),
+    ]
 
 
 def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str, str]]:

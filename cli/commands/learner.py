@@ -12,6 +12,7 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,9 @@ from daedalus.cli.quick_check import expected_spaces
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser, resolve
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.recorder import OpenWriter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
+from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.finished import finished_run
@@ -41,10 +44,9 @@ from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, find_policy
+from daedalus.policy.saving.saved_policy import checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
-from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
@@ -73,8 +75,9 @@ def main() -> int:
     keep_freed_memory()
     raise_descriptor_limit()
     stop = stop_on_signals()
+    user_metrics = UserMetrics()
     if arguments.exit_with_parent:
-        exit_with_parent(stop)
+        exit_with_parent(stop, user_metrics.add_line)
     try:
         run = choose_run(arguments)
         credentials = _credentials(arguments)
@@ -88,7 +91,9 @@ def main() -> int:
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
         with ExitStack() as stack:
-            return _serve(run, arguments, credentials, stop, progress, arguments.started or started, stack)
+            return _serve(
+                run, arguments, credentials, stop, progress, arguments.started or started, user_metrics, stack
+            )
     except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -101,6 +106,7 @@ def _serve(
     stop: threading.Event,
     progress: Progress,
     started: float,
+    user_metrics: UserMetrics,
     stack: ExitStack,
 ) -> int:
     """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
@@ -133,7 +139,21 @@ def _serve(
         run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments, credentials)
-        outcome = _train(run, transport, stop, progress, started, restored, initial, spaces, credentials)
+        outcome = LearnerService(
+            run.spec,
+            run.directory,
+            transport,
+            stop,
+            progress,
+            _writers(run.directory, arguments.rows_to),
+            started=started,
+            restored=restored,
+            initial=initial,
+            spaces=spaces,
+            modules=run.modules,
+            certificate_days_left=partial(certificate_days_left, credentials),
+            user_metrics=user_metrics,
+        ).run()
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)
@@ -182,34 +202,13 @@ def _announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Creden
         _logger.info("actors join with: %s", how_to_join(_addresses(arguments), credentials, spec))
 
 
-def _train(
-    run: ChosenRun,
-    transport: Transport,
-    stop: threading.Event,
-    progress: Progress,
-    started: float,
-    restored: "Checkpoint | None",
-    initial: SavedPolicy | None,
-    spaces: Spaces | None,
-    credentials: Credentials | None,
-) -> Outcome:
-    """Run the learner to its end."""
-    directory = run.directory
-    service = LearnerService(
-        run.spec,
-        directory,
-        transport,
-        stop,
-        progress,
-        [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
-        started=started,
-        restored=restored,
-        initial=initial,
-        spaces=spaces,
-        modules=run.modules,
-        certificate_days_left=lambda: certificate_days_left(credentials),
-    )
-    return service.run()
+def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:
+    """Return the metrics writers; `rows_to` is a pipe to the program that started the run."""
+    writers: list[OpenWriter] = [
+        lambda: CsvWriter(directory / run_directory.METRICS),
+        lambda: TensorBoardWriter(directory),
+    ]
+    return writers if rows_to is None else [lambda: RowsWriter(rows_to), *writers]
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":

@@ -51,7 +51,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
 }
 COLUMNS = tuple(name for names in GROUPS.values() for name in names)
-ENV = "env/"  # prefix of the columns for the scalars of the environment's info, which a run adds to COLUMNS
+# Prefixes of columns that a run adds to COLUMNS.
+ENV = "env/"  # scalars of the environment's info
+USER = "user/"  # metrics of the program that started the run
 
 
 def tag(column: str) -> str:
@@ -78,8 +80,7 @@ class MetricsWriter(Protocol):
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Write a row. Raises OSError.
 
-        Its keys are in COLUMNS, or ENV and the name of a scalar of the environment's info. Columns without a value yet
-        are absent.
+        Its keys are in COLUMNS, or begin with ENV or USER. Columns without a value yet are absent.
         """
         ...
 

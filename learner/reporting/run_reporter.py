@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.report import EpisodeHint, Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluations import Evaluations
@@ -32,6 +33,7 @@ class RunReporter:
         evaluations: Evaluations,
         health: Health,
         started: float,
+        user_metrics: UserMetrics,
     ) -> None:
         """Construct the reporter. `lock` guards counters and fleet; `started` is on the monotonic clock, in seconds."""
         self._run, self._spec, self._epoch = run, spec, learner_epoch
@@ -39,6 +41,7 @@ class RunReporter:
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
         self._hint = EpisodeHint()
+        self._user_metrics = user_metrics
 
     def begin(self, now: float) -> None:
         """Start to measure rates, at the begin of training."""
@@ -67,6 +70,7 @@ class RunReporter:
                 **self._evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
+                **self._user_metrics.take(),
             }
             return metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
 

@@ -24,17 +24,19 @@ class CustomEncoder(nn.Module):
         super().__init__()
         self._only = next(iter(spaces)) if len(spaces) == 1 else None
         shapes = {component: space.stacked_shape for component, space in spaces.items()}
+        contract = ""  # for errors of the class, not for those of its module
         try:
             encoder = find_class("policy.encoder", name, nn.Module, modules)
+            contract = f"; {_contract(spaces)}"
             self.module = encoder(shapes if self._only is None else shapes[self._only])
             self.features = _checked_features(self.module, self._inputs(_zeros(spaces)))
         except UserModuleError as error:
             raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:
-            raise NetworkError(f"policy.encoder={name}: {error}") from error.__cause__
+            raise NetworkError(f"policy.encoder={name}: {error}{contract}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
             first_line = next(iter(str(error).strip().splitlines()), "")
-            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}") from error
+            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}{contract}") from error
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
@@ -49,6 +51,25 @@ def _zeros(spaces: ObservationSpaces) -> dict[str, Tensor]:
         name: torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype))
         for name, space in spaces.items()
     }
+
+
+def _contract(spaces: ObservationSpaces) -> str:
+    """Return the arguments of the constructor and of the calls."""
+    described = {name: _described(space) for name, space in spaces.items()}
+    if len(spaces) == 1:
+        (space,), (text,) = spaces.values(), described.values()
+        return f"it is constructed with the shape {space.stacked_shape}, and called with observations {text}"
+    parts = ", ".join(f"{name}: {text}" for name, text in described.items())
+    return f"it is constructed with a dict of shapes by name, and called with a dict of observations: {parts}"
+
+
+def _described(space: ArraySpace | DiscreteSpace) -> str:
+    sizes = ", ".join(map(str, space.stacked_shape))
+    if isinstance(space, DiscreteSpace):
+        return f"[N, {sizes}] of {space.dtype}, numbers of choices from 0 on"
+    scale = "uint8 from 0 to 255" if space.dtype == "uint8" else "float32"
+    stacked = f", {space.frames} frames first" if space.frames > 1 else ""
+    return f"[N, {sizes}] of {scale}, not scaled, axes as in the environment{stacked}"
 
 
 def _checked_features(module: nn.Module, zeros: Tensor | dict[str, Tensor]) -> int:

@@ -57,13 +57,21 @@ def test_a_run_does_not_wait_for_an_environment_that_hangs(monkeypatch: pytest.M
     assert "the check of the environment was not done within 0.5 s: the run starts without it" in "\n".join(LINES)
 
 
-def test_a_stopped_check_ends_at_once() -> None:
+def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
+
+    def spawned(words: str, writing: int) -> int:
+        started.append(spawn(words, writing))
+        return started[0]
+
+    spawn = module._spawned
+    monkeypatch.setattr(module, "_spawned", spawned)
     stop = threading.Event()
     stop.set()
     with pytest.raises(CheckTimeoutError):
         quick_check(faulty("hang"), MODULES, stop=stop)
     with pytest.raises(ChildProcessError):
-        os.waitpid(-1, os.WNOHANG)  # no child is left
+        os.waitpid(started[0], os.WNOHANG)  # it has ended
 
 
 def test_a_fork_gives_the_same_report_and_leaves_the_module_out_of_the_parent() -> None:

@@ -11,6 +11,7 @@ from pages import DOCS, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
 
 from daedalus.actor.environments.make import make_environments
+from daedalus.cli.callbacks import TrainingRun
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
 from daedalus.learner.training.learner import Learner
@@ -72,3 +73,16 @@ def test_the_metrics_writer_writes(folder: Path) -> None:
     writer.write({"env_steps": 1.0}, Details())
     writer.close()
     assert (folder / "metrics.jsonl").read_text() == '{"env_steps": 1.0}\n'
+
+
+def test_the_callback_ends_training_on_a_plateau(folder: Path) -> None:
+    (folder / "plateau.py").write_text(example("callback.md"))
+    sys.path.append(str(folder))
+    callback = importlib.import_module("plateau").StopOnPlateau(100)
+    run = TrainingRun(folder)
+    for env_steps, mean in ((0, None), (100, 20.0), (150, 30.0), (200, 10.0)):
+        callback.on_metrics(run, {"env_steps": env_steps, **({} if mean is None else {"episode_return_mean": mean})})
+    assert run.stop_reason is None
+    callback.on_metrics(run, {"env_steps": 250, "episode_return_mean": 29.0})
+    assert run.stop_reason == "no better mean return than 30.0 for 100 env_steps"
+    assert run.take_metrics() == {"best_return": 30.0}

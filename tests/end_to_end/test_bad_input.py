@@ -71,12 +71,15 @@ def test_a_fault_of_the_environment_is_reported_once_before_anything_starts(
     assert not run.exists()
 
 
-def test_a_missing_cuda_device_is_reported_in_one_line(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_cuda_device_is_reported_in_one_line(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # also on a machine with a GPU
     running = start("train", "cartpole", "--set", "training.device=cuda", "--run-dir", "run")
     assert running.wait() == 1
     running.expect("daedalus learner: training.device is cuda, but torch finds no CUDA device: install")
     assert "Traceback" not in running.output
+    assert not (tmp_path / "run").exists()  # a failed start leaves nothing
 
 
 def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_path: Path) -> None:

@@ -127,6 +127,15 @@ def test_invalid_encoder_is_rejected_with_one_line(build: Building, source: str,
     assert "\n" not in str(caught.value)
 
 
+def test_the_error_of_an_encoder_states_its_input(build: Building) -> None:
+    with pytest.raises(NetworkError) as caught:
+        build("class Net(Base):\n    def forward(self, x): return self.convolution(x.permute(0, 3, 1, 2).float())")
+    assert str(caught.value).endswith(
+        "; it is constructed with the shape (3, 9, 11), and called with observations [N, 3, 9, 11] of uint8 from 0 to "
+        "255, not scaled, axes as in the environment, 3 frames first"
+    )
+
+
 FORWARD = """
 class Net(Base):
     def __init__(self, shape):

@@ -1,0 +1,51 @@
+"""`daedalus check`: the report of an environment."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli.commands.check import check
+
+ENV = ["--env", "faulty_environments:Faulty-v0", "--seconds", "0.05"]
+
+
+@pytest.fixture(autouse=True)
+def _beside_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(Path(__file__).parent.parent)
+
+
+def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check([*ENV, "--algorithm", "a2c"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if "note" not in line)
+    assert lines["environment"] == "faulty_environments:Faulty-v0 of gymnasium"
+    assert lines["spaces"] == "observation: float32 array of shape (2,); action: 2 choices"
+    assert "ended, after 10 to 10 env_steps; return 10 to 10, mean 10" in lines["episodes"]
+    assert "ms a step" in lines["speed"]
+    assert lines["train"].startswith("a2c, 2 actors x 16 environments, rollouts of 16 rows, 1,000,000 env_steps")
+    assert lines["network"] == "encoder mlp, 4,547 parameters"
+    assert lines["result"] == "no problem found"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "environment.kwargs.fault=reward"], "problem       environment .* the reward nan: it must be fini"),
+        (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
+    ],
+)
+def test_a_problem_is_the_exit_status(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert check([*ENV, *words]) == 1
+    output = capsys.readouterr().out
+    assert any(re.match(message, line) for line in output.splitlines()), output
+
+
+def test_warnings_do_not_change_the_exit_status(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check([*ENV, "--set", "environment.kwargs.fault=bounds"]) == 0
+    assert "warning       environment" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--env", "A", "--set", "environment.id=B"], ["cartpole", "--seconds", "0"]])
+def test_bad_usage_is_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
