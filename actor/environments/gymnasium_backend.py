@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     creation_errors,
+    first_line,
     import_extra,
     unknown_environment,
 )

@@ -25,4 +25,4 @@ def test_a_repeated_config_is_named_after_its_environment(
     (folder / run_directory.CONFIG).rename(folder / name)
     again, directory = resolve(learner_parser().parse_args([str(folder / name)]))
     assert again == spec
-    assert directory.name.startswith(f"{named}-impala-s5-")
+    assert directory.name.startswith(f"{named}-appo-s5-")

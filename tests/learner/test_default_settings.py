@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 
 from daedalus.learner.run.default_settings import default_settings, kind_of
-from daedalus.learner.run.settings import run_spec
+from daedalus.learner.run.settings import choose_algorithm, run_spec
+from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 VECTOR = ArraySpace(shape=(17,), dtype="float32")
@@ -41,12 +42,14 @@ def test_a_discrete_and_a_continuous_component_make_a_continuous_action() -> Non
     assert kind_of(where) == "vectors_continuous"
 
 
+@pytest.mark.parametrize("algorithm", [None, *ALGORITHMS])
 @pytest.mark.parametrize(
     "where", [None, spaces(CHOICES, VECTOR), spaces(JOINTS, VECTOR), spaces(CHOICES, image(96, 96, 3))]
 )
-def test_default_settings_are_valid(where: Spaces | None) -> None:
+def test_default_settings_are_valid_for_each_algorithm(where: Spaces | None, algorithm: str | None) -> None:
     settings: dict[str, Any] = default_settings(where)
     settings.setdefault("environment", {})["id"] = "Any-v0"
+    choose_algorithm(settings, algorithm)
     spec = run_spec(settings)
     assert spec.training.normalize_rewards
     assert spec.training.target_return is None
