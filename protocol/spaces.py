@@ -13,6 +13,7 @@ from daedalus.protocol.specification import PositiveInt, Specification
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64
+_MAX_VARIABLES = 8_192  # of all discrete and continuous components together: a Join lists their bounds
 
 ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]
 
@@ -180,6 +181,15 @@ class Spaces(Specification):
         size = sum(space.observation_bytes for space in arrays)
         if size > _MAX_OBSERVATION_BYTES:
             raise ValueError(f"an observation has {size:,} bytes: use at most {_MAX_OBSERVATION_BYTES:,}")
+        outputs = sum(
+            space.choices if isinstance(space, DiscreteSpace) else space.size for space in self.actions.values()
+        )
+        if outputs > _MAX_CHOICES:
+            raise ValueError(f"an action has {outputs:,} choices and numbers together: use at most {_MAX_CHOICES:,}")
+        listed = [*self.observations.values(), *self.actions.values()]
+        variables = sum(space.size for space in listed if not isinstance(space, ArraySpace))
+        if variables > _MAX_VARIABLES:
+            raise ValueError(f"the spaces have {variables:,} variables together: use at most {_MAX_VARIABLES:,}")
         return self
 
     @property

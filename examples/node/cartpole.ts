@@ -4,9 +4,11 @@
  */
 
 export const ID = "CartPole-v1";
+export const OBSERVATION = "observation"; // the name of the only component of an observation
+export const ACTION = "action"; // the name of the only component of an action
 export const SPACES = {
-  observation: { kind: "array", shape: [4], dtype: "float32", frames: 1 },
-  action: { kind: "discrete", count: 2 },
+  observations: { [OBSERVATION]: { kind: "array", shape: [4], dtype: "float32", frames: 1 } },
+  actions: { [ACTION]: { kind: "discrete", counts: [2], masked: false } },
 };
 export const SIZE = 4; // of an observation: position, velocity, angle, angular velocity
 

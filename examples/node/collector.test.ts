@@ -1,21 +1,22 @@
-/** Tests of the environments, the collector and the sampling, without a learner. */
+/** Tests of the environments, the collector and the random numbers, without a learner. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { SIZE, VectorCartPole } from "./cartpole.ts";
+import { ACTION, OBSERVATION, SIZE, VectorCartPole } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
-import { type BehaviourPolicy, sample } from "./policy.ts";
-import { seeded } from "./random.ts";
+import type { BehaviourPolicy } from "./policy.ts";
+import { normal, seeded, uniform } from "./random.ts";
 
+const FRAMES = `frames/${OBSERVATION}`;
 const UNCHANGED = { reward_clip: null, reward_scale: 1, bootstrap_terminations: false };
 
 /** A policy that always pushes right. Its state counts the rows of the episode. */
 const pusher: BehaviourPolicy = {
   stateSize: 1,
-  async act(observations, _shape, state) {
-    const rows = observations.length / SIZE;
+  async act(observations, state) {
+    const rows = observations[OBSERVATION].shape[0];
     return {
-      actions: new Uint8Array(rows).fill(1),
+      actions: { [ACTION]: new Int32Array(rows).fill(1) },
       logProbs: new Float32Array(rows),
       state: state.map((count) => count + 1),
     };
@@ -60,8 +61,8 @@ test("the row after an episode's end only resets, and clears the state of the me
   assert.deepEqual([...lengths].sort(), [...ends].sort());
   assert.deepEqual(returns, lengths);
   // The second rollout begins with the last frame of the first, and with the state since the last reset.
-  const lastFrame = first.arrays.frames.data.slice(rows * count * SIZE);
-  assert.deepEqual(second.arrays.frames.data.slice(0, count * SIZE), lastFrame);
+  const lastFrame = first.arrays[FRAMES].data.slice(rows * count * SIZE);
+  assert.deepEqual(second.arrays[FRAMES].data.slice(0, count * SIZE), lastFrame);
   for (let e = 0; e < count; e++) {
     let since = 0;
     for (let row = 0; row < rows; row++) since = valid[row * count + e] ? since + 1 : 0;
@@ -79,15 +80,14 @@ test("a rollout has clipped and scaled rewards and bootstraps terminations if th
   assert.deepEqual(Array.from(arrays.episode_returns.data, Number), Array.from(arrays.episode_lengths.data, Number));
 });
 
-test("samples follow the softmax of the logits", () => {
-  const random = seeded(3);
-  const logits = Float32Array.of(0, Math.log(3), -Infinity);
-  let second = 0;
-  for (let i = 0; i < 20_000; i++) {
-    const { actions, logProbs } = sample(logits, 1, random);
-    const expected = [Math.log(0.25), Math.log(0.75)][actions[0]];
-    assert.ok(Math.abs(logProbs[0] - expected) < 1e-6);
-    second += actions[0];
-  }
-  assert.ok(Math.abs(second / 20_000 - 0.75) < 0.02);
+test("uniform and normal numbers have their moments, and uniform ones never reach 1", () => {
+  const mean = (values: Float32Array) => values.reduce((sum, value) => sum + value, 0) / values.length;
+  const flat = uniform(20_000, seeded(3));
+  assert.ok(Math.abs(mean(flat) - 0.5) < 0.01);
+  assert.deepEqual(uniform(2, () => 1 - 2 ** -32), Float32Array.of(1 - 2 ** -24, 1 - 2 ** -24));
+  const bell = normal(20_000, seeded(4));
+  assert.ok(Math.abs(mean(bell)) < 0.03);
+  assert.ok(Math.abs(mean(bell.map((value) => value ** 2)) - 1) < 0.04);
+  assert.ok(Math.abs(mean(bell.map((value) => value ** 4)) - 3) < 0.3);
+  assert.ok(normal(2, () => 0).every(Number.isFinite));
 });

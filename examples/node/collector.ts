@@ -1,8 +1,8 @@
 /** Rollouts from environments and a policy. No network. */
 
-import { SIZE, type VectorCartPole } from "./cartpole.ts";
+import { ACTION, OBSERVATION, SIZE, type VectorCartPole } from "./cartpole.ts";
 import type { BehaviourPolicy } from "./policy.ts";
-import type { Message } from "./wire.ts";
+import type { Message, WireArray } from "./wire.ts";
 
 /** How a rollout records rewards and ends of episodes for training, from the run's specification. */
 export interface OutcomeSettings {
@@ -52,7 +52,7 @@ export class Collector {
   async collect(identity: Record<string, unknown>, policyVersion: unknown): Promise<Message> {
     const [rows, count] = [this.#rolloutLength, this.#environments.count];
     const frames = new Float32Array((rows + 1) * count * SIZE); // [T+1, E, 4]; row T bootstraps
-    const actions = new Uint8Array(rows * count); // this and the next five [T, E]
+    const actions = new Uint8Array(rows * count); // [T, E, 1]; the next five [T, E]
     const logProbs = new Float32Array(rows * count);
     const rewards = new Float32Array(rows * count);
     const terminated = new Uint8Array(rows * count);
@@ -63,13 +63,14 @@ export class Collector {
     frames.set(this.#environments.observations);
     for (let row = 0; row < rows; row++) {
       const start = row * count;
-      const observations = frames.subarray(start * SIZE, (start + count) * SIZE);
-      const acted = await this.#policy.act(observations, [SIZE], this.#state, this.#random);
-      const step = this.#environments.step(acted.actions);
+      const data = frames.subarray(start * SIZE, (start + count) * SIZE);
+      const observed: WireArray = { dtype: "<f4", shape: [count, SIZE], data };
+      const acted = await this.#policy.act({ [OBSERVATION]: observed }, this.#state, {}, this.#random);
+      const step = this.#environments.step(acted.actions[ACTION]);
       valid.set(this.#ended.map((ended) => 1 - ended), start);
       this.#countEpisodes(step.rewards, step.terminated, step.truncated, finished);
       frames.set(this.#environments.observations, (start + count) * SIZE);
-      actions.set(acted.actions, start);
+      actions.set(acted.actions[ACTION], start);
       logProbs.set(acted.logProbs, start);
       rewards.set(step.rewards.map((reward) => this.#clipAndScale(reward)), start);
       const { bootstrap_terminations } = this.#settings;
@@ -84,9 +85,9 @@ export class Collector {
       kind: "Rollout",
       fields: { identity, policy_version: policyVersion },
       arrays: {
-        frames: { dtype: "<f4", shape: [rows + 1, count, SIZE], data: frames },
+        [`frames/${OBSERVATION}`]: { dtype: "<f4", shape: [rows + 1, count, SIZE], data: frames },
         initial_state: { dtype: "<f4", shape: [count, this.#policy.stateSize], data: initialState },
-        actions: { dtype: "|u1", shape, data: actions },
+        [`actions/${ACTION}`]: { dtype: "|u1", shape: [rows, count, 1], data: actions },
         behaviour_log_probs: { dtype: "<f4", shape, data: logProbs },
         rewards: { dtype: "<f4", shape, data: rewards },
         terminated: { dtype: "|b1", shape, data: terminated },

@@ -2,15 +2,19 @@
 
 import { createHash } from "node:crypto";
 import { InferenceSession, Tensor } from "onnxruntime-node";
+import { normal, uniform } from "./random.ts";
 import type { WireArray } from "./wire.ts";
 
 /** This actor cannot use the program or the weights. */
 export class PolicyError extends Error {}
 
-/** Sampled actions of one row. */
-export interface SampledRow {
-  actions: Uint8Array; // [E]
-  logProbs: Float32Array; // [E] log-probabilities of the actions
+/** Arrays by the names of their components, each with a first axis E. */
+export type Components = Record<string, WireArray>;
+
+/** What the policy chose for one row. */
+export interface Choice {
+  actions: Record<string, Int32Array | Float32Array>; // of each component [E, D]
+  logProbs: Float32Array; // [E] log-probabilities of the whole actions
   state: Float32Array; // [E, S] input of the next row
 }
 
@@ -18,14 +22,17 @@ export interface SampledRow {
 export interface BehaviourPolicy {
   readonly stateSize: number; // S; 0 without a memory
 
-  /** Sample an action for each observation [E, ...shape] with the memory's state [E, S]. */
-  act(observations: Float32Array, shape: number[], state: Float32Array, random: () => number): Promise<SampledRow>;
+  /** Sample actions for the observations of E environments, with the memory's state [E, S] and masks of actions. */
+  act(observations: Components, state: Float32Array, masks: Components, random: () => number): Promise<Choice>;
 }
+
+const TENSOR_TYPES = { "<f4": "float32", "|u1": "uint8", "|b1": "bool" } as const;
 
 /** A program in onnxruntime, and the weights that it was bound to last. */
 export class Policy implements BehaviourPolicy {
   readonly stateSize: number;
   readonly #session: InferenceSession;
+  readonly #inputs: Map<string, InferenceSession.TensorValueMetadata>; // all but the weights
   readonly #weightShapes: Map<string, readonly (number | string)[]>; // by input name
   #weights: Record<string, Tensor> = {};
 
@@ -44,19 +51,25 @@ export class Policy implements BehaviourPolicy {
 
   private constructor(session: InferenceSession) {
     this.#session = session;
+    this.#inputs = new Map();
     this.#weightShapes = new Map();
-    let stateSize = 0;
     for (const input of session.inputMetadata) {
-      if (!input.isTensor || input.type !== "float32") {
-        throw new PolicyError(`the program's input '${input.name}' must be a float32 tensor`);
+      if (!input.isTensor) throw new PolicyError(`the program's input '${input.name}' must be a tensor`);
+      const isWeight = !/^(observations\/.*|masks\/.*|uniform|normal|state)$/s.test(input.name);
+      if (isWeight) this.#weightShapes.set(input.name, input.shape);
+      else this.#inputs.set(input.name, input);
+      if (isWeight && input.type !== "float32") {
+        throw new PolicyError(`the program's weights '${input.name}' must be float32`);
       }
-      if (input.name === "state") stateSize = Number(input.shape[1]);
-      else if (input.name !== "observations") this.#weightShapes.set(input.name, input.shape);
     }
-    if (!session.inputNames.includes("observations") || session.outputNames[0] !== "logits") {
-      throw new PolicyError("the program must compute 'logits' from 'observations'");
+    const outputs = session.outputNames;
+    if (!outputs.some((name) => name.startsWith("actions/")) || !outputs.includes("log_prob")) {
+      throw new PolicyError("the program must compute 'actions/NAME' and 'log_prob'");
     }
-    this.stateSize = stateSize;
+    this.stateSize = this.#size("state");
+    if (this.stateSize && !outputs.includes("next_state")) {
+      throw new PolicyError("the program must compute 'next_state' from 'state'");
+    }
   }
 
   /** Use these weights from the next `act` on. Throws PolicyError if they do not match the program's inputs. */
@@ -72,44 +85,43 @@ export class Policy implements BehaviourPolicy {
     this.#weights = bound;
   }
 
-  async act(
-    observations: Float32Array,
-    shape: number[],
-    state: Float32Array,
-    random: () => number,
-  ): Promise<SampledRow> {
-    const rows = observations.length / shape.reduce((product, side) => product * side, 1);
-    const feeds: Record<string, Tensor> = {
-      ...this.#weights,
-      observations: new Tensor("float32", observations, [rows, ...shape]),
-    };
+  async act(observations: Components, state: Float32Array, masks: Components, random: () => number): Promise<Choice> {
+    const rows = Object.values(observations)[0].shape[0];
+    const feeds: Record<string, Tensor> = { ...this.#weights };
+    for (const [name, array] of Object.entries(observations)) this.#set(feeds, `observations/${name}`, array);
+    for (const [name, array] of Object.entries(masks)) this.#set(feeds, `masks/${name}`, array);
+    for (const [name, draw] of [["uniform", uniform], ["normal", normal]] as const) {
+      const size = this.#size(name);
+      if (size) feeds[name] = new Tensor("float32", draw(rows * size, random), [rows, size]);
+    }
     if (this.stateSize) feeds.state = new Tensor("float32", state, [rows, this.stateSize]);
-    const { logits, next_state } = await this.#session.run(feeds);
-    const { actions, logProbs } = sample(logits.data as Float32Array, rows, random);
-    return { actions, logProbs, state: this.stateSize ? (next_state.data as Float32Array) : state };
+    const outputs = await this.#session.run(feeds);
+    const actions: Choice["actions"] = {};
+    for (const [name, { type, data }] of Object.entries(outputs)) {
+      if (!name.startsWith("actions/")) continue;
+      const whole = type === "int64" ? Int32Array.from(data as BigInt64Array, Number) : (data as Float32Array);
+      actions[name.slice("actions/".length)] = whole;
+    }
+    const next = this.stateSize ? (outputs.next_state.data as Float32Array) : state;
+    return { actions, logProbs: outputs.log_prob.data as Float32Array, state: next };
   }
-}
 
-/**
- * Sample an action from the softmax of each row of logits [E, A], by inverting the cumulative distribution.
- *
- * Returns the actions [E] and their log-probabilities [E].
- */
-export function sample(logits: Float32Array, rows: number, random: () => number) {
-  const choices = logits.length / rows;
-  const actions = new Uint8Array(rows);
-  const logProbs = new Float32Array(rows);
-  for (let row = 0; row < rows; row++) {
-    const shifted = logits.slice(row * choices, (row + 1) * choices);
-    const largest = Math.max(...shifted);
-    const weights = Array.from(shifted, (logit) => Math.exp(logit - largest));
-    const total = weights.reduce((sum, weight) => sum + weight, 0);
-    let left = random() * total;
-    let action = 0;
-    // Stop at the last action: because of rounding, the weights may sum to less than `left`.
-    while (action < choices - 1 && left >= weights[action]) left -= weights[action++];
-    actions[row] = action;
-    logProbs[row] = shifted[action] - largest - Math.log(total);
+  /** Set an input of a component. A component that the network does not use is not in the program. */
+  #set(feeds: Record<string, Tensor>, name: string, { dtype, shape, data }: WireArray): void {
+    const input = this.#inputs.get(name);
+    if (!input) return;
+    if (input.type === "int64") {
+      // Discrete observations, which messages hold in fewer bits.
+      feeds[name] = new Tensor("int64", BigInt64Array.from(data as Uint8Array, BigInt), shape);
+      return;
+    }
+    const type = TENSOR_TYPES[dtype as keyof typeof TENSOR_TYPES];
+    if (type !== input.type) throw new PolicyError(`the program's input '${name}' is ${input.type}, not ${dtype}`);
+    feeds[name] = new Tensor(type, data as Uint8Array, shape);
   }
-  return { actions, logProbs };
+
+  /** Return the second dimension of an input, or 0 if the program does not have it. */
+  #size(name: string): number {
+    return Number(this.#inputs.get(name)?.shape[1] ?? 0);
+  }
 }

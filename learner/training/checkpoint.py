@@ -17,7 +17,15 @@ import safetensors.numpy
 import safetensors.torch
 from torch import Tensor
 
-from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, SavedPolicy, checkpoints, read_policy
+from daedalus.policy.saving.saved_policy import (
+    FORMAT,
+    PARAMETERS_FILE,
+    PROGRAM_FILE,
+    OtherFormatError,
+    SavedPolicy,
+    checkpoints,
+    read_policy,
+)
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -60,6 +68,7 @@ def save_checkpoint(
         _STATE_FILE: safetensors.torch.save(state),
     }
     content = {
+        "format": FORMAT,
         "policy_version": policy_version,
         "spec": spec.model_dump(mode="json"),
         "spaces": spaces.model_dump(mode="json"),
@@ -93,11 +102,13 @@ def load_checkpoint(directory: Path) -> Checkpoint:
 def load_newest(run_directory: Path) -> Checkpoint:
     """Return the newest undamaged checkpoint, and log a warning for each damaged checkpoint.
 
-    Raises DamagedError if there is no undamaged checkpoint.
+    Raises DamagedError if there is no undamaged checkpoint, OtherFormatError for a run of another release.
     """
     for directory in checkpoints(run_directory):
         try:
             return load_checkpoint(directory)
+        except OtherFormatError:
+            raise
         except DamagedError as error:
             _logger.warning("damaged checkpoint skipped: %s", error)
     raise DamagedError(f"{run_directory} has no readable checkpoint: start a new run with another --run-dir")

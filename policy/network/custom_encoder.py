@@ -2,7 +2,8 @@
 
 The class is constructed with one argument, the shape of an observation, frame stack included. It is called with
 observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32. If the
-observation has several components, it is constructed with a map of shapes, and called with a map of tensors.
+observation has several components, it is constructed with a map of shapes, and called with a map of tensors; discrete
+components are int64 [N, D].
 """
 
 import torch
@@ -48,7 +49,10 @@ class CustomEncoder(nn.Module):
 
 def _zeros(spaces: ObservationSpaces) -> dict[str, Tensor]:
     return {
-        name: torch.zeros((2, *space.stacked_shape), dtype=getattr(torch, space.dtype))
+        name: torch.zeros(
+            (2, *space.stacked_shape),
+            dtype=torch.int64 if isinstance(space, DiscreteSpace) else getattr(torch, space.dtype),
+        )
         for name, space in spaces.items()
     }
 

@@ -22,7 +22,12 @@ from daedalus.protocol.spec import RunSpec
 _logger = logging.getLogger(__name__)
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
+FORMAT = 2  # of the spaces, the program and the names of the parameters; older releases wrote no number
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
+
+
+class OtherFormatError(DamagedError):
+    """A checkpoint of another format, which another release wrote."""
 
 
 class NoPolicyError(Exception):
@@ -53,7 +58,7 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """Return the policy of a checkpoint, or the best policy of a run directory.
 
     The newest policy of the run is returned if no checkpoint has a score or `newest` is true. Damaged checkpoints are
-    logged and skipped. Raises DamagedError if no checkpoint is readable.
+    logged and skipped. Raises DamagedError if no checkpoint is readable, OtherFormatError for a run of another release.
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
@@ -63,6 +68,8 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     for candidate in candidates:
         try:
             return read_policy(candidate)
+        except OtherFormatError:
+            raise
         except DamagedError as error:
             _logger.warning("skipped a damaged checkpoint: %s", error)
     raise DamagedError(f"{directory} has no readable checkpoint")
@@ -90,8 +97,14 @@ def export_policy(checkpoint: Path, target: Path) -> None:
 
 
 def read_policy(directory: Path) -> SavedPolicy:
-    """Return the policy in one checkpoint. Raises DamagedError if the checkpoint is damaged."""
+    """Return the policy of a checkpoint. Raises DamagedError if damaged, OtherFormatError for another format."""
     sealed = SealedDirectory(directory)
+    found = sealed.content.get("format", 1)
+    if found != FORMAT:
+        raise OtherFormatError(
+            f"{directory} has format {str(found)[:20]} of checkpoints, and this release reads format {FORMAT} only: "
+            "use the release that wrote it, or train again from the run's config.toml"
+        )
     try:
         return SavedPolicy(
             directory=directory,

@@ -12,8 +12,8 @@ from building import SPACES, run_spec
 from log_lines import LINES
 
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
-from daedalus.policy.saving.saved_policy import checkpoints, read_policy
-from daedalus.policy.saving.sealed import DamagedError
+from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, read_policy
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
 COUNTERS = {"env_steps": 12, "returns": [1.5, -2.25], "rollouts_rejected": {"stale": 3}}
@@ -89,6 +89,17 @@ def test_load_newest_raises_when_no_checkpoint_is_undamaged(tmp_path: Path) -> N
     with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
     assert len(LINES) == 2
+
+
+def test_run_of_another_format_is_refused_and_its_checkpoints_are_not_called_damaged(tmp_path: Path) -> None:
+    for version in (1, 2):
+        directory = save(tmp_path, version)
+        sealed = SealedDirectory(directory)
+        files = {name: sealed.read(name) for name in FILES if name not in ("manifest.json", "seal")}
+        write_sealed(directory, files, {**sealed.content, "format": FORMAT - 1})
+    with pytest.raises(OtherFormatError, match=rf"has format {FORMAT - 1} of checkpoints.* reads format {FORMAT} only"):
+        load_newest(tmp_path)
+    assert not LINES
 
 
 FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]

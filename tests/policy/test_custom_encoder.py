@@ -11,11 +11,13 @@ from plain import NAME, act, array_space
 from policies import make_policy, observations, spaces
 from torch import nn
 
+from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
 PREAMBLE = """
@@ -33,7 +35,7 @@ class Base(nn.Module):
 """
 SPACES = spaces((9, 11), frames=3)
 
-Building = Callable[[str], ActorCritic]
+Building = Callable[..., ActorCritic]
 
 
 @pytest.fixture
@@ -43,9 +45,9 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
-    def from_source(source: str) -> ActorCritic:
+    def from_source(source: str, where: Spaces = SPACES) -> ActorCritic:
         (tmp_path / "users_own.py").write_text(PREAMBLE + source)
-        return ActorCritic(PolicySpec(encoder="users_own:Net"), SPACES, UserModules(frozenset({"users_own"})))
+        return ActorCritic(PolicySpec(encoder="users_own:Net"), where, UserModules(frozenset({"users_own"})))
 
     yield from_source
     sys.modules.pop("users_own", None)
@@ -81,6 +83,44 @@ class Net(Base):
     seen = torch.full((2, 4, 3, 9, 11), 7, dtype=torch.uint8)
     logits, _ = network({NAME: seen}, torch.zeros(4, 0), torch.zeros(2, 4, dtype=torch.bool))
     assert logits.shape == (2, 4, 4)
+
+
+def test_encoder_of_several_components_receives_maps_and_is_exported(build: Building) -> None:
+    where = Spaces(
+        observations={
+            "camera": ArraySpace(shape=(9, 11), dtype="uint8", frames=3),
+            "goal": DiscreteSpace(counts=(3, 700)),
+        },
+        actions={"action": DiscreteSpace(counts=(4,))},
+    )
+    network = build(
+        """
+class Net(nn.Module):
+    def __init__(self, shapes):
+        super().__init__()
+        assert shapes == {"camera": (3, 9, 11), "goal": (2,)}, shapes
+        self.camera, self.goal = Base(shapes["camera"]), nn.Embedding(700, 5)
+
+    def forward(self, observations):
+        assert observations["goal"].dtype == torch.int64  # as an embedding requires
+        return torch.cat([self.camera(observations["camera"]), self.goal(observations["goal"][:, 1])], 1)
+""",
+        where,
+    )
+    runtime = OnnxRuntime(export_program(network, where))
+    runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
+    random = np.random.default_rng(0)
+    seen = {
+        "camera": random.integers(0, 256, (5, 3, 9, 11), np.uint8),
+        "goal": np.stack([random.integers(0, 3, 5), random.integers(300, 700, 5)], 1).astype(np.uint16),
+    }
+    choice = runtime.act(seen, np.zeros((5, 0), np.float32), draw_noise(runtime.noise_size, 5, random), {})
+    with torch.no_grad():
+        tensors = {"camera": torch.from_numpy(seen["camera"]), "goal": torch.from_numpy(seen["goal"].astype(np.int64))}
+        parameters, _ = network.step(tensors, torch.zeros(5, 0))
+        actions = {name: torch.from_numpy(values) for name, values in choice.actions.items()}
+        expected = network.distribution.log_prob(parameters, actions, {})
+    np.testing.assert_allclose(choice.log_probs, expected.numpy(), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["not_there_at_all:Net", "not_there.at_all:Net"])

@@ -15,7 +15,15 @@ import pytest
 import safetensors.numpy
 from plain import vector_spaces
 
-from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE, checkpoints, read_policy
+from daedalus.policy.saving.saved_policy import (
+    FORMAT,
+    PARAMETERS_FILE,
+    PROGRAM_FILE,
+    OtherFormatError,
+    checkpoints,
+    find_policy,
+    read_policy,
+)
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 
 FILES = {"weights": bytes(range(40)), "program": b"onnx", "empty": b""}
@@ -198,6 +206,7 @@ def test_leftovers_of_an_earlier_attempt_are_replaced(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------- the policy in it
 
 POLICY_CONTENT: dict[str, Any] = {
+    "format": FORMAT,
     "policy_version": 7,
     "spec": {"environment": {"id": "CartPole-v1"}},
     "spaces": vector_spaces(4, 2).model_dump(mode="json"),
@@ -229,7 +238,23 @@ def test_policy_of_another_release_is_rejected_with_its_directory(tmp_path: Path
         read_policy(tmp_path / "0007")
 
 
-@pytest.mark.parametrize("name", POLICY_CONTENT)
+@pytest.mark.parametrize("number", [None, FORMAT + 1, "x" * 99])
+def test_policy_of_another_format_is_refused_with_both_formats(tmp_path: Path, number: object) -> None:
+    """Releases before the number existed wrote format 1: their spaces and programs are others."""
+    content = {name: value for name, value in POLICY_CONTENT.items() if name != "format"}
+    run = tmp_path / "run"
+    for version in (1, 2):
+        directory = run / "checkpoints" / f"{version:010d}"
+        write_sealed(directory, POLICY_FILES, content if number is None else {**content, "format": number})
+    expected = str(1 if number is None else number)[:20]
+    for read in (read_policy, find_policy):
+        with pytest.raises(
+            OtherFormatError, match=rf"0000000002 has format {expected} of .* reads format {FORMAT} only"
+        ):
+            read(run if read is find_policy else directory)
+
+
+@pytest.mark.parametrize("name", [name for name in POLICY_CONTENT if name != "format"])
 def test_incomplete_policy_is_rejected(tmp_path: Path, name: str) -> None:
     content = {key: value for key, value in POLICY_CONTENT.items() if key != name}
     write_sealed(tmp_path / "0007", POLICY_FILES, content)

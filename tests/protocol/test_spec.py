@@ -5,6 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from daedalus.protocol.algorithms import ALGORITHMS
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import JOIN_LIMITS
+from daedalus.protocol.messages import Join
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
@@ -258,6 +261,29 @@ def test_observations_too_large_for_memory_are_refused(shape: tuple[int, ...], f
 def test_inconsistent_space_is_rejected(space: type[Specification], fields: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValidationError, match=reason):
         space.model_validate(fields)
+
+
+LONGEST = {"kind": "continuous", "low": [-1.23456789e-300] * 4096, "high": [1.23456789e300] * 4096}
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "reason"),
+    [
+        ({"a": ARRAY}, {"a": {"kind": "discrete", "counts": [65_536]}, "b": CONTINUOUS}, "65,538 choices and numbers"),
+        ({"a": {"kind": "discrete", "counts": [2]}}, {"a": LONGEST, "b": LONGEST}, "8,193 variables"),
+        ({"a": {**ARRAY, "shape": [2**23]}, "b": {**ARRAY, "shape": [2**23 + 1]}}, {"a": DISCRETE}, "bytes"),
+    ],
+)
+def test_components_have_limits_together(observations: dict, actions: dict, reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        Spaces.model_validate({"observations": observations, "actions": actions})
+
+
+def test_join_with_the_largest_spaces_is_within_its_limits() -> None:
+    many = {f"{'x' * 60}{number}": {**ARRAY, "shape": [16_000, 1, 1, 1]} for number in range(64)}
+    spaces = Spaces.model_validate({"observations": many, "actions": {"a": LONGEST, "b": LONGEST}})
+    join = Join(actor="a" * 64, incarnation=2**62, spaces=spaces, environments=4096)
+    assert decode(encode(join), JOIN_LIMITS) == join
 
 
 def test_spaces_of_several_components_have_a_readable_string() -> None:
