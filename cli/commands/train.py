@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import signal
 import sys
 from pathlib import Path
 from typing import Any, TextIO
@@ -70,6 +71,7 @@ def train(arguments: list[str]) -> int:
     started = process_started()
     parsed = train_parser().parse_args(arguments)
     configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
@@ -79,9 +81,6 @@ def train(arguments: list[str]) -> int:
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
     except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("stopped")
         return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
@@ -95,6 +94,7 @@ def resume(arguments: list[str]) -> int:
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
     configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         spec = _resumed_spec(parsed)
