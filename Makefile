@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-compose examples attack fuzz docs check format clean
+.PHONY: train test test-compose examples attack fuzz mutants docs check format clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -41,6 +41,15 @@ fuzz: .venv/ready-test
 	mkdir -p build/fuzz
 	$(BIN)/python -m benchmarks.fuzz_decoder build/fuzz tests/protocol/fuzz_corpus \
 		-max_total_time=60 -artifact_prefix=build/fuzz/
+
+# Change the central files in many small ways, each of which must make a test fail. Takes about an hour of CPU time.
+mutants: .venv/ready-test
+	$(PIP) -e ".[mutants]"
+	rm -rf build/mutants
+	mkdir -p build/mutants
+	cp -RL daedalus tests pyproject.toml build/mutants
+	cd build/mutants && OMP_NUM_THREADS=1 nice ../../$(BIN)/mutmut run
+	cd build/mutants && ../../$(BIN)/mutmut export-cicd-stats && ../../$(BIN)/python tests/mutants.py
 
 # The documentation site, in build/site: open index.html there.
 docs: .venv/ready-test

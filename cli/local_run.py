@@ -13,6 +13,7 @@ from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.confirmation import confirmation, confirmation_arguments
+from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
@@ -38,30 +39,6 @@ class RunFailedError(Exception):
 
 class RunStoppedError(Exception):
     """Error of a run that was stopped before its end."""
-
-
-class RunObserver:
-    """Observer of the training of a run. This one does nothing."""
-
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        """File descriptors that the learner inherits."""
-        return ()
-
-    @property
-    def learner_options(self) -> list[str]:
-        """Options of the learner."""
-        return []
-
-    def begin(self) -> None:
-        """Called before the processes start."""
-
-    def end(self) -> None:
-        """Called after they have ended, in any way."""
-
-    def poll(self, learner: subprocess.Popen[bytes]) -> bool:
-        """Do what is due, and return whether training has to end. Called many times a second."""
-        return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -104,13 +104,17 @@ def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = l
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
 
-    Every command runs in it. `outputs` are the streams that it writes to, besides standard output and standard error.
+    Every command runs in it. After Ctrl-C the status is 1. `outputs` are the streams that the command writes to,
+    besides standard output and standard error.
     """
     try:
         try:
             return command()
         finally:
             sys.stdout.flush()
+    except KeyboardInterrupt:  # before a command has handlers of its own, or without any
+        print("stopped", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         unread = [stream for stream in (*outputs, sys.stdout, sys.stderr) if _is_unread(stream)]
         if not unread:  # another pipe: a fault of ours

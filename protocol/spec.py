@@ -161,7 +161,8 @@ class TrainingSpec(Specification):
     batch_rollouts: PositiveInt | None = None
     """Rollouts in a batch. Unset: 1 for `a3c`, `collection.actors` for `impala` and `appo`. Not for `a2c`."""
     max_policy_lag: NaturalInt | None = None
-    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches."""
+    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches, for
+    `a3c` of 8."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""
@@ -227,7 +228,9 @@ class TrainingSpec(Specification):
     @property
     def policy_lag_bound(self) -> int:
         """Largest policy lag that is learned from, in updates."""
-        return 32 * self.updates_per_batch if self.max_policy_lag is None else self.max_policy_lag
+        if self.max_policy_lag is not None:
+            return self.max_policy_lag
+        return ALGORITHMS[self.algorithm].max_lag_batches * self.updates_per_batch
 
 
 class EvaluationSpec(Specification):

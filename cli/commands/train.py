@@ -1,10 +1,10 @@
 """`daedalus train` and `daedalus resume`: train with a learner and actors on this machine, and evaluate the policy."""
 
 import argparse
-import importlib.util
+import signal
 import sys
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allowing, command_parser
 from daedalus.cli.child_output import ChildOutput
@@ -12,6 +12,7 @@ from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, ru
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
+from daedalus.cli.run_report import report
 from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
@@ -71,6 +72,7 @@ def train(arguments: list[str]) -> int:
     started = process_started()
     parsed = train_parser().parse_args(arguments)
     configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
@@ -85,9 +87,6 @@ def train(arguments: list[str]) -> int:
     except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("stopped")
-        return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
@@ -100,6 +99,7 @@ def resume(arguments: list[str]) -> int:
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
     configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         spec = _resumed_spec(parsed)
@@ -219,7 +219,7 @@ def _run(
         if not (resume or output.withheld):
             run_directory.remove_failed(directory)
         return error.status
-    print(_report(run, end.summary))
+    print(report(run, end.summary))
     return end.status
 
 
@@ -234,40 +234,3 @@ def _print_err(line: str) -> None:
 def _print_line(line: str, stream: TextIO) -> None:
     """Print a line in place of the line of progress that the learner rewrites on the same terminal."""
     print(f"\r\x1b[K{line}" if stream.isatty() else line, file=stream, flush=True)
-
-
-def _report(run: LocalRun, summary: dict[str, Any]) -> str:
-    target = run.spec.training.target_return
-    if summary["solved"]:
-        trained = (
-            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s, "
-            f"{summary['env_steps']:,} env_steps, {summary['updates']:,} updates"
-        )
-    else:
-        goal = "" if target is None else f" (the target {target:g} was not reached)"
-        trained = f"done: {summary['env_steps']:,} env_steps, {summary['updates']:,} updates{goal}"
-    evaluation = summary["evaluation"]
-    evaluated = (
-        f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
-        f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
-        f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
-        f"on {evaluation['backend']}'s {evaluation['environment']}"
-    )
-    folder = f"run directory: {run.directory}"
-    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
-        folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
-    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
-
-
-def _confirmed(summary: dict[str, Any]) -> list[str]:
-    """Return the line about the new episodes that confirm "solved", if there is one."""
-    confirmation = summary.get("confirmation")
-    if confirmation is None:
-        return []
-    line = (
-        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
-        "of the policy at that moment"
-    )
-    if confirmation["interval"] is not None:
-        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
-    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]

@@ -1,11 +1,11 @@
-"""cli/processes.py: limits of a process."""
+"""cli/processes.py: limits and the end of a process."""
 
 import resource
 from collections.abc import Iterator
 
 import pytest
 
-from daedalus.cli.processes import raise_descriptor_limit
+from daedalus.cli.processes import exit_status, raise_descriptor_limit
 
 
 @pytest.fixture
@@ -22,3 +22,11 @@ def test_descriptor_limit_is_raised_to_the_hard_limit(limits: tuple[int, int]) -
     assert resource.getrlimit(resource.RLIMIT_NOFILE) == (hard, hard)
     raise_descriptor_limit()
     assert resource.getrlimit(resource.RLIMIT_NOFILE) == (hard, hard)
+
+
+def test_ctrl_c_prints_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    assert exit_status(interrupted) == 1
+    assert capsys.readouterr().err == "stopped\n"

@@ -1,10 +1,11 @@
 """Test of mistakes on the command line: one line that says what to do, and an exit status other than 0."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Running
+from processes import Running, until
 
 from daedalus.cli import main
 
@@ -69,6 +70,18 @@ def test_a_fault_of_the_environment_is_reported_once_before_anything_starts(
     running.expect(message)
     assert len(running.lines) == 1, running.output
     assert not run.exists()
+
+
+def test_a_signal_ends_the_check_of_an_environment_that_hangs(start: Start, tmp_path: Path) -> None:
+    words = ["faulty_environments:Faulty-v0", "--set", "environment.kwargs.fault=hang", "--run-dir", tmp_path / "run"]
+    running = start("train", "--env", *words, directory=Path(__file__).parent.parent)
+    process = running.process.pid
+    children = Path(f"/proc/{process}/task/{process}/children")
+    until(lambda: children.read_text())
+    running.process.send_signal(signal.SIGTERM)
+    assert running.wait() == 1
+    assert running.lines == ["stopped"]
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_missing_cuda_device_is_reported_in_one_line(

@@ -1,4 +1,4 @@
-"""The last lines of `daedalus train`."""
+"""cli/run_report.py: the last lines of `daedalus train`."""
 
 import importlib.util
 import time
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli.commands.train import _report
 from daedalus.cli.local_run import LocalRun
+from daedalus.cli.run_report import report
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 SUMMARY = {
@@ -33,7 +33,7 @@ def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
-    text = _report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
+    text = report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
     assert "episodes of the newest checkpoint on gymnasium's CartPole-v1\n7 of 9 episodes were cut\nrun" in text
     assert "run directory: runs/one" in text
     assert ("daedalus plot runs/one" in text) == installed

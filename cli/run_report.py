@@ -1,0 +1,44 @@
+"""The last lines that `daedalus train` prints."""
+
+import importlib.util
+from typing import Any
+
+from daedalus.cli.local_run import LocalRun
+
+
+def report(run: LocalRun, summary: dict[str, Any]) -> str:
+    """Return the result of a run from its summary.json, with the evaluation."""
+    target = run.spec.training.target_return
+    if summary["solved"]:
+        trained = (
+            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s, "
+            f"{summary['env_steps']:,} env_steps, {summary['updates']:,} updates"
+        )
+    else:
+        goal = "" if target is None else f" (the target {target:g} was not reached)"
+        trained = f"done: {summary['env_steps']:,} env_steps, {summary['updates']:,} updates{goal}"
+    evaluation = summary["evaluation"]
+    evaluated = (
+        f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
+        f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
+        f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
+        f"on {evaluation['backend']}'s {evaluation['environment']}"
+    )
+    folder = f"run directory: {run.directory}"
+    if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
+        folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
+    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+
+
+def _confirmed(summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
+        "of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
+    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]
