@@ -223,6 +223,7 @@ def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
     ("fields", "updates", "bound"),
     [
         ({"algorithm": "impala", "passes": 5}, 1, 32),
+        ({"algorithm": "a3c"}, 1, 8),
         ({"algorithm": "appo", "passes": 3, "minibatches": 4}, 12, 384),
         ({"algorithm": "appo", "passes": 1, "minibatches": 1}, 1, 32),
         ({"algorithm": "appo", "passes": 3, "minibatches": 4, "max_policy_lag": 7}, 12, 7),
