@@ -50,6 +50,11 @@ def printable(text: str) -> str:
     return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
+def one_line(text: str) -> str:
+    """Return `text` in one line, with control characters escaped."""
+    return printable(" ".join(text.split()))
+
+
 class _LineHandler(logging.Handler):
     """Handler that writes each record as one line. It ignores a closed terminal."""
 

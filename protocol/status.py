@@ -9,6 +9,9 @@ class ActorStatus(Specification):
     """State of one actor."""
 
     actor: str
+    host: str  # where it runs, what it runs and its address, as the actor states them
+    software: str
+    address: str
     alive: bool
     quarantined: str  # why its rollouts are no longer accepted; empty if they are
     lives: int  # incarnations that joined
@@ -24,6 +27,17 @@ class ActorStatus(Specification):
     compact_snapshots: bool  # it requests compact snapshots at its own rate, instead of receiving every snapshot
     bytes_up_per_hour: float  # of rollouts, at the rate of the last seconds
     bytes_down_per_hour: float  # of snapshots
+
+
+class RefusedJoin(Specification):
+    """Joins that were refused for the same reason, and failures that actors of one host reported."""
+
+    actor: str  # that was refused last
+    host: str  # as the actor states it; empty if it is not known
+    software: str  # likewise, or the protocol version if it is not this learner's
+    reason: str
+    count: int
+    seconds_since_last: float
 
 
 class ActorsPage(Specification):
@@ -61,4 +75,5 @@ class RunStatus(Specification):
     actors_alive: int
     actors_quarantined: int  # present, but their rollouts are no longer accepted
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
+    refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name

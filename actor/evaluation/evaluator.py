@@ -14,6 +14,7 @@ from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -34,6 +35,7 @@ class Evaluator:
         self._config, self._stop = config, stop
         self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
+        self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
         self._warned_of_cuts = False
 
     def run(self) -> bool:
@@ -42,15 +44,17 @@ class Evaluator:
         Raises ActorError if the evaluator is refused, EnvironmentSetupError if the environment cannot be created here,
         PolicyError if the policy does not run.
         """
-        join = Join(actor=self._config.name, incarnation=self._config.incarnation)
         try:
             while True:
                 self._evaluate_learner(
-                    self._queries.join_learner(self._config.run, join, self._config.timeout, self._end)
+                    self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._end)
                 )
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished
+        except Exception as error:
+            self._queries.report_failure(self._end.run, self._join, error)
+            raise
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""

@@ -13,6 +13,7 @@ from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
@@ -65,7 +66,7 @@ class ActorService:
         """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
         self._config, self._transport, self._stop = config, transport, stop
         self._collector = collector or EnvironmentCollector(config.environments, config.modules)
-        self._join = Join(actor=config.name, incarnation=config.incarnation)
+        self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
@@ -95,6 +96,9 @@ class ActorService:
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished
+        except Exception as error:
+            self._queries.report_failure(self._end.run, self._join, error)
+            raise
         finally:
             self._collector.close()
 

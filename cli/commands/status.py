@@ -1,16 +1,17 @@
 """`daedalus status`: show the state of a learner and its actors, for a person or for a health check."""
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import printable
+from daedalus.cli.logs import one_line, printable
 from daedalus.cli.status_query import ask, fleet_size
 from daedalus.learner.run.heartbeat import silence
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, RefusedJoin, RunStatus
 from daedalus.transport.connecting import connect
 from daedalus.transport.credentials import WARNING_DAYS
 from daedalus.transport.interface import TransportError
@@ -80,12 +81,12 @@ def status(arguments: list[str]) -> int:
         return NO_ANSWER
     for status in statuses:
         if parsed.json:
-            print(status.model_dump_json())
+            print(json.dumps(status.model_dump(mode="json")))  # in ASCII: texts of peers cannot command a terminal
         elif not parsed.quiet:
-            print(printable(_table(status)))
+            print(_table(status))
         else:
             for problem in status.problems:
-                print(printable(f"{status.run}: {problem}"))
+                print(one_line(f"{status.run}: {problem}"))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -115,12 +116,23 @@ def _table(status: RunStatus) -> str:
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
         f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
-        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}  rejected",
+        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}"
+        "  rejected; host, address, software",
         *(f"  {_line(actor)}" for actor in status.actors),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
+        *map(_refused, status.refused_joins),
     ]
-    return "\n".join(lines)
+    return "\n".join(printable(line.replace("\n", " ")) for line in lines)
+
+
+def _refused(refused: RefusedJoin) -> str:
+    """Return the line of an actor that was refused or failed."""
+    where = ", ".join(filter(None, (refused.host, refused.software)))
+    return (
+        f"  refused: {refused.actor}{f' ({where})' if where else ''}, {refused.count:,} x, last "
+        f"{refused.seconds_since_last:,.0f} s ago: {refused.reason}"
+    )
 
 
 def _expiry(days: float | None) -> list[str]:
@@ -139,9 +151,10 @@ def _line(actor: ActorStatus) -> str:
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
     down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.compact_snapshots else ''}"
+    where = ", ".join(filter(None, (actor.host, actor.address, actor.software)))
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
         f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
         f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
-        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}"
+        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}; {where or '-'}"
     )

@@ -57,7 +57,7 @@ for (const [name, { kind, fields, arrays }] of Object.entries(VALUES)) {
   test(`${name} is encoded to the same bytes`, () => {
     const message = decode(bytesOf(name));
     // JavaScript does not distinguish 50.0 from 50: the bytes of messages with such numbers may differ.
-    if (kind === "Welcome" || kind === "StatusReport") assert.deepEqual(decode(encode(message)), message);
+    if (["Welcome", "StatusReport", "ActorsReport"].includes(kind)) assert.deepEqual(decode(encode(message)), message);
     else assert.deepEqual(plain(encode(message)), plain(bytesOf(name)));
   });
 }

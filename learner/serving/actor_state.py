@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.sequence_window import SequenceWindow
+from daedalus.protocol.messages import UNKNOWN, Origin
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
 _MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
@@ -18,6 +19,7 @@ class Actor:
     lives_before: int = 0  # a number that is different after an actor of this name was forgotten
     incarnation: int = -1  # the newest; -1 before the first Join
     incarnations: int = 0  # number of incarnations that joined
+    origin: Origin = UNKNOWN  # of the newest incarnation
     environments: int = 0  # 0 before the actor has joined with its spaces
     last_seen: float = 0.0
     sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation

@@ -15,6 +15,7 @@ import numpy as np
 from daedalus.learner.serving.actor_state import Actor
 from daedalus.learner.serving.former_incarnations import Former, FormerIncarnations
 from daedalus.learner.serving.presence import Presence
+from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
 from daedalus.protocol.spaces import Spaces
@@ -38,6 +39,7 @@ class Fleet:
         self.forgotten = 0  # number of actors that were forgotten
         self.forgotten_missed = 0  # rollouts of forgotten actors that never arrived
         self.forgotten_busy = 0  # `busy` answers to forgotten actors
+        self.refused_joins = RefusedJoins()
         self._presence = Presence()
         self._former = FormerIncarnations()
         self._of_owner: Counter[str] = Counter()  # number of actors
@@ -75,11 +77,12 @@ class Fleet:
             self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten)
             self._of_owner[keys.owner(join.actor)] += 1
         self.spaces = join.spaces
+        self.refused_joins.joined(join.actor)
         actor = self.actors[join.actor]
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
             self._replace_incarnation(actor, join.incarnation)
-        actor.environments = join.environments
+        actor.environments, actor.origin = join.environments, bounded(join.origin)
         self.changed()
         return None
 

@@ -7,7 +7,8 @@ import math
 import threading
 
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.learner.serving.refused_joins import MAX_REASON
+from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import Join, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
@@ -47,24 +48,18 @@ class QueryResponses:
           data: the encoded message.
           now: time on the monotonic clock, in seconds.
         """
-        try:
-            message = decode(data, JOIN_LIMITS)
-        except ProtocolError as error:
-            return encode(Refusal(code="mismatch", reason=str(error)))
-        if not isinstance(message, Join):
-            return encode(Refusal(code="malformed", reason="expected a Join message"))
-        if message.actor != name:
-            reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
-            return encode(Refusal(code="malformed", reason=reason))
-        if self._ending is not None:
+        message = _read_join(name, data)
+        if isinstance(message, Join) and self._ending is not None:
             return encode(self._ending)
         with self._lock:
-            refusal = self._fleet.join(message, now)
+            refusal = message if isinstance(message, Refusal) else self._fleet.join(message, now)
             if refusal is not None:
+                origin = message.origin if isinstance(message, Join) else origin_of(data, JOIN_LIMITS)
+                self._fleet.refused_joins.add(name, origin, refusal.reason, now)
                 if refusal.code == "name_taken":
                     self.postponed_at = now
                 return encode(refusal)
-            seed = self._fleet.seed_for(message.actor, self._start_version)
+            seed = self._fleet.seed_for(name, self._start_version)
             self._lock.notify_all()
         return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
 
@@ -94,6 +89,22 @@ class QueryResponses:
         """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""
         encoded, version = self._snapshot
         return self._unchanged if version is not None and version == held_version else encoded
+
+
+def _read_join(name: str, data: bytes) -> Join | Refusal:
+    """Return the Join that was sent on the key of an actor, or the Refusal of what is none."""
+    try:
+        message = decode(data, JOIN_LIMITS)
+    except ProtocolError as error:
+        return Refusal(code="mismatch", reason=str(error))
+    if not isinstance(message, Join):
+        return Refusal(code="malformed", reason="expected a Join message")
+    if message.actor != name:
+        reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
+        return Refusal(code="malformed", reason=reason)
+    if message.failure:
+        return Refusal(code="failed", reason=message.failure[:MAX_REASON])
+    return message
 
 
 def _refuse(reason: str) -> bytes:

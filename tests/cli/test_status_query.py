@@ -19,7 +19,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import ActorsReport, ActorsRequest, Join, Message, Refusal, StatusReport
-from daedalus.protocol.status import PAGE_ACTORS, ActorsPage, RunStatus
+from daedalus.protocol.status import PAGE_ACTORS, ActorsPage, RefusedJoin, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 MANY = 905
@@ -112,6 +112,9 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
     largest = 2**62
     actor = actor_status(
         "n" * 64,
+        host="\N{EM DASH}" * 64,
+        software="\N{EM DASH}" * 64,
+        address="\N{EM DASH}" * 64,
         quarantined="\N{EM DASH}" * 300,
         lives=largest,
         env_steps=largest,
@@ -123,6 +126,14 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
     )
     data = encode(ActorsReport(page=ActorsPage(learner_epoch=largest, actors=(actor,) * PAGE_ACTORS)))
     assert isinstance(decode(data, STATUS_LIMITS), ActorsReport)
+    refused = RefusedJoin(
+        **dict.fromkeys(("actor", "host", "software"), "\N{EM DASH}" * 64),
+        reason="\N{EM DASH}" * 300,
+        count=largest,
+        seconds_since_last=1.0,
+    )
+    status = run_status(actors=(actor,) * PAGE_ACTORS, refused_joins=(refused,) * 32, problems=("x" * 1000,) * 5)
+    assert isinstance(decode(encode(StatusReport(status=status)), STATUS_LIMITS), StatusReport)
     decode(encode(ActorsRequest(after="n" * 64)), STATUS_REQUEST_LIMITS)
 
 

@@ -1,5 +1,7 @@
 """Test of a real learner with mismatching actors and with arbitrary bytes."""
 
+import re
+import socket
 import struct
 from collections.abc import Callable, Iterator
 
@@ -117,3 +119,5 @@ def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transp
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1
     actor.expect("learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")
+    asked = start("status", "--connect", address, "--run", "run")
+    asked.expect(rf"refused: .* \({re.escape(socket.gethostname())}, daedalus-rl .*\), 1 x, .* 2 choices, but this run")
