@@ -14,7 +14,7 @@ import numpy as np
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import ActorsPage, RunStatus
+from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 
@@ -301,6 +301,18 @@ class ActorsReport:
     page: ActorsPage
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventsRequest:
+    """Request of an operator for the newest events of the run. Operator -> learner, on `status`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventsReport:
+    """The newest events, in answer to an EventsRequest."""
+
+    page: EventsPage
+
+
 Message = (
     Join
     | Welcome
@@ -318,4 +330,6 @@ Message = (
     | StatusReport
     | ActorsRequest
     | ActorsReport
+    | EventsRequest
+    | EventsReport
 )

@@ -1,7 +1,10 @@
 """State of a run and of its actors, as the learner reports it."""
 
+from typing import Literal
+
 from daedalus.protocol.specification import Specification
 
+MAX_EVENTS = 100  # that a learner keeps
 PAGE_ACTORS = 100  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
 
 
@@ -38,6 +41,27 @@ class RefusedJoin(Specification):
     reason: str
     count: int
     seconds_since_last: float
+
+
+EventKind = Literal["started", "joined", "left", "refused", "failed", "rejected", "quarantined", "checkpoint", "ended"]
+
+
+class Event(Specification):
+    """One event of a run, or several equal ones within a minute."""
+
+    time: str  # of the first, by the learner's clock: ISO 8601, UTC
+    kind: EventKind
+    actor: str  # that the event is about; empty if it is about the run
+    text: str
+    count: int
+
+
+class EventsPage(Specification):
+    """The newest events of one learner process (MAX_EVENTS), the newest last."""
+
+    run: str
+    learner_epoch: int
+    events: tuple[Event, ...]
 
 
 class ActorsPage(Specification):

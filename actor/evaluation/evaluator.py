@@ -7,6 +7,7 @@ import itertools
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,9 +31,15 @@ _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices the end of the run
 class Evaluator:
     """One evaluator over one transport."""
 
-    def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
-        """`stop` ends `run`, also in the middle of an episode."""
-        self._config, self._stop = config, stop
+    def __init__(
+        self,
+        config: ActorConfig,
+        transport: Transport,
+        stop: threading.Event,
+        on_join: Callable[[Welcome], object] = lambda _: None,
+    ) -> None:
+        """`stop` ends `run`, also in the middle of an episode; for `on_join`, see ActorService."""
+        self._config, self._stop, self._on_join = config, stop, on_join
         self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
         self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
@@ -59,6 +66,7 @@ class Evaluator:
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
         self._end.follow(welcome.run, welcome.learner_epoch)
+        self._on_join(welcome)
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes

@@ -80,10 +80,14 @@ def main() -> int:
         return BAD_USAGE
     Heartbeat(run.directory).clear()  # before a router is waited for
     progress = Progress(sys.stdout, run.spec.training.env_steps)
-    configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
+    context = {"run": run.directory.name}
+    process = "" if arguments.prepared else "learner"  # the launcher shows the lines to a person
+    configure_logging(
+        arguments.log_level, as_json=arguments.log_json, process=process, context=context, write=progress.say
+    )
     try:
         with ExitStack() as stack:
-            return _serve(run, arguments, credentials, stop, progress, arguments.started or started, stack)
+            return _serve(run, arguments, credentials, stop, progress, arguments.started or started, context, stack)
     except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -96,9 +100,13 @@ def _serve(
     stop: threading.Event,
     progress: Progress,
     started: float,
+    context: dict[str, str],
     stack: ExitStack,
 ) -> int:
-    """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
+    """Run the learner to its end and return the exit status. Raises _FAILURES.
+
+    `context` receives the fields of the log; `stack` closes what is opened.
+    """
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
     restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
@@ -111,9 +119,12 @@ def _serve(
         lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
         stack.enter_context(lock)
         run = replace(run, directory=lock.directory)
+        context["run"] = run.directory.name
     try:
+        service = _service(run, transport, stop, progress, started, restored, credentials)
+        context["epoch"] = f"{service.learner_epoch:x}"
         _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, started, restored, credentials)
+        outcome = service.run()
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)
@@ -155,7 +166,7 @@ def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
         _logger.info("actors join with: daedalus actor --connect %s", " ".join(options))
 
 
-def _train(
+def _service(
     run: ChosenRun,
     transport: Transport,
     stop: threading.Event,
@@ -163,10 +174,10 @@ def _train(
     started: float,
     restored: "Checkpoint | None",
     credentials: Credentials | None,
-) -> Outcome:
-    """Run the learner to its end."""
+) -> LearnerService:
+    """Construct the learner."""
     directory = run.directory
-    service = LearnerService(
+    return LearnerService(
         run.spec,
         directory,
         transport,
@@ -178,7 +189,6 @@ def _train(
         modules=run.modules,
         certificate_days_left=lambda: certificate_days_left(credentials),
     )
-    return service.run()
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":

@@ -1,5 +1,6 @@
-"""Progress of a run: one line that is rewritten on a terminal, or a new line every few seconds elsewhere."""
+"""Progress of a run: one line that is rewritten on a terminal, or a log record every few seconds elsewhere."""
 
+import logging
 import shutil
 import time
 from collections import deque
@@ -9,6 +10,9 @@ from typing import TextIO
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
 _RATE_SECONDS = 30.0  # of the run, over which the rate of the env_steps is measured
+
+
+_logger = logging.getLogger(__name__)
 
 
 class Progress:
@@ -34,9 +38,9 @@ class Progress:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
             self._stream.write(f"\r\x1b[K{line}")
             self._rewriting = True
+            self._stream.flush()
         else:
-            self._stream.write("  ".join(parts) + "\n")
-        self._stream.flush()
+            _logger.info("%s", "  ".join(parts))
 
     def say(self, text: str) -> None:
         """Print a permanent line."""

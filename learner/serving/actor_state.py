@@ -22,6 +22,7 @@ class Actor:
     origin: Origin = UNKNOWN  # of the newest incarnation
     environments: int = 0  # 0 before the actor has joined with its spaces
     last_seen: float = 0.0
+    left: bool = False  # whether the newest incarnation was present and is no longer
     sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
@@ -85,4 +86,5 @@ class Actor:
         self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
         self.incarnations += 1
         self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
+        self.left = False
         self.quarantined, self.fetches, self.compact_snapshots = "", False, False

@@ -129,13 +129,16 @@ class Fleet:
         self._forget(min(absent, key=lambda actor: actor.last_seen))
         return ""
 
+    def lives(self, name: str) -> int:
+        """Return a number that is different for each incarnation that joins under a name."""
+        return self.actors[name].lives if name in self.actors else 0
+
     def seed_for(self, name: str, start_version: int) -> int:
         """Return the seed of an actor's environments and samples.
 
         It differs by name, by incarnation and by `start_version`, the policy version that the run continued from.
         """
-        lives = self.actors[name].lives if name in self.actors else 0
-        entropy = [self._seed, zlib.crc32(name.encode()), lives, start_version]
+        entropy = [self._seed, zlib.crc32(name.encode()), self.lives(name), start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     # ---------------------------------------------------------------------------------------------- forgetting
@@ -165,13 +168,19 @@ class Fleet:
 
     # ------------------------------------------------------------------------------------------------ presence
 
-    def set_present(self, name: str, incarnation: int, present: bool, now: float) -> None:
-        """Record whether an incarnation is present. `now` is on the monotonic clock, in seconds."""
+    def set_present(self, name: str, incarnation: int, present: bool, now: float) -> bool:
+        """Record whether an incarnation is present; return whether an actor that has joined left or returned.
+
+        `now` is on the monotonic clock, in seconds.
+        """
         self._presence.set(name, incarnation, present)
         actor = self.actors.get(name)
-        if actor is not None and actor.incarnation == incarnation:
-            actor.last_seen = now
-            self.changed()
+        if actor is None or actor.incarnation != incarnation:
+            return False
+        actor.last_seen = now
+        self.changed()
+        changed, actor.left = actor.left == present, not present  # its token may come after its Join
+        return changed
 
     def is_present(self, actor: Actor) -> bool:
         """Return whether the newest incarnation of an actor is present."""

@@ -26,8 +26,8 @@ class RefusedJoins:
     def __init__(self) -> None:
         self._entries: dict[tuple[str, str], _Entry] = {}  # by host (or actor) and reason, the newest last
 
-    def add(self, actor: str, origin: Origin, reason: str, now: float) -> bool:
-        """Count a refusal; return whether it is the first of its host and reason.
+    def add(self, actor: str, origin: Origin, reason: str, now: float) -> None:
+        """Count a refusal.
 
         Args:
           actor: name of the actor.
@@ -39,14 +39,12 @@ class RefusedJoins:
         actor, origin, reason = actor[:_MAX_NAME], bounded(origin), reason[:MAX_REASON]
         key = (origin.host or actor, reason)
         entry = self._entries.pop(key, None)
-        is_first = entry is None
         if entry is None:
             self._make_room()
             entry = _Entry(actor, origin, reason)
         entry.actor, entry.origin = actor, origin
         entry.count, entry.last_at = entry.count + 1, now
         self._entries[key] = entry
-        return is_first
 
     def joined(self, actor: str) -> None:
         """Remove the entries of an actor that has joined since."""

@@ -9,8 +9,8 @@ from statuses import actor_status, run_status
 from daedalus.cli.commands.status import status as status_command
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import StatusReport
-from daedalus.protocol.status import RefusedJoin, RunStatus
+from daedalus.protocol.messages import EventsReport, StatusReport
+from daedalus.protocol.status import Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")
@@ -24,7 +24,11 @@ def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     def show(status: RunStatus, *options: str) -> str:
         network = MemoryNetwork()
         learner = MemoryTransport(network)
-        learner.serve(keys.status(status.run), lambda request: request.reply(encode(StatusReport(status=status))))
+        answers = {0: StatusReport(status=status)}  # by the size of the request
+        learner.serve(
+            keys.status(status.run),
+            lambda request: request.reply(encode(answers.get(request.size, EventsReport(page=events_page())))),
+        )
         monkeypatch.setattr("daedalus.cli.commands.status.connect", lambda *_: MemoryTransport(network))
         assert status_command([*CONNECT, *options]) == 0
         return capsys.readouterr().out
@@ -49,6 +53,26 @@ def test_refused_joins_are_shown_with_host_version_and_reason(printed: Print) ->
         "  refused: arm-2, 3 x, last 7 s ago: protocol version 5",
     ]
     assert json.loads(printed(status, "--json"))["refused_joins"][0]["host"] == "arm-box"
+
+
+def events_page() -> EventsPage:
+    events = (
+        Event(time="2026-11-22T13:16:45.123Z", kind="joined", actor="arm-1", text="joined", count=1),
+        Event(time="2026-11-22T13:17:45.123Z", kind="rejected", actor="arm-1", text="a\x1b[2J\nb", count=1200),
+        Event(time="2026-11-22T13:18:45.123Z", kind="checkpoint", actor="", text="checkpoint saved", count=1),
+    )
+    return EventsPage(run="mine", learner_epoch=1, events=events)
+
+
+def test_events_are_shown_with_time_kind_actor_and_count(printed: Print) -> None:
+    lines = printed(run_status(), "--events").splitlines()
+    assert [" ".join(line.split()) for line in lines] == [
+        "run mine: epoch 1, the newest events",
+        "2026-11-22T13:16:45.123Z joined arm-1 joined",
+        "2026-11-22T13:17:45.123Z rejected arm-1 a\\x1b[2J b (1,200 times)",
+        "2026-11-22T13:18:45.123Z checkpoint - checkpoint saved",
+    ]
+    assert json.loads(printed(run_status(), "--events", "--json")) == events_page().model_dump(mode="json")
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])

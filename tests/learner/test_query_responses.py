@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -19,7 +20,7 @@ SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 def make_responses() -> tuple[QueryResponses, Fleet]:
     fleet = Fleet(seed=1, spaces=None)
-    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition()), fleet
+    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition(), EventLog()), fleet
 
 
 def read(data: bytes) -> Message:

@@ -17,6 +17,8 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    EventsReport,
+    EventsRequest,
     Join,
     Message,
     Origin,
@@ -33,7 +35,7 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.status import ActorsPage, ActorStatus, RefusedJoin, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4
@@ -172,6 +174,17 @@ MESSAGES: dict[str, Message] = {
                 ),
             ),
             actors=(_ACTOR,),
+        )
+    ),
+    "events_request": EventsRequest(),
+    "events_report": EventsReport(
+        page=EventsPage(
+            run="r",
+            learner_epoch=9,
+            events=(
+                Event(time="2026-11-22T13:16:45.123Z", kind="joined", actor="wing-1", text="joined", count=1),
+                Event(time="2026-11-22T13:17:45.123Z", kind="checkpoint", actor="", text="checkpoint saved", count=2),
+            ),
         )
     ),
     "actors_request": ActorsRequest(after="wing-0"),

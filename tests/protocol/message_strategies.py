@@ -13,6 +13,8 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    EventsReport,
+    EventsRequest,
     Join,
     Origin,
     Program,
@@ -36,7 +38,7 @@ from daedalus.protocol.spec import (
     ServiceSpec,
     TrainingSpec,
 )
-from daedalus.protocol.status import ActorsPage, ActorStatus, RefusedJoin, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)
@@ -103,6 +105,7 @@ actor_statuses = st.builds(
     **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
     **dict.fromkeys(("busy_answers", "env_steps", "policy_lag"), counters),
 )
+events = st.builds(Event, time=text, actor=text, text=text, count=counters)
 refused_joins = st.builds(
     RefusedJoin,
     count=counters,
@@ -242,6 +245,11 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
     ),
     StatusReport: st.builds(StatusReport, status=statuses),
+    EventsRequest: st.builds(EventsRequest),
+    EventsReport: st.builds(
+        EventsReport,
+        page=st.builds(EventsPage, run=text, learner_epoch=counters, events=st.lists(events, max_size=3).map(tuple)),
+    ),
     ActorsRequest: st.builds(ActorsRequest, after=text),
     ActorsReport: st.builds(
         ActorsReport,
