@@ -11,7 +11,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.protocol.messages import Welcome
 from daedalus.transport.connecting import connect_with_retry
@@ -55,4 +55,4 @@ def main() -> int:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main())
+    sys.exit(exit_status(main))
