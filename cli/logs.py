@@ -1,13 +1,17 @@
-"""Configuration of logging: plain lines for a person, or one JSON object per line for a log collector."""
+"""Configuration of logging: lines for a person, for the log of a service, or JSON objects for a log collector."""
 
 import argparse
 import json
 import logging
 import re
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+
+from daedalus.protocol import keys
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
+EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
 LEVELS = ("debug", "info", "warning", "error")
 
 
@@ -23,22 +27,46 @@ def add_logging(options: argparse._ActionsContainer) -> None:
 
 
 def configure_logging(
-    level: str = "info", *, as_json: bool = False, prefix: str = "", write: Callable[[str], None] | None = None
+    level: str = "info",
+    *,
+    as_json: bool = False,
+    process: str = "",
+    context: Mapping[str, str] | None = None,
+    prefix: str = "",
+    write: Callable[[str], None] | None = None,
 ) -> None:
     """Send the records of all daedalus loggers to the terminal.
 
     Args:
       level: lowest severity of the records shown, one of LEVELS.
-      as_json: write one JSON object per line, for a log collector, instead of plain messages.
-      prefix: text before each plain message, such as the name of the process.
+      as_json: write one JSON object per line, for a log collector.
+      process: kind of this process, such as `learner`: each line has its time and severity, the process and the fields
+        of `context`; in short if standard output is a terminal. Empty: each line has the message alone, for a person.
+      context: fields of each record, such as `run` and `epoch`; read for each record, so the caller may change it.
+      prefix: text before each message without `process`.
       write: called with each line, if a progress line shares the terminal (default: print to standard output).
     """
+    context = {} if context is None else context
+    if as_json:
+        formatter: logging.Formatter = _JsonFormatter(context)
+    elif not process:
+        formatter = _MessageFormatter(prefix)
+    elif sys.stdout.isatty():
+        formatter = _TerminalFormatter(process, context)
+    else:
+        formatter = _ServiceFormatter(process, context)
     handler = _LineHandler(write or _print)
-    plain = logging.Formatter(prefix.replace("%", "%%") + "%(message)s")
-    handler.setFormatter(_JsonFormatter() if as_json else plain)
+    handler.setFormatter(formatter)
+    if not (process or as_json or level == "debug"):
+        handler.addFilter(_needs_attention)
     logger = logging.getLogger("daedalus")
     logger.handlers[:] = [handler]
     logger.setLevel(level.upper())
+
+
+def _needs_attention(record: logging.LogRecord) -> bool:
+    """Return whether a person who watches a command should see a record: it is no ordinary event of a run."""
+    return record.name != EVENTS or record.levelno >= logging.WARNING
 
 
 def _print(line: str) -> None:
@@ -48,6 +76,11 @@ def _print(line: str) -> None:
 def printable(text: str) -> str:
     """Return `text` with control characters escaped: it may come from a peer, and a terminal would obey them."""
     return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
+def one_line(text: str) -> str:
+    """Return `text` in one line, with control characters escaped."""
+    return printable(" ".join(text.split()))
 
 
 class _LineHandler(logging.Handler):
@@ -67,19 +100,90 @@ class _LineHandler(logging.Handler):
             self.handleError(record)
 
 
+class _MessageFormatter(logging.Formatter):
+    """Formatter for a person who watches one command: the message, after the name of the actor that it is about."""
+
+    def __init__(self, prefix: str) -> None:
+        super().__init__()
+        self._prefix = prefix
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        return self._prefix + _about(record) + super().format(record)
+
+
+class _TerminalFormatter(logging.Formatter):
+    """Formatter for a service that runs in a terminal: time of day, process, message."""
+
+    def __init__(self, process: str, context: Mapping[str, str]) -> None:
+        super().__init__()
+        self._process, self._context = process, context
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        of = " ".join(filter(None, (self._process, self._context.get("actor"))))
+        level = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
+        clock = time.strftime("%H:%M:%S", time.localtime(record.created))
+        return f"{clock} {of}: {level}{_about(record)}{super().format(record)}"
+
+
+class _ServiceFormatter(logging.Formatter):
+    """Formatter for the log of a service: each line has time, severity, process and the fields of the context."""
+
+    def __init__(self, process: str, context: Mapping[str, str]) -> None:
+        super().__init__()
+        self._process, self._context = process, context
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        fields = "".join(f" {name}={_word(value)}" for name, value in _fields(record, self._context).items())
+        prefix = f"{_utc(record.created)} {record.levelname.lower()} {self._process}{fields}: "
+        # Each line of a longer text has the prefix: a text of a peer cannot imitate another record.
+        return "\n".join(prefix + line for line in super().format(record).split("\n"))
+
+
 class _JsonFormatter(logging.Formatter):
     """Formatter that writes a record as one JSON object."""
+
+    def __init__(self, context: Mapping[str, str]) -> None:
+        super().__init__()
+        self._context = context
 
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""
         fields = {
-            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
+            "time": _utc(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
             "process": record.process,
             "thread": record.threadName,
+            **_fields(record, self._context),
             "message": record.getMessage(),
         }
+        if event := getattr(record, "event", ""):
+            fields["event"] = event
         if record.exc_info:
             fields["exception"] = self.formatException(record.exc_info)
         return json.dumps(fields)
+
+
+def _fields(record: logging.LogRecord, context: Mapping[str, str]) -> dict[str, str]:
+    """Return run, epoch and actor of a record, as far as they are known."""
+    actor = getattr(record, "actor", "")
+    return {**context, "actor": actor} if actor else dict(context)
+
+
+def _about(record: logging.LogRecord) -> str:
+    """Return the name of the actor that an event is about, or an empty text."""
+    actor = getattr(record, "actor", "")
+    return f"{actor}: " if actor else ""
+
+
+def _word(value: str) -> str:
+    """Return a value that is one word, in quotes if it is none."""
+    return value if keys.is_name(value) else json.dumps(value)
+
+
+def _utc(seconds: float) -> str:
+    whole, part = divmod(int(seconds * 1000), 1000)
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(whole)) + f".{part:03d}Z"

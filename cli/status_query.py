@@ -1,12 +1,12 @@
-"""Queries for the status of learners: the state of each run, then its actors page by page."""
+"""Queries for the status of learners: the state of each run, its actors page by page, its newest events."""
 
 import time
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS
-from daedalus.protocol.messages import ActorsReport, ActorsRequest, StatusReport
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.messages import ActorsReport, ActorsRequest, EventsReport, EventsRequest, StatusReport
+from daedalus.protocol.status import ActorStatus, EventsPage, RunStatus
 from daedalus.transport.interface import Transport
 
 _ANSWER_SECONDS = 5.0
@@ -25,6 +25,15 @@ def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None
     reports = [decode(answer, STATUS_LIMITS) for answer in answers]
     statuses = [report.status for report in reports if isinstance(report, StatusReport)]
     return [_with_actors(transport, status, max_actors) for status in statuses]
+
+
+def ask_events(transport: Transport, status: RunStatus) -> EventsPage | None:
+    """Return the newest events of a run, or None if its learner does not answer. Raises as `ask` does."""
+    for answer in transport.query(keys.status(status.run), encode(EventsRequest()), timeout=_ANSWER_SECONDS):
+        report = decode(answer, STATUS_LIMITS)
+        if isinstance(report, EventsReport) and report.page.learner_epoch == status.learner_epoch:
+            return report.page
+    return None
 
 
 def fleet_size(status: RunStatus) -> int:

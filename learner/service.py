@@ -99,7 +99,7 @@ class LearnerService:
         if restored is not None:
             self._counters.restore(restored.counters)
             self._annealing = _resumed_annealing(restored, spec)
-        epoch = secrets.randbits(62)
+        self.learner_epoch = epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
         self._heartbeat = Heartbeat(directory)
         self._health = Health(
@@ -184,6 +184,7 @@ class LearnerService:
             counters=lambda: self._reporter.counters_state(time.monotonic()),
             evaluations=self._evaluations,
             health=self._health,
+            events=self._server.events,
         )
 
     def _learn(self, learner: "Learner", checkpointer: "Checkpointer") -> Outcome:

@@ -30,7 +30,7 @@ from pydantic import ValidationError
 
 from daedalus.protocol import schema
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import CompactSnapshot, Message, Program, Rollout
+from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program, Rollout
 
 PROTOCOL_VERSION = 6
 
@@ -115,6 +115,19 @@ def decode(data: bytes, limits: Limits) -> Message:
     return message
 
 
+def origin_of(data: bytes, limits: Limits) -> Origin:
+    """Return the origin in a Join of any protocol version, as far as it can be read; its texts may be empty.
+
+    A learner names the host whose version it refuses. Versions before 6 have no origin.
+    """
+    try:
+        _, header, _ = _split(data, limits, any_version=True)
+        _, fields, _, _ = _read_header(header)
+        return schema.unpack(Origin, dict(fields["origin"]), "", {})
+    except (ProtocolError, KeyError, TypeError, ValueError):
+        return Origin()
+
+
 # ------------------------------------------------------------------------------------------- writing
 
 
@@ -140,13 +153,13 @@ def _buffer(name: str, array: np.ndarray) -> tuple[bytes, bytes]:
 # ------------------------------------------------------------------------------------------- reading
 
 
-def _split(data: bytes, limits: Limits) -> tuple[int, bytes, memoryview]:
+def _split(data: bytes, limits: Limits, *, any_version: bool = False) -> tuple[int, bytes, memoryview]:
     if len(data) < _PREFIX.size:
         raise ProtocolError(f"{len(data)} bytes are too few for a message")
     magic, version, flags, header_length = _PREFIX.unpack_from(data)
     if magic != _MAGIC:
         raise ProtocolError("not a message of this protocol")
-    if version != PROTOCOL_VERSION:
+    if version != PROTOCOL_VERSION and not any_version:
         raise VersionMismatchError(version)
     if flags not in (_PLAIN, _ZSTD):
         raise ProtocolError(f"unknown flags {flags}")

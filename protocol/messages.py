@@ -14,9 +14,21 @@ import numpy as np
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import ActorsPage, RunStatus
+from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """Where an actor runs, as the actor states it: for an operator who reads the status. Each text may be empty."""
+
+    host: str = ""  # name of the host
+    software: str = ""  # name and version, such as `daedalus-rl 1.2.3`
+    address: str = ""  # of the actor's end of the connection, such as `tcp/10.0.0.7:43092`
+
+
+UNKNOWN = Origin()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,13 +36,15 @@ class Join:
     """Request of an actor to join. Actor -> learner, on `join`.
 
     Sent twice: first without spaces, to receive the specification of the run; then with the spaces of the environment
-    that the actor made from the specification.
+    that the actor made from the specification. An actor that fails sends it a last time, with the reason.
     """
 
     actor: str  # a name that stays the same across restarts
     incarnation: int  # identifies this process of the actor
     spaces: Spaces | None = None
     environments: int = 0  # E, number of vectorised environments
+    origin: Origin = UNKNOWN
+    failure: str = ""  # why the actor fails and ends, such as a missing module; empty if it asks to join
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +61,7 @@ class Welcome:
 class Refusal:
     """Negative answer to any query, with a code."""
 
-    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full", "name_taken"]
+    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full", "name_taken", "failed"]
     reason: str
 
 
@@ -305,6 +319,18 @@ class ActorsReport:
     page: ActorsPage
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventsRequest:
+    """Request of an operator for the newest events of the run. Operator -> learner, on `status`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventsReport:
+    """The newest events, in answer to an EventsRequest."""
+
+    page: EventsPage
+
+
 Message = (
     Join
     | Welcome
@@ -322,4 +348,6 @@ Message = (
     | StatusReport
     | ActorsRequest
     | ActorsReport
+    | EventsRequest
+    | EventsReport
 )

@@ -1,7 +1,10 @@
 """State of a run and of its actors, as the learner reports it."""
 
+from typing import Literal
+
 from daedalus.protocol.specification import Specification
 
+MAX_EVENTS = 100  # that a learner keeps
 PAGE_ACTORS = 100  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
 
 
@@ -9,6 +12,9 @@ class ActorStatus(Specification):
     """State of one actor."""
 
     actor: str
+    host: str  # where it runs, what it runs and its address, as the actor states them
+    software: str
+    address: str
     alive: bool
     quarantined: str  # why its rollouts are no longer accepted; empty if they are
     lives: int  # incarnations that joined
@@ -24,6 +30,38 @@ class ActorStatus(Specification):
     compact_snapshots: bool  # it requests compact snapshots at its own rate, instead of receiving every snapshot
     bytes_up_per_hour: float  # of rollouts, at the rate of the last seconds
     bytes_down_per_hour: float  # of snapshots
+
+
+class RefusedJoin(Specification):
+    """Joins that were refused for the same reason, and failures that actors of one host reported."""
+
+    actor: str  # that was refused last
+    host: str  # as the actor states it; empty if it is not known
+    software: str  # likewise, or the protocol version if it is not this learner's
+    reason: str
+    count: int
+    seconds_since_last: float
+
+
+EventKind = Literal["started", "joined", "left", "refused", "failed", "rejected", "quarantined", "checkpoint", "ended"]
+
+
+class Event(Specification):
+    """One event of a run, or several equal ones within a minute."""
+
+    time: str  # of the first, by the learner's clock: ISO 8601, UTC
+    kind: EventKind
+    actor: str  # that the event is about; empty if it is about the run
+    text: str
+    count: int
+
+
+class EventsPage(Specification):
+    """The newest events of one learner process (MAX_EVENTS), the newest last."""
+
+    run: str
+    learner_epoch: int
+    events: tuple[Event, ...]
 
 
 class ActorsPage(Specification):
@@ -61,4 +99,5 @@ class RunStatus(Specification):
     actors_alive: int
     actors_quarantined: int  # present, but their rollouts are no longer accepted
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
+    refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name

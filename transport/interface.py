@@ -71,6 +71,11 @@ class Transport(Protocol):
     Methods raise TransportError if the connection was closed or refuses the operation.
     """
 
+    @property
+    def local_address(self) -> str:
+        """Address of this end of the connection, such as `tcp/10.0.0.7:43092`; empty if it is not known."""
+        ...
+
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """Call `handler` with every query for `key`, in which `*` matches one chunk."""
         ...

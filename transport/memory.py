@@ -71,6 +71,11 @@ class MemoryTransport:
         with network.lock:
             network.ends.append(self)
 
+    @property
+    def local_address(self) -> str:
+        """See Transport."""
+        return "memory"
+
     def _ends(self) -> list["MemoryTransport"]:
         with self._network.lock:
             return list(self._network.ends)

@@ -102,6 +102,14 @@ class ZenohTransport:
         self._callbacks = Callbacks()
         self._watch: CredentialsWatch | None = None
 
+    @property
+    def local_address(self) -> str:
+        """See Transport. A Unix socket has no address at this end: it is the name of the protocol alone."""
+        with contextlib.suppress(zenoh.ZError):
+            for link in self._session.info.links():
+                return link.src.partition("/")[0] if link.src.startswith("unixsock") else link.src
+        return ""
+
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         """See Transport."""
 

@@ -7,6 +7,7 @@ import itertools
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import cut_note, environments_for, play_episodes
 from daedalus.actor.session.learner_queries import LearnerQueries
+from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -29,11 +31,18 @@ _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices the end of the run
 class Evaluator:
     """One evaluator over one transport."""
 
-    def __init__(self, config: ActorConfig, transport: Transport, stop: threading.Event) -> None:
-        """`stop` ends `run`, also in the middle of an episode."""
-        self._config, self._stop = config, stop
+    def __init__(
+        self,
+        config: ActorConfig,
+        transport: Transport,
+        stop: threading.Event,
+        on_join: Callable[[Welcome], object] = lambda _: None,
+    ) -> None:
+        """`stop` ends `run`, also in the middle of an episode; for `on_join`, see ActorService."""
+        self._config, self._stop, self._on_join = config, stop, on_join
         self._end = RunEndWatch(transport, stop)
         self._queries = LearnerQueries(transport)
+        self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
         self._warned_of_cuts = False
 
     def run(self) -> bool:
@@ -42,19 +51,22 @@ class Evaluator:
         Raises ActorError if the evaluator is refused, EnvironmentSetupError if the environment cannot be created here,
         PolicyError if the policy does not run.
         """
-        join = Join(actor=self._config.name, incarnation=self._config.incarnation)
         try:
             while True:
                 self._evaluate_learner(
-                    self._queries.join_learner(self._config.run, join, self._config.timeout, self._end)
+                    self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._end)
                 )
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished
+        except Exception as error:
+            self._queries.report_failure(self._end.run, self._join, error)
+            raise
 
     def _evaluate_learner(self, welcome: Welcome) -> None:
         """Evaluate the policies of one learner epoch until it ends."""
         self._end.follow(welcome.run, welcome.learner_epoch)
+        self._on_join(welcome)
         spec = welcome.spec
         interval = spec.evaluation.seconds or _DEFAULT_SECONDS
         episodes = spec.evaluation.episodes

@@ -4,9 +4,11 @@ import contextlib
 import logging
 import queue
 import time
+from dataclasses import replace
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
-from daedalus.policy.acting.runtime import program_hash
+from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
@@ -27,6 +29,7 @@ _logger = logging.getLogger(__name__)
 
 _ANSWER_SECONDS = 5.0  # for a query that is answered at once
 _UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
+_REPORT_SECONDS, _MAX_FAILURE = 2.0, 300  # for the report of a failure, and its length in characters
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
@@ -44,7 +47,11 @@ class LearnerLostError(Exception):
         super().__init__(reason)
 
 
-class NameInUseError(ActorError):
+class ActorRefusedError(ActorError):
+    """The learner refused or quarantined the actor."""
+
+
+class NameInUseError(ActorRefusedError):
     """The actor name is in use by another actor, or was in use a moment ago."""
 
 
@@ -114,9 +121,19 @@ class LearnerQueries:
                     raise RunOverError("the run is over", finished=True)
                 if refusal.code == "not_ready":  # the learner is stopping; another process may continue the run
                     return None
-                kind = NameInUseError if refusal.code == "name_taken" else ActorError
+                kind = NameInUseError if refusal.code == "name_taken" else ActorRefusedError
                 raise kind(f"the learner refused this actor: {refusal.reason}")
         return None
+
+    def report_failure(self, run: str, join: Join, error: Exception) -> None:
+        """Report why this actor ends, for the status of the run. Does nothing if the learner itself is the cause."""
+        if not run or isinstance(error, ActorRefusedError):
+            return
+        expected = isinstance(error, (ActorError, EnvironmentSetupError, PolicyError))
+        failure = f"{'' if expected else type(error).__name__ + ': '}{error}"[:_MAX_FAILURE]
+        with contextlib.suppress(TransportError):
+            failed = replace(join, spaces=None, environments=0, failure=failure or type(error).__name__)
+            self._transport.query(keys.join(run, join.actor), encode(failed), timeout=_REPORT_SECONDS)
 
     def learner_responds(self, run: str, join: Join) -> bool:
         """Return whether any learner of `run` answers a request to join, with whatever answer."""

@@ -26,12 +26,12 @@ class RunEndWatch:
         """`on_news` is called on the transport's threads when a message has come."""
         self._transport, self._stop, self._on_news = transport, stop, on_news
         self._inboxes: dict[str, Inbox] = {}  # by run
-        self._run, self._learner_epoch = "", -1
+        self.run, self.learner_epoch = "", -1  # of the learner that is followed; an empty name before the first
         self.learner_stopped = False  # since `follow`
 
     def follow(self, run: str, learner_epoch: int) -> None:
         """Follow a learner from now on."""
-        self._run, self._learner_epoch, self.learner_stopped = run, learner_epoch, False
+        self.run, self.learner_epoch, self.learner_stopped = run, learner_epoch, False
         if run not in self._inboxes:
             self._inboxes[run] = self._transport.subscribe(keys.run_end(run), self._on_news)
 
@@ -39,7 +39,7 @@ class RunEndWatch:
         """Raise RunOverError on a local stop or if the run finished; note if the learner was stopped."""
         if self._stop.is_set():
             raise RunOverError("stopped")
-        inbox = self._inboxes.get(self._run)
+        inbox = self._inboxes.get(self.run)
         data = None if inbox is None else inbox.take()
         if data is None:
             return
@@ -57,7 +57,7 @@ class RunEndWatch:
         """
         if message.outcome == "finished":
             raise RunOverError(f"the run is over: {message.reason}", finished=True)
-        if message.learner_epoch == self._learner_epoch:
+        if message.learner_epoch == self.learner_epoch:
             self.learner_stopped = True
 
     def wait(self, seconds: float) -> None:

@@ -6,6 +6,7 @@ The only threads are the caller's, which `run` occupies, and the transport's.
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,6 +14,7 @@ from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
@@ -61,11 +63,21 @@ class ActorService:
         transport: Transport,
         stop: threading.Event,
         collector: Collector | None = None,
+        on_join: Callable[[Welcome], object] = lambda _: None,
     ) -> None:
-        """`stop` ends `run`; `collector` replaces the environments that the actor would create."""
+        """Construct the service.
+
+        Args:
+          config: settings of this actor.
+          transport: the network; the caller closes it.
+          stop: event that ends `run`.
+          collector: replaces the environments that the actor would create.
+          on_join: called with the answer of each learner that the actor begins to join.
+        """
         self._config, self._transport, self._stop = config, transport, stop
         self._collector = collector or EnvironmentCollector(config.environments, config.modules)
-        self._join = Join(actor=config.name, incarnation=config.incarnation)
+        self._join = Join(actor=config.name, incarnation=config.incarnation, origin=own_origin(transport))
+        self._on_join = on_join
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
@@ -95,6 +107,9 @@ class ActorService:
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished
+        except Exception as error:
+            self._queries.report_failure(self._end.run, self._join, error)
+            raise
         finally:
             self._collector.close()
 
@@ -112,6 +127,7 @@ class ActorService:
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
         self._end.follow(welcome.run, welcome.learner_epoch)
+        self._on_join(welcome)
         spaces, count = self._collector.prepare(welcome.spec)
         self._feed.begin(welcome)
         self._declare_presence(welcome.run)

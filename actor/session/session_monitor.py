@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.learner_queries import ActorRefusedError, LearnerLostError, LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
@@ -65,15 +65,17 @@ class SessionMonitor:
     def check(self) -> None:
         """Raise if there is a reason to stop collecting.
 
-        Raises RunOverError if the run or the actor is over, ActorError in quarantine, LearnerLostError if the learner
-        left or does not accept rollouts of this learner epoch any more.
+        Raises RunOverError if the run or the actor is over, ActorRefusedError in quarantine, LearnerLostError if the
+        learner left or does not accept rollouts of this learner epoch any more.
         """
         with self._lock:
             ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
             left = self._presence.left
         self._end.check()  # after the presence was read: a learner that finished says so before it leaves
         if ended_by == "quarantined":
-            raise ActorError(f"the learner quarantined this actor: {reason}; fix the cause and restart the actor")
+            raise ActorRefusedError(
+                f"the learner quarantined this actor: {reason}; fix the cause and restart the actor"
+            )
         if ended_by == "finished":
             raise RunOverError("the run is over", finished=True)
         if self._end.learner_stopped:

@@ -13,6 +13,7 @@ from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
+from daedalus.protocol.messages import Welcome
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -31,14 +32,19 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
 
-    configure_logging(arguments.log_level, as_json=arguments.log_json, prefix=f"actor {config.name}: ")
+    context = {"actor": config.name}
+    configure_logging(arguments.log_level, as_json=arguments.log_json, process="actor", context=context)
+
+    def note(welcome: Welcome) -> None:
+        context.update(run=welcome.run, epoch=f"{welcome.learner_epoch:x}")
+
     try:
         transport = connect_with_retry(arguments.connect, stop, config.timeout, credentials)
         if transport is None:
             return 0
         try:
             role = Evaluator if arguments.evaluator else ActorService
-            role(config, transport, stop).run()
+            role(config, transport, stop, on_join=note).run()
         finally:
             transport.close()
     except (ActorError, EnvironmentSetupError, PolicyError, TransportError) as error:

@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> int:
     """Run `daedalus bridge` and return its exit status."""
     arguments = parser().parse_args()
-    configure_logging(arguments.log_level, as_json=arguments.log_json, prefix="bridge: ")
+    configure_logging(arguments.log_level, as_json=arguments.log_json, process="bridge")
     try:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
         if arguments.listen.startswith("tls/"):

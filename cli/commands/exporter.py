@@ -117,7 +117,7 @@ def exporter(arguments: list[str]) -> int:
     except SECURITY_ERRORS as error:
         print(f"daedalus exporter: {error}", file=sys.stderr)
         return 2
-    configure_logging(parsed.log_level, as_json=parsed.log_json, prefix="exporter: ")
+    configure_logging(parsed.log_level, as_json=parsed.log_json, process="exporter")
     stop = stop_on_signals()
     collector, registry = StatusCollector(), CollectorRegistry()
     registry.register(collector)

@@ -88,12 +88,15 @@ def main() -> int:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
     progress = Progress(sys.stdout, run.spec.training.env_steps)
-    configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
+    context = {"run": run.directory.name}
+    process = "" if arguments.prepared else "learner"  # the launcher shows the lines to a person
+    configure_logging(
+        arguments.log_level, as_json=arguments.log_json, process=process, context=context, write=progress.say
+    )
     try:
         with ExitStack() as stack:
-            return _serve(
-                run, arguments, credentials, stop, progress, arguments.started or started, user_metrics, stack
-            )
+            began = arguments.started or started
+            return _serve(run, arguments, credentials, stop, progress, began, user_metrics, context, stack)
     except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -107,9 +110,13 @@ def _serve(
     progress: Progress,
     started: float,
     user_metrics: UserMetrics,
+    context: dict[str, str],
     stack: ExitStack,
 ) -> int:
-    """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
+    """Run the learner to its end and return the exit status. Raises _FAILURES.
+
+    `context` receives the fields of the log; `stack` closes what is opened.
+    """
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
     Heartbeat(run.directory).clear()  # before a router is waited for
@@ -137,9 +144,9 @@ def _serve(
         new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
         lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         run = replace(run, directory=lock.directory)
+        context["run"] = run.directory.name
     try:
-        _announce(run, arguments, credentials)
-        outcome = LearnerService(
+        service = LearnerService(
             run.spec,
             run.directory,
             transport,
@@ -153,7 +160,10 @@ def _serve(
             modules=run.modules,
             certificate_days_left=partial(certificate_days_left, credentials),
             user_metrics=user_metrics,
-        ).run()
+        )
+        context["epoch"] = f"{service.learner_epoch:x}"
+        _announce(run, arguments, credentials)
+        outcome = service.run()
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)

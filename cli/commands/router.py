@@ -73,7 +73,7 @@ def _megabytes(text: str) -> float:
 def router(arguments: list[str]) -> int:
     """Run `daedalus router` and return its exit status."""
     parsed = parser().parse_args(arguments)
-    configure_logging(parsed.log_level, as_json=parsed.log_json, prefix="router: ")
+    configure_logging(parsed.log_level, as_json=parsed.log_json, process="router")
     try:
         if parsed.connect:
             check_connecting(parsed.connect, tls=parsed.tls is not None)

@@ -1,16 +1,17 @@
 """`daedalus status`: show the state of a learner and its actors, for a person or for a health check."""
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import printable
-from daedalus.cli.status_query import ask, fleet_size
+from daedalus.cli.logs import one_line, printable
+from daedalus.cli.status_query import ask, ask_events, fleet_size
 from daedalus.learner.run.heartbeat import silence
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.connecting import connect
 from daedalus.transport.credentials import WARNING_DAYS
 from daedalus.transport.interface import TransportError
@@ -26,6 +27,7 @@ _EXAMPLES = """\
 examples:
   daedalus status --connect tcp/127.0.0.1:7447
   daedalus status --connect tcp/gpu-box:7447 --json
+  daedalus status --connect tcp/gpu-box:7447 --events
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
@@ -49,6 +51,11 @@ def parser() -> argparse.ArgumentParser:
         "two minutes. Needs no network and no router. For a liveness probe",
     )
     options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="show only this run")
+    options.add_argument(
+        "--events",
+        action="store_true",
+        help="show the newest events of each run, such as joins, rejections and checkpoints, instead of its state",
+    )
     output = options.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print each run as one JSON object per line")
     output.add_argument("--quiet", action="store_true", help="print only problems")
@@ -69,7 +76,8 @@ def status(arguments: list[str]) -> int:
     try:
         transport = connect(parsed.connect, credentials)
         try:
-            statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet else None)
+            statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
+            pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
@@ -78,14 +86,12 @@ def status(arguments: list[str]) -> int:
     if not statuses:
         print("daedalus status: no learner answers at this address: is a learner running?", file=sys.stderr)
         return NO_ANSWER
-    for status in statuses:
-        if parsed.json:
-            print(status.model_dump_json())
-        elif not parsed.quiet:
-            print(printable(_table(status)))
-        else:
-            for problem in status.problems:
-                print(printable(f"{status.run}: {problem}"))
+    if parsed.quiet:
+        _show_problems(statuses)
+    else:
+        for shown in filter(None, pages) if parsed.events else statuses:
+            # JSON in ASCII: texts of peers cannot command a terminal.
+            print(json.dumps(shown.model_dump(mode="json")) if parsed.json else _text(shown))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
 
 
@@ -97,11 +103,34 @@ def _check_alive(directory: Path) -> int:
     return NO_ANSWER
 
 
-def _table(status: RunStatus) -> str:
+def _show_problems(statuses: list[RunStatus]) -> None:
+    for status in statuses:
+        for problem in status.problems:
+            print(one_line(f"{status.run}: {problem}"))
+
+
+def _text(shown: RunStatus | EventsPage) -> str:
+    """Return what a person reads; texts of peers can neither begin a line nor command a terminal."""
+    lines = _events(shown) if isinstance(shown, EventsPage) else _table(shown)
+    return "\n".join(printable(line.replace("\n", " ")) for line in lines)
+
+
+def _events(page: EventsPage) -> list[str]:
+    return [
+        f"run {page.run}: epoch {page.learner_epoch:x}, the newest events",
+        *(
+            f"  {event.time} {event.kind:<11} {event.actor or '-':<24} {event.text}"
+            f"{f' ({event.count:,} times)' if event.count > 1 else ''}"
+            for event in page.events
+        ),
+    ]
+
+
+def _table(status: RunStatus) -> list[str]:
     mean = "-" if status.episode_return_mean is None else f"{status.episode_return_mean:.1f}"
     age = status.checkpoint_age_seconds
     skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
-    lines = [
+    return [
         f"run {status.run}: {status.environment}, {status.algorithm}, up {status.uptime_seconds:.0f} s, "
         f"epoch {status.learner_epoch:x}",
         *(f"  PROBLEM: {problem}" for problem in status.problems),
@@ -115,12 +144,22 @@ def _table(status: RunStatus) -> str:
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
         f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
-        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}  rejected",
+        f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}"
+        "  rejected; host, address, software",
         *(f"  {_line(actor)}" for actor in status.actors),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
+        *map(_refused, status.refused_joins),
     ]
-    return "\n".join(lines)
+
+
+def _refused(refused: RefusedJoin) -> str:
+    """Return the line of an actor that was refused or failed."""
+    where = ", ".join(filter(None, (refused.host, refused.software)))
+    return (
+        f"  refused: {refused.actor}{f' ({where})' if where else ''}, {refused.count:,} x, last "
+        f"{refused.seconds_since_last:,.0f} s ago: {refused.reason}"
+    )
 
 
 def _expiry(days: float | None) -> list[str]:
@@ -139,9 +178,10 @@ def _line(actor: ActorStatus) -> str:
     rejected = ", ".join(f"{count:,} {cause}" for cause, count in sorted(actor.rollouts_rejected.items()))
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
     down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.compact_snapshots else ''}"
+    where = ", ".join(filter(None, (actor.host, actor.address, actor.software)))
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
         f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
         f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
-        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}"
+        f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}; {where or '-'}"
     )

@@ -1,5 +1,6 @@
 /** The actor's service: join a learner, collect rollouts and upload them, follow its snapshots, leave. */
 
+import { hostname } from "node:os";
 import { setTimeout as sleep } from "node:timers/promises";
 import { Bridge, BridgeError } from "./bridge.ts";
 import { ID, SPACES, VectorCartPole } from "./cartpole.ts";
@@ -11,6 +12,7 @@ import { seeded } from "./random.ts";
 import { type Acknowledgement, Uploader } from "./uploader.ts";
 import { encode, type Message, tryDecode } from "./wire.ts";
 
+const SOFTWARE = "daedalus-node"; // for an operator who reads the status
 const RETRY_MILLISECONDS = 500; // between attempts to join
 const HEARTBEAT_MILLISECONDS = 200; // how soon a wait notices a deadline
 const MISSED_PUSH_MILLISECONDS = 1_000; // without the awaited snapshot for so long, request it
@@ -79,7 +81,9 @@ export class Actor {
       this.#snapshot = undefined;
       this.#stopReason = this.#stopped ? new RunOverError("stopped") : undefined;
       bridge.onClosed = (error) => this.#stopCollecting(error);
-      const inquiry = { actor: name, incarnation, spaces: null, environments: 0 };
+      const origin = { host: hostname(), software: SOFTWARE, address: "" };
+      const known = { actor: name, incarnation, origin, failure: "" };
+      const inquiry = { ...known, spaces: null, environments: 0 };
       const { run, spec, learner_epoch } = await link.join(bridge, this.#config.run, inquiry);
       checkSupported(spec.environment);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
@@ -93,7 +97,7 @@ export class Actor {
       });
       bridge.announce(`daedalus/${run}/actors/${name}/${incarnation}`);
       const environments = this.#config.environments ?? spec.collection.envs_per_actor;
-      const welcome = await link.join(bridge, run, { actor: name, incarnation, spaces: SPACES, environments });
+      const welcome = await link.join(bridge, run, { ...known, spaces: SPACES, environments });
       if (welcome.learner_epoch !== learner_epoch) throw new LearnerLostError("the learner was restarted");
       this.#heardAt = performance.now();
       onJoined();

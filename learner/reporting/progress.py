@@ -1,5 +1,6 @@
-"""Progress of a run: one line that is rewritten on a terminal, or a new line every few seconds elsewhere."""
+"""Progress of a run: one line that is rewritten on a terminal, or a log record every few seconds elsewhere."""
 
+import logging
 import shutil
 import time
 from collections import deque
@@ -10,6 +11,9 @@ from typing import TextIO
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
 _RATE_SECONDS = 30.0  # of the run, over which the rate of the env_steps is measured
+
+
+_logger = logging.getLogger(__name__)
 
 
 class Progress:
@@ -36,7 +40,7 @@ class Progress:
             self._write(f"\r\x1b[K{line}")
             self._rewriting = True
         else:
-            self._write("  ".join(parts) + "\n")
+            _logger.info("%s", "  ".join(parts))
 
     def say(self, text: str) -> None:
         """Print a permanent line."""

@@ -202,6 +202,7 @@ def run_status(
         rollouts_accepted=counters.rollouts_accepted,
         rollouts_rejected=dict(counters.rollouts_rejected),
         **totals(fleet),
+        refused_joins=fleet.refused_joins.report(now),
         actors=page(fleet, "", now),
     )
 

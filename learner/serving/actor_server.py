@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page
 from daedalus.learner.serving.query_responses import QueryResponses
@@ -31,10 +32,19 @@ from daedalus.protocol.limits import (
     STATUS_REQUEST_LIMITS,
     Limits,
 )
-from daedalus.protocol.messages import ActorsReport, ActorsRequest, Message, Refusal, RunEnded, StatusReport
+from daedalus.protocol.messages import (
+    ActorsReport,
+    ActorsRequest,
+    EventsReport,
+    EventsRequest,
+    Message,
+    Refusal,
+    RunEnded,
+    StatusReport,
+)
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import ActorsPage, RunStatus
+from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
@@ -78,12 +88,15 @@ class ActorServer:
         self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
         self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
         self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
-        self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock)
+        self.events = EventLog()
+        self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock, self.events)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
             run, spec, transport, self._responses, self.fleet, self.lock, counters, **start
         )
-        self.rollouts = RolloutIntake(spec, self.lock, self.fleet, counters, lambda: self.publisher.version, **start)
+        self.rollouts = RolloutIntake(
+            spec, self.lock, self.fleet, counters, lambda: self.publisher.version, self.events, **start
+        )
         self.evaluations = EvaluationQueue()
         self._watchdog = SessionWatchdog(transport, keys.status(run))
 
@@ -107,6 +120,7 @@ class ActorServer:
         # Last, because an actor that has joined uses all other keys.
         self._serve(keys.join(run, "*"), self._on_join, JOIN_LIMITS)
         self._watchdog.open()
+        self.events.add("started", f"serving run {run!r}")
 
     def _serve(self, key: str, handler: Callable[[Request], None], limits: Limits | None = None) -> None:
         """Serve a key; refuse queries above `limits` without a copy of their payload."""
@@ -136,6 +150,7 @@ class ActorServer:
                 self._ended_at < actor.last_seen + _LEAVE_SECONDS and not self.fleet.is_present(actor)
                 for actor in self.fleet.actors.values()
             )
+        self.events.add("ended", f"{outcome}: {reason}")
         self._responses.end(self._ended, finished=finished)
         self._publish_end()
         with self.lock:
@@ -195,8 +210,11 @@ class ActorServer:
         actor = keys.parse_presence(key)
         if actor is not None:
             with self.lock:
-                self.fleet.set_present(*actor, present, time.monotonic())
+                changed = self.fleet.set_present(*actor, present, time.monotonic())
                 self.lock.notify_all()
+            if changed:
+                kind, text = ("joined", "connected again") if present else ("left", "no longer connected")
+                self.events.add(kind, text, actor=actor[0])
 
     def _on_join(self, request: Request) -> None:
         name = keys.last_chunk(request.key)
@@ -206,7 +224,7 @@ class ActorServer:
         request.reply(encode(self._status_answer(request)))
 
     def _status_answer(self, request: Request) -> Message:
-        """Return the answer to a status query: the status, or the page of actors that an ActorsRequest names."""
+        """Return the answer to a status query: the status, or what an ActorsRequest or EventsRequest asks for."""
         if not request.size:
             with self.lock:
                 return StatusReport(status=self._status())
@@ -214,8 +232,11 @@ class ActorServer:
             message = decode(request.payload, STATUS_REQUEST_LIMITS)
         except ProtocolError as error:
             return Refusal(code="malformed", reason=str(error))
+        if isinstance(message, EventsRequest):
+            page_of_events = EventsPage(run=self._run, learner_epoch=self._epoch, events=self.events.report())
+            return EventsReport(page=page_of_events)
         if not isinstance(message, ActorsRequest):
-            return Refusal(code="malformed", reason="expected an ActorsRequest message")
+            return Refusal(code="malformed", reason="expected an ActorsRequest or EventsRequest message")
         with self.lock:
             actors = page(self.fleet, message.after, time.monotonic())
         return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))

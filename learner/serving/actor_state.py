@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.sequence_window import SequenceWindow
+from daedalus.protocol.messages import UNKNOWN, Origin
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
 _MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
@@ -18,8 +19,10 @@ class Actor:
     lives_before: int = 0  # a number that is different after an actor of this name was forgotten
     incarnation: int = -1  # the newest; -1 before the first Join
     incarnations: int = 0  # number of incarnations that joined
+    origin: Origin = UNKNOWN  # of the newest incarnation
     environments: int = 0  # 0 before the actor has joined with its spaces
     last_seen: float = 0.0
+    left: bool = False  # whether the newest incarnation was present and is no longer
     sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
@@ -83,4 +86,5 @@ class Actor:
         self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
         self.incarnations += 1
         self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
+        self.left = False
         self.quarantined, self.fetches, self.compact_snapshots = "", False, False

@@ -15,6 +15,7 @@ import numpy as np
 from daedalus.learner.serving.actor_state import Actor
 from daedalus.learner.serving.former_incarnations import Former, FormerIncarnations
 from daedalus.learner.serving.presence import Presence
+from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
 from daedalus.protocol.spaces import Spaces
@@ -38,6 +39,7 @@ class Fleet:
         self.forgotten = 0  # number of actors that were forgotten
         self.forgotten_missed = 0  # rollouts of forgotten actors that never arrived
         self.forgotten_busy = 0  # `busy` answers to forgotten actors
+        self.refused_joins = RefusedJoins()
         self._presence = Presence()
         self._former = FormerIncarnations()
         self._of_owner: Counter[str] = Counter()  # number of actors
@@ -75,11 +77,12 @@ class Fleet:
             self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten)
             self._of_owner[keys.owner(join.actor)] += 1
         self.spaces = join.spaces
+        self.refused_joins.joined(join.actor)
         actor = self.actors[join.actor]
         actor.last_seen = now
         if actor.incarnation != join.incarnation:
             self._replace_incarnation(actor, join.incarnation)
-        actor.environments = join.environments
+        actor.environments, actor.origin = join.environments, bounded(join.origin)
         self.changed()
         return None
 
@@ -126,13 +129,16 @@ class Fleet:
         self._forget(min(absent, key=lambda actor: actor.last_seen))
         return ""
 
+    def lives(self, name: str) -> int:
+        """Return a number that is different for each incarnation that joins under a name."""
+        return self.actors[name].lives if name in self.actors else 0
+
     def seed_for(self, name: str, start_version: int) -> int:
         """Return the seed of an actor's environments and samples.
 
         It differs by name, by incarnation and by `start_version`, the policy version that the run continued from.
         """
-        lives = self.actors[name].lives if name in self.actors else 0
-        entropy = [self._seed, zlib.crc32(name.encode()), lives, start_version]
+        entropy = [self._seed, zlib.crc32(name.encode()), self.lives(name), start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     # ---------------------------------------------------------------------------------------------- forgetting
@@ -162,13 +168,19 @@ class Fleet:
 
     # ------------------------------------------------------------------------------------------------ presence
 
-    def set_present(self, name: str, incarnation: int, present: bool, now: float) -> None:
-        """Record whether an incarnation is present. `now` is on the monotonic clock, in seconds."""
+    def set_present(self, name: str, incarnation: int, present: bool, now: float) -> bool:
+        """Record whether an incarnation is present; return whether an actor that has joined left or returned.
+
+        `now` is on the monotonic clock, in seconds.
+        """
         self._presence.set(name, incarnation, present)
         actor = self.actors.get(name)
-        if actor is not None and actor.incarnation == incarnation:
-            actor.last_seen = now
-            self.changed()
+        if actor is None or actor.incarnation != incarnation:
+            return False
+        actor.last_seen = now
+        self.changed()
+        changed, actor.left = actor.left == present, not present  # its token may come after its Join
+        return changed
 
     def is_present(self, actor: Actor) -> bool:
         """Return whether the newest incarnation of an actor is present."""

@@ -45,6 +45,9 @@ def page(fleet: Fleet, after: str, now: float) -> tuple[ActorStatus, ...]:
 def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
     return ActorStatus(
         actor=actor.name,
+        host=actor.origin.host,
+        software=actor.origin.software,
+        address=actor.origin.address,
         alive=fleet.is_present(actor),
         quarantined=actor.quarantined[:_MAX_REASON],
         lives=actor.incarnations,

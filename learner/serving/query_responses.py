@@ -3,14 +3,18 @@
 State that several of the transport's threads read. It decides and encodes the answers; the caller sends them.
 """
 
+import logging
 import math
 import threading
 
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.learner.serving.refused_joins import MAX_REASON
+from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import JOIN_LIMITS
-from daedalus.protocol.messages import Join, Program, Refusal, Welcome
+from daedalus.protocol.messages import Join, Origin, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.status import EventKind
 
 
 class QueryResponses:
@@ -24,6 +28,7 @@ class QueryResponses:
         start_version: int,
         fleet: Fleet,
         lock: threading.Condition,
+        events: EventLog,
     ) -> None:
         self._run = run
         self._spec = spec
@@ -31,6 +36,7 @@ class QueryResponses:
         self._start_version = start_version
         self._fleet = fleet
         self._lock = lock
+        self._events = events
         # The answer to queries for the newest snapshot, and its version if it is a snapshot.
         self._snapshot: tuple[bytes, int | None] = (_refuse("the learner has no policy yet"), None)
         self._unchanged = _refuse("the actor holds the newest snapshot")
@@ -47,26 +53,33 @@ class QueryResponses:
           data: the encoded message.
           now: time on the monotonic clock, in seconds.
         """
-        try:
-            message = decode(data, JOIN_LIMITS)
-        except ProtocolError as error:
-            return encode(Refusal(code="mismatch", reason=str(error)))
-        if not isinstance(message, Join):
-            return encode(Refusal(code="malformed", reason="expected a Join message"))
-        if message.actor != name:
-            reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
-            return encode(Refusal(code="malformed", reason=reason))
-        if self._ending is not None:
+        message = _read_join(name, data)
+        if isinstance(message, Join) and self._ending is not None:
             return encode(self._ending)
+        origin = message.origin if isinstance(message, Join) else origin_of(data, JOIN_LIMITS)
         with self._lock:
-            refusal = self._fleet.join(message, now)
-            if refusal is not None:
-                if refusal.code == "name_taken":
-                    self.postponed_at = now
-                return encode(refusal)
-            seed = self._fleet.seed_for(message.actor, self._start_version)
-            self._lock.notify_all()
+            lives = self._fleet.lives(name)
+            refusal = message if isinstance(message, Refusal) else self._fleet.join(message, now)
+            if refusal is None:
+                self._lock.notify_all()
+            else:
+                self._fleet.refused_joins.add(name, origin, refusal.reason, now)
+                self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
+            seed = self._fleet.seed_for(name, self._start_version)
+            is_new = self._fleet.lives(name) != lives
+        if refusal is not None:
+            self._add_refusal(name, origin, refusal)
+            return encode(refusal)
+        if is_new and isinstance(message, Join) and message.spaces is not None:
+            text = f"joined with {message.environments} environments{_where(origin)}"
+            self._events.add("joined", text, actor=name)
         return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
+
+    def _add_refusal(self, name: str, origin: Origin, refusal: Refusal) -> None:
+        kind: EventKind = "failed" if refusal.code == "failed" else "refused"
+        level = logging.INFO if refusal.code == "name_taken" else logging.WARNING  # that actor asks again
+        text = f"{kind}{_where(origin)}: {refusal.reason}"
+        self._events.add(kind, text, actor=name, cause=refusal.reason, level=level)
 
     def offer_program(self, program: Program) -> None:
         """Set the run's program, the answer to later queries."""
@@ -94,6 +107,28 @@ class QueryResponses:
         """Return the answer to a query for the newest snapshot by an actor that holds `held_version`."""
         encoded, version = self._snapshot
         return self._unchanged if version is not None and version == held_version else encoded
+
+
+def _read_join(name: str, data: bytes) -> Join | Refusal:
+    """Return the Join that was sent on the key of an actor, or the Refusal of what is none."""
+    try:
+        message = decode(data, JOIN_LIMITS)
+    except ProtocolError as error:
+        return Refusal(code="mismatch", reason=str(error))
+    if not isinstance(message, Join):
+        return Refusal(code="malformed", reason="expected a Join message")
+    if message.actor != name:
+        reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
+        return Refusal(code="malformed", reason=reason)
+    if message.failure:
+        return Refusal(code="failed", reason=message.failure[:MAX_REASON])
+    return message
+
+
+def _where(origin: Origin) -> str:
+    """Return host and software for a person, or an empty text if both are unknown."""
+    where = ", ".join(filter(None, (origin.host[:64], origin.software[:64])))
+    return f" ({where})" if where else ""
 
 
 def _refuse(reason: str) -> bytes:

@@ -21,7 +21,8 @@ from collections.abc import Callable, Set
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
@@ -49,6 +50,7 @@ class RolloutIntake:
         fleet: Fleet,
         counters: RunCounters,
         published_version: Callable[[], int],
+        events: EventLog,
         *,
         learner_epoch: int,
         start_version: int,
@@ -60,11 +62,12 @@ class RolloutIntake:
           lock: the condition shared with the actor server.
           fleet, counters: guarded by `lock`.
           published_version: function that returns the newest published policy version.
+          events: receives rejections and quarantines.
           learner_epoch: epoch of this learner process.
           start_version: policy version of the checkpoint that the run continues from, else 0.
         """
         self._spec, self._lock, self._fleet, self._counters = spec, lock, fleet, counters
-        self._published_version = published_version
+        self._published_version, self._events = published_version, events
         self._version = start_version  # rollouts of this version have a policy lag of 0
         self._intake = Intake(spec, learner_epoch, fleet)
         self._buffer = _buffer(spec)
@@ -129,7 +132,7 @@ class RolloutIntake:
         with self._lock:
             refused = self._intake.judge(sender, refused, self._version, time.monotonic())
             assert isinstance(refused, Rejected)
-            self._counters.rollouts_rejected[refused.cause] += 1
+            self._count_rejection(sender, refused)
         request.reply(encode(acknowledgement(refused, self._published_version())))
         return True
 
@@ -171,10 +174,16 @@ class RolloutIntake:
                 if actor is not None:
                     actor.count_trained(finite=finite)
                 if not finite:
-                    self._fleet.changed()
-                    self._counters.rollouts_rejected["non_finite"] += 1
-                if not finite and actor is not None and actor.rejected["non_finite"] == 1:
-                    _logger.warning("a rollout of actor %r has no finite gradient, and was left out", actor.name)
+                    self._count_non_finite(rollout.identity.actor, actor)
+
+    def _count_non_finite(self, name: str, actor: Actor | None) -> None:
+        self._fleet.changed()
+        self._counters.rollouts_rejected["non_finite"] += 1
+        text = f"a rollout of actor {name!r} has no finite gradient, and was left out"
+        self._events.add("rejected", text, actor=name, cause="non_finite", level=logging.WARNING)
+        if actor is not None and actor.quarantined:
+            text = f"quarantined: {actor.quarantined}"
+            self._events.add("quarantined", text, actor=name, level=logging.WARNING)
 
     def _take(self, version: int) -> TakenRollouts:
         taken = self._buffer.take(self._fleet.live, version, time.monotonic())
@@ -257,8 +266,16 @@ class RolloutIntake:
         if isinstance(verdict, Rollout):
             self._store(verdict, size)
         else:
-            self._counters.rollouts_rejected[verdict.cause] += 1
+            self._count_rejection(sender, verdict)
         return acknowledgement(verdict, self._published_version())
+
+    def _count_rejection(self, sender: str, rejected: Rejected) -> None:
+        self._counters.rollouts_rejected[rejected.cause] += 1
+        if rejected.verdict == "quarantined" and rejected.cause == "unfit":
+            self._events.add("quarantined", f"quarantined: {rejected.reason}", actor=sender, level=logging.WARNING)
+        else:
+            text = f"rollout rejected as {rejected.cause}: {rejected.reason}"
+            self._events.add("rejected", text, actor=sender, cause=rejected.cause)
 
     def _is_surplus(self, content: Rollout | Rejected) -> bool:
         """Return whether the barrier already holds a rollout of the actor.

@@ -8,6 +8,7 @@ from typing import Any
 
 from daedalus.learner.reporting.report import Health
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spaces import Spaces
@@ -30,6 +31,7 @@ class Checkpointer:
         counters: Callable[[], dict[str, Any]],
         evaluations: Evaluations,
         health: Health,
+        events: EventLog,
     ) -> None:
         """Construct the checkpointer.
 
@@ -40,10 +42,12 @@ class Checkpointer:
           counters: function that returns the current counters of the run.
           evaluations: checkpoints that are being evaluated are not pruned.
           health: record of the last saved checkpoint and of the last error.
+          events: receives each saved checkpoint and each error.
         """
         self._directory, self._spec, self._spaces = directory, spec, spaces
         self._learner, self._program = learner, program
         self._counters, self._evaluations, self._health = counters, evaluations, health
+        self._events = events
         self._newest: tuple[int, Path] | None = None  # policy version and directory of the last checkpoint
 
     def ensure_saved(self) -> Path | None:
@@ -56,6 +60,7 @@ class Checkpointer:
 
     def save(self) -> Path | None:
         """Save a checkpoint and return its directory, or None on a disk error."""
+        counters = self._counters()
         try:
             directory = save_checkpoint(
                 self._directory,
@@ -65,22 +70,22 @@ class Checkpointer:
                 program=self._program,
                 parameters=self._learner.weights(),
                 state=self._learner.state(),
-                counters=self._counters(),
+                counters=counters,
                 keep=self._spec.service.keep_checkpoints,
                 also_keep=self._evaluations.checkpoints_in_use,
             )
         except OSError as error:
             if not self._health.save_fault:
-                _logger.warning(
-                    "checkpoint not saved: %s; the previous checkpoint is kept, training continues, "
-                    "and saving is retried every %g s",
-                    error.strerror,
-                    self._spec.service.checkpoint_seconds,
+                text = (
+                    f"checkpoint not saved: {error.strerror}; the previous checkpoint is kept, training continues, "
+                    f"and saving is retried every {self._spec.service.checkpoint_seconds:g} s"
                 )
+                self._events.add("checkpoint", text, level=logging.WARNING)
             self._health.save_fault = error.strerror or type(error).__name__
             return None
         if self._health.save_fault:
             _logger.info("checkpoints are saved again")
+        self._events.add("checkpoint", f"checkpoint saved at {counters['env_steps']:,} env_steps: {directory}")
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         self._newest = self._learner.policy_version, directory
         return directory

@@ -12,11 +12,11 @@ from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_
 
 from daedalus.actor.environments.interface import Observed, Step
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.protocol.messages import (
-    Join,
-    Refusal,
-)
-from daedalus.transport.memory import MemoryNetwork
+from daedalus.actor.session.origin import own_origin
+from daedalus.protocol.messages import Join, Refusal
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+JOIN = Join(actor="e", incarnation=7, origin=own_origin(MemoryTransport(MemoryNetwork())))
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_each_evaluation_uses_the_policy_given_then(learner: ScriptedLearner, ev
 def test_evaluator_does_not_join_as_an_actor(learner: ScriptedLearner, evaluator: RunningEvaluator) -> None:
     learner.give(learner.snapshot(0))
     learner.receive_report()
-    assert learner.joins.get(timeout=LIMIT) == Join(actor="e", incarnation=7)
+    assert learner.joins.get(timeout=LIMIT) == JOIN
     assert learner.joins.empty()  # once, and without spaces: it is no actor
     assert learner.present == []
 
@@ -116,7 +116,7 @@ def test_policy_of_another_learner_epoch_is_not_evaluated_before_joining_it(
 ) -> None:
     learner.epoch = 2  # the learner restarted, with the same keys
     learner.give(learner.snapshot(9))
-    assert [learner.joins.get(timeout=LIMIT) for _ in range(2)] == [Join(actor="e", incarnation=7)] * 2
+    assert [learner.joins.get(timeout=LIMIT) for _ in range(2)] == [JOIN] * 2
     learner.give(learner.snapshot(3))
     report = learner.receive_report()
     assert (report.learner_epoch, report.policy_version) == (2, 3)

@@ -1,5 +1,6 @@
 """ActorService against a scripted learner, over the memory transport: failures, refusals and the end of the run."""
 
+import socket
 import threading
 
 import pytest
@@ -77,6 +78,33 @@ def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     actor.join()
     assert isinstance(actor.error, ActorError)
     assert "its environment has 3 choices" in str(actor.error)
+
+    assert not any(join.failure for join in learner.joins.queue)  # the learner knows the reason
+
+
+def test_failure_of_an_actor_is_reported_to_its_learner(network: MemoryNetwork) -> None:
+    environment = SPEC.environment.model_copy(update={"id": "corridor:Corridor-v0"})
+    learner = ScriptedLearner(network, SPEC.model_copy(update={"environment": environment}))
+    actor = RunningActor(network)
+    actor.join()
+    *_, failed = learner.joins.queue
+    assert failed.failure == str(actor.error)
+    assert "corridor" in failed.failure
+    assert (failed.actor, failed.spaces, failed.origin.host) == ("a", None, socket.gethostname())
+    assert failed.origin.software.startswith("daedalus-rl ")
+
+
+def test_unexpected_error_is_reported_with_its_type(network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a fault of a simulator")
+
+    monkeypatch.setattr(service.ActorService, "_collect", fail)
+    learner = ScriptedLearner(network)
+    actor = RunningActor(network)
+    learner.publish(0)
+    actor.join()
+    *_, failed = learner.joins.queue
+    assert failed.failure == "ZeroDivisionError: a fault of a simulator"
 
 
 def test_actor_whose_rollouts_the_learner_cannot_take_ends_with_the_setting_to_raise(network: MemoryNetwork) -> None:

@@ -9,6 +9,9 @@ from daedalus.protocol.status import ActorStatus, RunStatus
 def actor_status(name: str, **changes: Any) -> ActorStatus:
     values = {
         "actor": name,
+        "host": "gpu-box",
+        "software": "daedalus-rl 1.0",
+        "address": "tcp/10.0.0.7:43092",
         "alive": True,
         "quarantined": "",
         "lives": 1,
@@ -52,6 +55,7 @@ def run_status(**changes: Any) -> RunStatus:
         "rollouts_rejected": {"stale": 2},
         "rollouts_missed": 4,
         "busy_answers": 5,
+        "refused_joins": (),
         "actors": (),
     }
     return RunStatus(**{**values, **_counts(changes.get("actors", ())), **changes})

@@ -1,6 +1,7 @@
 """cli/status_query.py against the server of a learner: fleets of any size."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from statuses import actor_status, run_status
 
 from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
-from daedalus.cli.status_query import ask, fleet_size
+from daedalus.cli.status_query import ask, ask_events, fleet_size
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
@@ -18,8 +19,18 @@ from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
-from daedalus.protocol.messages import ActorsReport, ActorsRequest, Join, Message, Refusal, StatusReport
-from daedalus.protocol.status import PAGE_ACTORS, ActorsPage, RunStatus
+from daedalus.protocol.messages import (
+    ActorsReport,
+    ActorsRequest,
+    EventsReport,
+    Join,
+    Message,
+    Origin,
+    Refusal,
+    StatusReport,
+)
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.status import MAX_EVENTS, PAGE_ACTORS, ActorsPage, Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 MANY = 905
@@ -85,6 +96,35 @@ def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer,
     assert [actor.actor for actor in more.page.actors] == names[PAGE_ACTORS : 2 * PAGE_ACTORS]
 
 
+def test_events_of_the_run_are_reported(server: ActorServer, operator: MemoryTransport) -> None:
+    """Actors join, leave, return and are refused."""
+    spaces = Spaces(observation=SPACES.observation, action=DiscreteSpace(count=7))
+    mismatch = Join(actor="other", incarnation=1, spaces=spaces, environments=1, origin=Origin(host="arm-box"))
+    actor = MemoryTransport(operator._network)
+    new = replace(mismatch, actor="new", spaces=SPACES)
+    for join in (new, new, mismatch):
+        actor.declare_presence(keys.presence("r", join.actor, join.incarnation))
+        actor.query(keys.join("r", join.actor), encode(join), timeout=1.0)
+    actor.close()
+    again = MemoryTransport(operator._network)
+    again.declare_presence(keys.presence("r", "new", 1))
+    (status,) = ask(operator, max_actors=0)
+    page = ask_events(operator, status)
+    assert page is not None
+    assert (page.run, page.learner_epoch) == ("r", EPOCH)
+    found = [(event.kind, event.actor, event.text) for event in page.events]
+    assert found[:2] == [("started", "", "serving run 'r'"), ("joined", "new", "joined with 1 environments (arm-box)")]
+    assert found[2][:2] == ("refused", "other")
+    assert found[2][2].startswith("refused (arm-box): the actor's environment has ")
+    assert found[3:] == [("left", "new", "no longer connected"), ("joined", "new", "connected again")]
+
+
+def test_events_of_the_longest_texts_fit_the_limits_of_their_reader() -> None:
+    event = Event(time="t" * 24, kind="quarantined", actor="\N{EM DASH}" * 64, text="\N{EM DASH}" * 300, count=2**62)
+    page = EventsPage(run="n" * 64, learner_epoch=2**62, events=(event,) * MAX_EVENTS)
+    assert isinstance(decode(encode(EventsReport(page=page)), STATUS_LIMITS), EventsReport)
+
+
 def test_page_after_the_last_actor_is_empty(server: ActorServer, operator: MemoryTransport) -> None:
     report = query(operator, encode(ActorsRequest(after="zzz")))
     assert isinstance(report, ActorsReport)
@@ -112,6 +152,9 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
     largest = 2**62
     actor = actor_status(
         "n" * 64,
+        host="\N{EM DASH}" * 64,
+        software="\N{EM DASH}" * 64,
+        address="\N{EM DASH}" * 64,
         quarantined="\N{EM DASH}" * 300,
         lives=largest,
         env_steps=largest,
@@ -123,6 +166,14 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
     )
     data = encode(ActorsReport(page=ActorsPage(learner_epoch=largest, actors=(actor,) * PAGE_ACTORS)))
     assert isinstance(decode(data, STATUS_LIMITS), ActorsReport)
+    refused = RefusedJoin(
+        **dict.fromkeys(("actor", "host", "software"), "\N{EM DASH}" * 64),
+        reason="\N{EM DASH}" * 300,
+        count=largest,
+        seconds_since_last=1.0,
+    )
+    status = run_status(actors=(actor,) * PAGE_ACTORS, refused_joins=(refused,) * 32, problems=("x" * 1000,) * 5)
+    assert isinstance(decode(encode(StatusReport(status=status)), STATUS_LIMITS), StatusReport)
     decode(encode(ActorsRequest(after="n" * 64)), STATUS_REQUEST_LIMITS)
 
 

@@ -11,7 +11,7 @@ from daedalus.bridge.packets import Kind
 from daedalus.protocol import messages
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorStatus, Event, EventKind, RunStatus
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
 TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Acknowledgement", "RunEnded"]
@@ -61,6 +61,9 @@ def test_codes_and_verdicts_are_all_explained(message: str, field: str) -> None:
 def test_the_status_tables_have_its_fields() -> None:
     assert first_column(table_under("| of the run |")) == set(RunStatus.model_fields)
     assert first_column(table_under("| of each actor |")) == set(ActorStatus.model_fields)
+    assert first_column(table_under("| of each event |")) == set(Event.model_fields)
+    kinds = table_under("| of each event |").partition("| `kind` |")[2].partition("\n")[0]
+    assert tuple(re.findall(r"`(\w+)`", kinds)) == typing.get_args(EventKind)
 
 
 def test_the_specifications_tables_have_what_an_actor_needs() -> None:

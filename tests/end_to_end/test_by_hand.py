@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +37,14 @@ def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, addr
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
     actor.expect("the run is over")
+    time = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
+    for line in learner.lines:
+        assert re.match(rf"{time} (info|warning) learner run=run( epoch=[0-9a-f]+)?( actor=early)?: ", line), line
+    for line in actor.lines:
+        assert re.match(rf"{time} (info|warning) actor actor=early( run=run epoch=[0-9a-f]+)?: ", line), line
+    epochs = {match[1] for line in learner.lines + actor.lines if (match := re.search("epoch=([0-9a-f]+)", line))}
+    assert len(epochs) == 1
+    learner.expect(r"epoch=\w+ actor=early: joined with 128 environments \(.*daedalus-rl ")
 
 
 def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str, status: Callable[[], dict | None]) -> None:
@@ -44,6 +53,7 @@ def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str, stat
     learner.expect(r"updates .*/s")
     start("actor", "--connect", address, "--name", "late", "--envs", 8, "--runtime", "torch")
     until(lambda: env_steps(status(), "late") > 0)
+    start("status", "--connect", address, "--events").expect("joined  *late  *joined with 8 environments")
     report = status()
     assert report is not None
     assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 128, "late": 8}

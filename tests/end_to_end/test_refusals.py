@@ -1,5 +1,7 @@
 """Test of a real learner with mismatching actors and with arbitrary bytes."""
 
+import re
+import socket
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -130,5 +132,7 @@ def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_th
         actor = start("actor", *options, directory=Path(__file__).parent.parent)
         assert actor.wait() == 1
         actor.expect("refused.*2 choices.*but this run has.*3 choices")
+        listed = rf"refused: .* \({re.escape(socket.gethostname())}, daedalus-rl .*\), 1 x, .* 2 choices, but this run"
+        start("status", "--connect", address, "--run", "run").expect(listed)
     finally:
         transport.close()

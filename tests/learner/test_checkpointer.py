@@ -9,6 +9,7 @@ from building import EPOCH, POLICY, SPACES, make_rollouts, run_spec
 from daedalus.learner.reporting.report import Health
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpointer import Checkpointer
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.saved_policy import read_policy
@@ -31,6 +32,7 @@ def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
         counters=lambda: RunCounters(10).state(0.0),
         evaluations=Evaluations(EPOCH),
         health=Health(started=0.0, updated=0.0, actor_seen=0.0),
+        events=EventLog(),
     )
     first = checkpointer.ensure_saved()
     assert first is not None
@@ -47,7 +49,7 @@ def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
 
 
 def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    health = Health(started=0.0, updated=0.0, actor_seen=0.0)
+    events, health = EventLog(), Health(started=0.0, updated=0.0, actor_seen=0.0)
     checkpointer = Checkpointer(
         tmp_path,
         run_spec(),
@@ -57,6 +59,7 @@ def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatc
         counters=lambda: RunCounters(10).state(0.0),
         evaluations=Evaluations(EPOCH),
         health=health,
+        events=events,
     )
     (tmp_path / "checkpoints").write_text("in the way")
     assert checkpointer.ensure_saved() is None

@@ -20,6 +20,7 @@ from building import (
 )
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
@@ -151,8 +152,9 @@ def test_new_incarnation_starts_with_a_clean_record() -> None:
 
 def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
     fleet, counters = joined_fleet("a", "b"), RunCounters(10)
+    events = EventLog()
     intake = RolloutIntake(
-        run_spec(), threading.Condition(), fleet, counters, lambda: 0, learner_epoch=EPOCH, start_version=0
+        run_spec(), threading.Condition(), fleet, counters, lambda: 0, events, learner_epoch=EPOCH, start_version=0
     )
     batch = [rollout("a"), rollout("b"), make_rollout(identity("b", incarnation=9)), rollout("z")]
     for _ in range(3):
@@ -161,3 +163,5 @@ def test_rollouts_at_fault_are_counted_for_their_senders_and_the_run() -> None:
     assert fleet.live == {"a"}
     assert not fleet.actors["a"].rejected
     assert fleet.actors["b"].rejected == {"non_finite": 3}
+    found = [(event.kind, event.actor, event.count) for event in events.report()]
+    assert found == [("rejected", "b", 3), ("rejected", "z", 3), ("quarantined", "b", 1)]

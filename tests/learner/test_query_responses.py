@@ -1,14 +1,17 @@
 """learner/serving/query_responses.py: answers before, during and after a run."""
 
+import struct
 import threading
+from dataclasses import replace
 
 import numpy as np
 
+from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Join, Message, Program, Refusal, RunEnded, Welcome
+from daedalus.protocol.messages import Join, Message, Origin, Program, Refusal, RunEnded, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
@@ -17,7 +20,7 @@ SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 def make_responses() -> tuple[QueryResponses, Fleet]:
     fleet = Fleet(seed=1, spaces=None)
-    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition()), fleet
+    return QueryResponses("run", SPEC, 5, 0, fleet, threading.Condition(), EventLog()), fleet
 
 
 def read(data: bytes) -> Message:
@@ -42,6 +45,42 @@ def test_message_that_is_not_a_join_is_refused() -> None:
         assert isinstance(answer, Refusal)
         assert answer.code == code
     assert not fleet.actors
+
+
+ORIGIN = Origin(host="arm-box", software="daedalus-rl 9.9", address="tcp/10.0.0.7:43092")
+
+
+def test_join_of_another_protocol_version_is_listed_with_its_host_and_version() -> None:
+    responses, fleet = make_responses()
+    data = bytearray(encode(Join(actor="a", incarnation=1, origin=ORIGIN)))
+    struct.pack_into("<H", data, 4, PROTOCOL_VERSION + 1)
+    answer = read(responses.join("a", bytes(data), 0.0))
+    assert isinstance(answer, Refusal)
+    assert answer.code == "mismatch"
+    (listed,) = fleet.refused_joins.report(0.0)
+    assert (listed.actor, listed.host, listed.software) == ("a", "arm-box", "daedalus-rl 9.9")
+    assert f"the other end uses protocol version {PROTOCOL_VERSION + 1}" in listed.reason
+
+
+def test_failure_that_an_actor_reports_is_listed_and_answered() -> None:
+    responses, fleet = make_responses()
+    failed = Join(actor="a", incarnation=1, origin=ORIGIN, failure="x" * 1000)
+    answer = read(responses.join("a", encode(failed), 0.0))
+    assert answer == Refusal(code="failed", reason="x" * 300)
+    (listed,) = fleet.refused_joins.report(0.0)
+    assert (listed.host, listed.reason) == ("arm-box", "x" * 300)
+
+
+def test_refused_actor_is_listed_until_it_has_joined() -> None:
+    responses, fleet = make_responses()
+    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+    joining = Join(actor="a", incarnation=1, spaces=spaces, environments=1, origin=ORIGIN)
+    responses.join("b", encode(joining), 0.0)  # the key of another actor
+    responses.join("a", encode(replace(joining, environments=0)), 0.0)
+    assert [each.actor for each in fleet.refused_joins.report(0.0)] == ["b", "a"]
+    assert isinstance(read(responses.join("a", encode(joining), 0.0)), Welcome)
+    assert [each.actor for each in fleet.refused_joins.report(0.0)] == ["b"]
+    assert fleet.actors["a"].origin == ORIGIN
 
 
 def test_program_is_found_by_its_hash() -> None:

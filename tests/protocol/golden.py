@@ -17,8 +17,11 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    EventsReport,
+    EventsRequest,
     Join,
     Message,
+    Origin,
     Program,
     Refusal,
     Rollout,
@@ -32,7 +35,7 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.status import ActorsPage, ActorStatus, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4
@@ -62,8 +65,12 @@ def _rollout(frames: np.ndarray) -> Rollout:
     )
 
 
+_ORIGIN = Origin(host="arm-box", software="daedalus-rl 1.2.3", address="tcp/10.0.0.7:43092")
 _ACTOR = ActorStatus(
     actor="wing-1",
+    host="arm-box",
+    software="daedalus-rl 1.2.3",
+    address="tcp/10.0.0.7:43092",
     alive=True,
     quarantined="",
     lives=2,
@@ -96,8 +103,10 @@ MESSAGES: dict[str, Message] = {
             },
         ),
         environments=2,
+        origin=_ORIGIN,
     ),
     "join_asking": Join(actor="wing-1", incarnation=5),
+    "join_failed": Join(actor="wing-1", incarnation=5, origin=_ORIGIN, failure="module 'corridor' is not installed"),
     "welcome": Welcome(
         run="r", learner_epoch=9, seed=3, spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}))
     ),
@@ -164,7 +173,28 @@ MESSAGES: dict[str, Message] = {
             actors_alive=1,
             actors_quarantined=2,
             actors_gone=3,
+            refused_joins=(
+                RefusedJoin(
+                    actor="wing-2",
+                    host="arm-box",
+                    software="daedalus-rl 1.2.2",
+                    reason="the other end uses protocol version 5",
+                    count=4,
+                    seconds_since_last=1.5,
+                ),
+            ),
             actors=(_ACTOR,),
+        )
+    ),
+    "events_request": EventsRequest(),
+    "events_report": EventsReport(
+        page=EventsPage(
+            run="r",
+            learner_epoch=9,
+            events=(
+                Event(time="2026-11-22T13:16:45.123Z", kind="joined", actor="wing-1", text="joined", count=1),
+                Event(time="2026-11-22T13:17:45.123Z", kind="checkpoint", actor="", text="checkpoint saved", count=2),
+            ),
         )
     ),
     "actors_request": ActorsRequest(after="wing-0"),

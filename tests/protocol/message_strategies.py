@@ -13,7 +13,10 @@ from daedalus.protocol.messages import (
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
+    EventsReport,
+    EventsRequest,
     Join,
+    Origin,
     Program,
     Refusal,
     Rollout,
@@ -35,7 +38,7 @@ from daedalus.protocol.spec import (
     ServiceSpec,
     TrainingSpec,
 )
-from daedalus.protocol.status import ActorsPage, ActorStatus, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)
@@ -108,14 +111,22 @@ run_specs = st.builds(
 actor_statuses = st.builds(
     ActorStatus,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
-    **dict.fromkeys(("actor", "quarantined"), text),
+    **dict.fromkeys(("actor", "host", "software", "address", "quarantined"), text),
     **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
     **dict.fromkeys(("bytes_up_per_hour", "bytes_down_per_hour"), floats),
     **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
     **dict.fromkeys(("busy_answers", "env_steps", "policy_lag"), counters),
 )
+events = st.builds(Event, time=text, actor=text, text=text, count=counters)
+refused_joins = st.builds(
+    RefusedJoin,
+    count=counters,
+    seconds_since_last=floats,
+    **dict.fromkeys(("actor", "host", "software", "reason"), text),
+)
 statuses = st.builds(
     RunStatus,
+    refused_joins=st.lists(refused_joins, max_size=3).map(tuple),
     episode_return_mean=st.none() | floats,
     actors=st.lists(actor_statuses, max_size=3).map(tuple),
     problems=st.lists(text, max_size=3).map(tuple),
@@ -222,7 +233,13 @@ def snapshot_parts(draw: st.DrawFn) -> SnapshotPart:
 
 KINDS: dict[type, st.SearchStrategy[Any]] = {
     Join: st.builds(
-        Join, actor=text, incarnation=counters, spaces=st.none() | spaces, environments=st.integers(0, 4096)
+        Join,
+        actor=text,
+        incarnation=counters,
+        spaces=st.none() | spaces,
+        environments=st.integers(0, 4096),
+        origin=st.builds(Origin, host=text, software=text, address=text),
+        failure=text,
     ),
     Welcome: st.builds(Welcome, run=text, learner_epoch=counters, seed=counters, spec=run_specs),
     Refusal: st.builds(Refusal, reason=text),
@@ -246,6 +263,11 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
     ),
     StatusReport: st.builds(StatusReport, status=statuses),
+    EventsRequest: st.builds(EventsRequest),
+    EventsReport: st.builds(
+        EventsReport,
+        page=st.builds(EventsPage, run=text, learner_epoch=counters, events=st.lists(events, max_size=3).map(tuple)),
+    ),
     ActorsRequest: st.builds(ActorsRequest, after=text),
     ActorsReport: st.builds(
         ActorsReport,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
+from hypothesis import strategies as st
 from message_strategies import KINDS, messages, rollouts, snapshots
 from wire_format import (
     IDENTITY,
@@ -25,13 +26,36 @@ from wire_format import (
     wire,
 )
 
-from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.codec import decode, encode, origin_of
+from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import (
+    Join,
     Message,
+    Origin,
     Program,
     Rollout,
     Snapshot,
 )
+
+
+@pytest.mark.parametrize("version", [6, 7, 65535])
+def test_origin_of_a_join_is_readable_whatever_its_version(version: int) -> None:
+    origin = Origin(host="arm-box", software="daedalus-rl 9.9", address="tcp/10.0.0.7:1")
+    data = bytearray(encode(Join(actor="a", incarnation=1, origin=origin)))
+    struct.pack_into("<H", data, 4, version)
+    assert origin_of(bytes(data), JOIN_LIMITS) == origin
+
+
+@given(st.binary(max_size=60), messages)
+def test_origin_of_any_other_bytes_has_empty_texts(data: bytes, message: Message) -> None:
+    assert origin_of(data, JOIN_LIMITS) == Origin()
+    assert isinstance(origin_of(encode(message), LIMITS), Origin)
+
+
+@pytest.mark.parametrize("value", [None, 1, "x", [], {}, {"host": 1, "software": "", "address": ""}, {"host": "x"}])
+def test_origin_of_another_form_has_empty_texts(value: object) -> None:
+    data = wire({"kind": "Join", "fields": {"origin": value}, "arrays": [], "size": 0})
+    assert origin_of(data, JOIN_LIMITS) == Origin()
 
 
 def test_strategies_cover_every_kind_of_message() -> None:

@@ -109,6 +109,7 @@ STATUS = wire(  # every field of a status, as another implementation could write
                 **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), 0),
                 **dict.fromkeys(("episode_return_mean", "checkpoint_age_seconds", "certificate_days_left")),
                 "problems": [],
+                "refused_joins": [],
                 "rollouts_rejected": {},
                 "actors": [],
             }

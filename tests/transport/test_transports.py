@@ -5,6 +5,7 @@ A fixture closes all sessions: an open session would prevent the process from en
 
 import itertools
 import queue
+import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -117,6 +118,11 @@ def test_query_is_answered_from_its_key_and_payload(pair: tuple[Transport, Trans
     payload = bytes(range(256)) * 1000
     assert asker.query("d/r/join", payload, timeout=WAIT) == [b"d/r/join " + payload]
     assert asker.query("d/r/join", timeout=WAIT) == [b"d/r/join "]
+
+
+def test_client_knows_the_address_of_its_end(pair: tuple[Transport, Transport]) -> None:
+    _, client = pair
+    assert re.fullmatch(r"memory|tcp/127\.0\.0\.1:\d+", client.local_address)
 
 
 def test_transport_answers_its_own_queries(make_end: MakeEnd) -> None:

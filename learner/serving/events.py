@@ -1,0 +1,101 @@
+"""Events of a run: joins, departures, refusals, rejections, checkpoints, the end. Each is logged and kept for a while.
+
+Peers cause most events. Therefore equal ones are one event with a count, events of actors are rate-limited, and where
+the list is full, the oldest event of the owner with the most makes room.
+"""
+
+import logging
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+from daedalus.protocol import keys
+from daedalus.protocol.status import MAX_EVENTS, Event, EventKind
+
+_EQUAL_SECONDS = 60.0  # an equal event within this time is counted, not added
+_AT_ONCE, _PER_SECOND = 100.0, 1.0  # events of actors
+_MAX_NAME, _MAX_TEXT = 64, 300  # characters
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Entry:
+    time: str
+    began: float  # on the monotonic clock, in seconds
+    key: tuple[EventKind, str, str]  # with the actor and the cause
+    text: str
+    count: int = 1
+
+
+class EventLog:
+    """The newest events of one learner process. Any thread may use it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()  # guards all below
+        self._entries: deque[_Entry] = deque()  # the newest last
+        self._equal: dict[tuple[EventKind, str, str], _Entry] = {}  # the newest of each key
+        self._tokens, self._tokens_at = _AT_ONCE, time.monotonic()
+        self._omitted = 0  # events of actors, since the last that was added
+
+    def add(self, kind: EventKind, text: str, *, actor: str = "", cause: str = "", level: int = logging.INFO) -> None:
+        """Add an event and log it.
+
+        Args:
+          kind: what happened.
+          text: the description.
+          actor: name of the actor that the event is about.
+          cause: events of the same kind, actor and cause are equal; by default, those of the same text.
+          level: severity of the log record.
+        """
+        actor, text = actor[:_MAX_NAME], text[:_MAX_TEXT]
+        key: tuple[EventKind, str, str] = kind, actor, cause or text
+        now = time.monotonic()
+        with self._lock:
+            equal = self._equal.get(key)
+            if equal is not None and now < equal.began + _EQUAL_SECONDS:
+                equal.count += 1
+                return
+            if actor and not self._take_token(now):
+                self._omitted += 1
+                return
+            omitted, self._omitted = self._omitted, 0
+            if len(self._entries) >= MAX_EVENTS:
+                self._make_room()
+            self._equal[key] = _Entry(utc(time.time()), now, key, text)
+            self._entries.append(self._equal[key])
+        if equal is not None and equal.count > 1:
+            text = f"{text} ({equal.count - 1:,} more times since the last message)"
+        if omitted:
+            _logger.warning("%d events of actors were left out: too many at once", omitted)
+        _logger.log(level, "%s", text, extra={"event": kind, "actor": actor})
+
+    def report(self) -> tuple[Event, ...]:
+        """Return the newest events, the newest last."""
+        with self._lock:
+            return tuple(
+                Event(time=each.time, kind=each.key[0], actor=each.key[1], text=each.text, count=each.count)
+                for each in self._entries
+            )
+
+    def _take_token(self, now: float) -> bool:
+        self._tokens = min(self._tokens + (now - self._tokens_at) * _PER_SECOND, _AT_ONCE)
+        self._tokens_at = now
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+    def _make_room(self) -> None:
+        name = keys.first_of_largest_owner(each.key[1] for each in self._entries)
+        oldest = next(each for each in self._entries if each.key[1] == name)
+        self._entries.remove(oldest)
+        if self._equal.get(oldest.key) is oldest:
+            del self._equal[oldest.key]
+
+
+def utc(seconds: float) -> str:
+    """Return a time of the wall clock as text in ISO 8601, in UTC with milliseconds."""
+    whole, part = divmod(int(seconds * 1000), 1000)
+    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(whole)) + f".{part:03d}Z"

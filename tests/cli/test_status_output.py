@@ -1,0 +1,85 @@
+"""`daedalus status` as a person and a program read it: hosts, refused joins, hostile texts."""
+
+import json
+from collections.abc import Callable
+
+import pytest
+from statuses import actor_status, run_status
+
+from daedalus.cli.commands.status import status as status_command
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import EventsReport, StatusReport
+from daedalus.protocol.status import Event, EventsPage, RefusedJoin, RunStatus
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+CONNECT = ("--connect", "tcp/127.0.0.1:7447")
+Print = Callable[..., str]
+
+
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Print:
+    """Function that returns what the command prints about a status."""
+
+    def show(status: RunStatus, *options: str) -> str:
+        network = MemoryNetwork()
+        learner = MemoryTransport(network)
+        answers = {0: StatusReport(status=status)}  # by the size of the request
+        learner.serve(
+            keys.status(status.run),
+            lambda request: request.reply(encode(answers.get(request.size, EventsReport(page=events_page())))),
+        )
+        monkeypatch.setattr("daedalus.cli.commands.status.connect", lambda *_: MemoryTransport(network))
+        assert status_command([*CONNECT, *options]) == 0
+        return capsys.readouterr().out
+
+    return show
+
+
+def refused_join(**changes: str) -> RefusedJoin:
+    texts = {"actor": "arm-2", "host": "arm-box", "software": "daedalus-rl 0.9", "reason": "protocol version 5"}
+    return RefusedJoin(**{**texts, **changes}, count=3, seconds_since_last=7.0)  # type: ignore[arg-type]
+
+
+def test_actors_are_shown_with_host_address_and_software(printed: Print) -> None:
+    (line,) = [each for each in printed(run_status(actors=(actor_status("arm-1"),))).splitlines() if "arm-1" in each]
+    assert line.endswith("; gpu-box, tcp/10.0.0.7:43092, daedalus-rl 1.0")
+
+
+def test_refused_joins_are_shown_with_host_version_and_reason(printed: Print) -> None:
+    status = run_status(refused_joins=(refused_join(), refused_join(host="", software="")))
+    assert printed(status).splitlines()[-2:] == [
+        "  refused: arm-2 (arm-box, daedalus-rl 0.9), 3 x, last 7 s ago: protocol version 5",
+        "  refused: arm-2, 3 x, last 7 s ago: protocol version 5",
+    ]
+    assert json.loads(printed(status, "--json"))["refused_joins"][0]["host"] == "arm-box"
+
+
+def events_page() -> EventsPage:
+    events = (
+        Event(time="2026-11-22T13:16:45.123Z", kind="joined", actor="arm-1", text="joined", count=1),
+        Event(time="2026-11-22T13:17:45.123Z", kind="rejected", actor="arm-1", text="a\x1b[2J\nb", count=1200),
+        Event(time="2026-11-22T13:18:45.123Z", kind="checkpoint", actor="", text="checkpoint saved", count=1),
+    )
+    return EventsPage(run="mine", learner_epoch=1, events=events)
+
+
+def test_events_are_shown_with_time_kind_actor_and_count(printed: Print) -> None:
+    lines = printed(run_status(), "--events").splitlines()
+    assert [" ".join(line.split()) for line in lines] == [
+        "run mine: epoch 1, the newest events",
+        "2026-11-22T13:16:45.123Z joined arm-1 joined",
+        "2026-11-22T13:17:45.123Z rejected arm-1 a\\x1b[2J b (1,200 times)",
+        "2026-11-22T13:18:45.123Z checkpoint - checkpoint saved",
+    ]
+    assert json.loads(printed(run_status(), "--events", "--json")) == events_page().model_dump(mode="json")
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_texts_of_peers_cannot_command_the_terminal_or_begin_lines(printed: Print, options: tuple[str, ...]) -> None:
+    evil = "\x1b[2J\nPROBLEM: none\r\x9b31m"
+    actor = actor_status("a", host=evil, software=evil, address=evil, quarantined=evil)
+    refused = refused_join(actor=evil, host=evil, software=evil, reason=evil)
+    output = printed(run_status(actors=(actor,), refused_joins=(refused,)), *options)
+    assert not {"\x1b", "\r", "\x9b"} & set(output)
+    assert not any(line.startswith("PROBLEM") for line in output.splitlines())

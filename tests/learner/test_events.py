@@ -1,0 +1,104 @@
+"""learner/serving/events.py: bounded, rate-limited, equal events counted; and the events that a learner records."""
+
+import logging
+from types import SimpleNamespace
+
+import pytest
+from log_lines import LINES
+
+from daedalus.learner.serving import events
+from daedalus.learner.serving.events import EventLog
+
+
+class Clock:
+    now = 1000.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Clock that the test sets, of the wall and of the machine."""
+    clock = Clock()
+
+    def read() -> float:
+        return clock.now
+
+    fake = SimpleNamespace(
+        monotonic=read,
+        time=lambda: 1_800_000_000.25 + clock.now,
+        strftime=events.time.strftime,
+        gmtime=events.time.gmtime,
+    )
+    monkeypatch.setattr(events, "time", fake)
+    return clock
+
+
+def texts(log: EventLog) -> list[str]:
+    return [event.text for event in log.report()]
+
+
+def test_event_is_logged_and_reported_with_time_kind_and_actor(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    log = EventLog()
+    log.add("refused", "refused: other spaces", actor="arm", level=logging.WARNING)
+    (event,) = log.report()
+    assert event.model_dump() == {
+        "time": "2027-01-15T08:16:40.250Z",
+        "kind": "refused",
+        "actor": "arm",
+        "text": "refused: other spaces",
+        "count": 1,
+    }
+    (record,) = caplog.records
+    assert (record.levelname, record.getMessage()) == ("WARNING", "refused: other spaces")
+    assert (record.actor, record.event) == ("arm", "refused")  # type: ignore[attr-defined] - of this record
+
+
+def test_equal_events_of_a_minute_are_one_with_a_count(clock: Clock) -> None:
+    log = EventLog()
+    for number in range(50):
+        log.add("rejected", f"stale: lag {number}", actor="arm", cause="stale")
+        log.add("rejected", "unfit", actor="arm", cause="unfit")
+    assert [(event.text, event.count) for event in log.report()] == [("stale: lag 0", 50), ("unfit", 50)]
+    assert LINES == ["stale: lag 0", "unfit"]
+    clock.now += 61.0
+    log.add("rejected", "stale: lag 99", actor="arm", cause="stale")
+    assert texts(log) == ["stale: lag 0", "unfit", "stale: lag 99"]
+    assert LINES[-1] == "stale: lag 99 (49 more times since the last message)"
+
+
+def test_last_100_events_are_kept(clock: Clock) -> None:
+    log = EventLog()
+    for number in range(250):
+        log.add("checkpoint", f"{number}")
+    assert texts(log) == [f"{number}" for number in range(150, 250)]
+    assert len(log._equal) == 100
+
+
+def test_events_of_actors_are_rate_limited_and_those_of_the_run_are_not(clock: Clock) -> None:
+    log = EventLog()
+    for number in range(1000):
+        log.add("joined", "joined", actor=f"actor-{number}")
+    log.add("checkpoint", "saved")
+    assert len(LINES) == 102
+    assert LINES[-2:] == ["900 events of actors were left out: too many at once", "saved"]
+    clock.now += 3.0
+    for number in range(10):
+        log.add("left", "left", actor=f"actor-{number}")
+    assert LINES[102:] == ["left"] * 3
+
+
+def test_one_owner_does_not_push_out_the_events_of_others(clock: Clock) -> None:
+    log = EventLog()
+    log.add("joined", "joined", actor="honest")
+    log.add("started", "started")
+    for number in range(500):
+        clock.now += 1.0
+        log.add("joined", "joined", actor=f"evil.{number}")
+    assert len(log.report()) == 100
+    assert [event.actor for event in log.report()][:3] == ["honest", "", "evil.402"]
+
+
+def test_long_texts_are_cut(clock: Clock) -> None:
+    log = EventLog()
+    log.add("refused", "x" * 5000, actor="a" * 5000)
+    (event,) = log.report()
+    assert (len(event.actor), len(event.text)) == (64, 300)
