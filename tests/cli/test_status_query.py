@@ -29,7 +29,7 @@ from daedalus.protocol.messages import (
     Refusal,
     StatusReport,
 )
-from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.status import MAX_EVENTS, PAGE_ACTORS, ActorsPage, Event, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -98,7 +98,7 @@ def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer,
 
 def test_events_of_the_run_are_reported(server: ActorServer, operator: MemoryTransport) -> None:
     """Actors join, leave, return and are refused."""
-    spaces = Spaces(observation=SPACES.observation, action=DiscreteSpace(count=7))
+    spaces = SPACES.model_copy(update={"actions": {"action": DiscreteSpace(counts=(7,))}})
     mismatch = Join(actor="other", incarnation=1, spaces=spaces, environments=1, origin=Origin(host="arm-box"))
     actor = MemoryTransport(operator._network)
     new = replace(mismatch, actor="new", spaces=SPACES)

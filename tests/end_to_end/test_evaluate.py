@@ -21,9 +21,9 @@ from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.commands import train as train_command
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.local_run import LocalRun, evaluate_run
+from daedalus.cli.run_report import report as report_of
 from daedalus.cli.select_best import EvaluationFailedError
 from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -333,7 +333,7 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     assert evaluation["select_best"] == []
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
     assert result == summary
-    report = train_command._report(local_run, summary)
+    report = report_of(local_run, summary)
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in report
 
 
@@ -378,7 +378,7 @@ def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path,
         == pytest.approx(mean - low)
         == pytest.approx(2.0227 * confirmation["return_std"] / 39**0.5, rel=1e-4)
     )
-    report = train_command._report(local_run, summary)
+    report = report_of(local_run, summary)
     assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
     assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 20.5")
 

@@ -5,6 +5,7 @@ import threading
 from dataclasses import replace
 
 import numpy as np
+from plain import vector_spaces
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
@@ -73,7 +74,7 @@ def test_failure_that_an_actor_reports_is_listed_and_answered() -> None:
 
 def test_refused_actor_is_listed_until_it_has_joined() -> None:
     responses, fleet = make_responses()
-    spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
+    spaces = vector_spaces(4, 2)
     joining = Join(actor="a", incarnation=1, spaces=spaces, environments=1, origin=ORIGIN)
     responses.join("b", encode(joining), 0.0)  # the key of another actor
     responses.join("a", encode(replace(joining, environments=0)), 0.0)
