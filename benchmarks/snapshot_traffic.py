@@ -19,10 +19,12 @@ from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.cli.processes import stop_on_signals
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.zenoh_transport import connect
 
 _ENVIRONMENT = Path(__file__).parents[1] / "tests" / "slow_environment.py"
+_MODULES = UserModules(frozenset({_ENVIRONMENT.stem}), "the learner")
 _UNLIMITED = 1e12  # bytes per second
 
 
@@ -44,7 +46,7 @@ def play(address: str, count: int, link: LinkChoice) -> int:
     stop, threads = stop_on_signals(), []
     for number in range(count):
         transport = connect([address])
-        config = ActorConfig(name=f"actor-{number}", incarnation=time.monotonic_ns(), link=link)
+        config = ActorConfig(name=f"actor-{number}", incarnation=time.monotonic_ns(), link=link, modules=_MODULES)
         threads.append(threading.Thread(target=ActorService(config, transport, stop).run, daemon=True))
         threads[-1].start()
     stop.wait()

@@ -58,25 +58,27 @@ POLICY = Policy.of(PolicySpec(), SPACES)
 class ScriptedLearner:
     """A learner that answers joins and programs, and leaves every rollout to the test to acknowledge."""
 
-    def __init__(self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY) -> None:
-        self.transport = MemoryTransport(network)
+    def __init__(
+        self, network: MemoryNetwork, spec: RunSpec = SPEC, epoch: int = 1, policy: Policy = POLICY, run: str = "r"
+    ) -> None:
+        self.transport, self.run = MemoryTransport(network), run
         self.epoch, self.spec, self.policy = epoch, spec, policy
         self.joins: queue.Queue[Join] = queue.Queue()
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
-        self.transport.declare_presence(keys.learner("r"))
-        self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
-        self.transport.serve(keys.snapshots("r"), self._newest)
-        self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.serve(keys.join("r", "*"), self._join)
+        self.transport.declare_presence(keys.learner(run))
+        self.transport.serve(keys.rollouts(run, "*"), self.rollouts.put)
+        self.transport.serve(keys.snapshots(run), self._newest)
+        self.transport.serve(keys.program(run, "*"), self._program)
+        self.transport.serve(keys.join(run, "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
-        answer: Message = Welcome(run="r", learner_epoch=self.epoch, seed=1, spec=self.spec)
+        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, spec=self.spec)
         request.reply(encode(self.refusal or answer))
 
     def _newest(self, request: Request) -> None:
@@ -103,7 +105,7 @@ class ScriptedLearner:
             Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights)
         )
         if push:
-            self.transport.publish(keys.snapshots("r"), self.snapshot)
+            self.transport.publish(keys.snapshots(self.run), self.snapshot)
 
     def receive(self) -> tuple[Rollout, Request]:
         request = self.rollouts.get(timeout=LIMIT)
@@ -124,12 +126,14 @@ class RunningActor:
         link: LinkChoice = "auto",
         collector: Collector | None = None,
         *,
+        run: str = keys.ANY_RUN,
+        any_run: bool = False,
         begin: bool = True,
     ) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
         self.transport = MemoryTransport(network)
-        config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link)
+        config = ActorConfig(name="a", incarnation=7, timeout=timeout, link=link, run=run, any_run=any_run)
         self._service = ActorService(config, self.transport, self.stop, collector)
         self._thread = threading.Thread(target=self._run, daemon=True)
         if begin:

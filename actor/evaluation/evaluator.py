@@ -53,9 +53,8 @@ class Evaluator:
         """
         try:
             while True:
-                self._evaluate_learner(
-                    self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._end)
-                )
+                run = self._config.run_to_join(self._end.run)
+                self._evaluate_learner(self._queries.join_learner(run, self._join, self._config.timeout, self._end))
         except RunOverError as error:
             _logger.info("%s", error)
             return error.finished

@@ -33,6 +33,7 @@ _REPORT_SECONDS, _MAX_FAILURE = 2.0, 300  # for the report of a failure, and its
 _HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
+_LOOK_AROUND_SECONDS, _MAX_RUNS = 10.0, 10  # between looks for other runs, and how many are named
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
 
 
@@ -68,12 +69,12 @@ class LearnerQueries:
         without an answer.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        pause, logged = _FIRST_RETRY_SECONDS, False
+        pause, logged, log_at = _FIRST_RETRY_SECONDS, "", 0.0
         reopen_at = time.monotonic() + _REOPEN_SECONDS
         name_free_by = time.monotonic() + _NAME_IN_USE_SECONDS
         while True:
             end.check()  # a request may take 5 s
-            awaited = "a learner"
+            awaited = ""
             try:
                 welcome = self.request_join(run, join)
             except NameInUseError:
@@ -84,18 +85,41 @@ class LearnerQueries:
             if welcome is not None:
                 return welcome
             if deadline is not None and time.monotonic() > deadline:
-                raise ActorError(
-                    f"no learner answered within {timeout:g} s: check that the learner runs and that the address is "
-                    "correct"
-                )
-            if not logged and pause >= _MAX_RETRY_SECONDS:
-                _logger.info("waiting for %s", awaited)
-                logged = True
+                raise ActorError(f"no learner answered within {timeout:g} s: {self._remedy(run, join)}")
+            if pause >= _MAX_RETRY_SECONDS and time.monotonic() >= log_at:
+                log_at = time.monotonic() + _LOOK_AROUND_SECONDS
+                text = f"waiting for {awaited or self._awaited(run, join)}"
+                if text != logged:
+                    _logger.info("%s", text)
+                logged = text
             end.wait(pause)
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
                 self._reopen()
                 reopen_at = time.monotonic() + _REOPEN_SECONDS
+
+    def _remedy(self, run: str, join: Join) -> str:
+        """Return what to do where no learner of the run answers."""
+        if run != keys.ANY_RUN and self._runs(join):
+            return f"waited for {self._awaited(run, join)}; choose with --run"
+        return "check that the learner runs and that the address is correct"
+
+    def _awaited(self, run: str, join: Join) -> str:
+        """Return which learner the actor waits for, and which runs are there instead."""
+        if run == keys.ANY_RUN:
+            return "a learner"
+        there = ", ".join(repr(name) for name in self._runs(join) if name != run)
+        return f"a learner of run {run!r}" + (f"; the runs here are {there}" if there else "")
+
+    def _runs(self, join: Join) -> list[str]:
+        """Return the names of the runs whose learners answer."""
+        request, runs = encode(replace(join, spaces=None, environments=0)), set()
+        with contextlib.suppress(TransportError):
+            for answer in self._transport.query(keys.join(keys.ANY_RUN, join.actor), request, timeout=_ANSWER_SECONDS):
+                with contextlib.suppress(ProtocolError):  # a learner of another version is not the one awaited
+                    message = decode(answer, LEARNER_LIMITS)
+                    runs.update({message.run} if isinstance(message, Welcome) else ())
+        return sorted(runs)[:_MAX_RUNS]
 
     def _reopen(self) -> None:
         """Open another session in place of one that may be dead. Raises ActorError if the certificate is refused."""

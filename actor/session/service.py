@@ -52,6 +52,11 @@ class ActorConfig:
     modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
+    any_run: bool = False  # whether the actor may change to another run when its learner has gone
+
+    def run_to_join(self, followed: str) -> str:
+        """Return the run to look for; `followed` is the run that the actor joined before, or an empty text."""
+        return self.run if self.any_run or not followed else followed
 
 
 class ActorService:
@@ -120,7 +125,8 @@ class ActorService:
     # ---------------------------------------------------------------------------------------------- joining
 
     def _find_learner(self) -> Welcome:
-        welcome = self._queries.join_learner(self._config.run, self._join, self._config.timeout, self._end)
+        run = self._config.run_to_join(self._end.run)
+        welcome = self._queries.join_learner(run, self._join, self._config.timeout, self._end)
         self._presence.joined()
         return welcome
 

@@ -59,8 +59,15 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_connection(options: argparse.ArgumentParser) -> None:
     """Add the options about the learner, the name and the link."""
-    options.add_argument(
-        "--run", default=keys.ANY_RUN, metavar="NAME", help="run to join, if several runs share a network"
+    runs = options.add_mutually_exclusive_group()
+    runs.add_argument(
+        "--run",
+        default=keys.ANY_RUN,
+        metavar="NAME",
+        help="run to join, if several runs share a network (default: the only run; the actor then stays with this run)",
+    )
+    runs.add_argument(
+        "--any-run", action="store_true", help="change to another run when the learner of the present one has gone"
     )
     options.add_argument(
         "--name",
@@ -103,6 +110,7 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         modules=UserModules(frozenset(arguments.allow_module), "the learner"),
         link=arguments.link,
         timeout=arguments.timeout,
+        any_run=arguments.any_run,
     )
 
 

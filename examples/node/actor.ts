@@ -33,6 +33,7 @@ export interface ActorConfig {
 export class Actor {
   readonly #config: ActorConfig;
   readonly #log: (text: string) => void;
+  #run: string; // to join; the one that was joined first, if any would do
   #uploader = new Uploader(-1, 1);
   #snapshot?: Message; // the newest received
   #snapshotAt = 0; // when the last snapshot was received or requested; times are of performance.now()
@@ -45,6 +46,7 @@ export class Actor {
 
   constructor(config: ActorConfig, log: (text: string) => void) {
     this.#config = config;
+    this.#run = config.run;
     this.#log = log;
   }
 
@@ -84,7 +86,8 @@ export class Actor {
       const origin = { host: hostname(), software: SOFTWARE, address: "" };
       const known = { actor: name, incarnation, origin, failure: "" };
       const inquiry = { ...known, spaces: null, environments: 0 };
-      const { run, spec, learner_epoch } = await link.join(bridge, this.#config.run, inquiry);
+      const { run, spec, learner_epoch } = await link.join(bridge, this.#run, inquiry);
+      this.#run = run;
       checkSupported(spec.environment);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);

@@ -1,6 +1,7 @@
 """ActorService against a scripted learner, over the memory transport: failures, refusals and the end of the run."""
 
 import socket
+import struct
 import threading
 
 import pytest
@@ -11,7 +12,7 @@ from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknow
 from daedalus.actor.session import learner_queries, service, session_monitor
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
+from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.messages import (
     Acknowledgement,
     Refusal,
@@ -141,6 +142,49 @@ def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     actor = RunningActor(network)
     actor.join()
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
+
+
+def test_actor_that_waits_for_another_run_names_the_runs_that_are_there(network: MemoryNetwork) -> None:
+    learners = [ScriptedLearner(network, run=run) for run in ("two", "one")]
+    of_another_version = MemoryTransport(network)
+    newer = bytearray(encode(Refusal(code="not_ready", reason="")))
+    struct.pack_into("<H", newer, 4, PROTOCOL_VERSION + 1)
+    of_another_version.serve(keys.join("three", "*"), lambda request: request.reply(bytes(newer)))
+    actor = RunningActor(network, run="cartpol")
+    until(lambda: "waiting for a learner of run 'cartpol'; the runs here are 'one', 'two'" in LINES)
+    actor.stop.set()
+    actor.join()
+    actor = RunningActor(network, run="cartpol", timeout=0.05)
+    actor.join()
+    assert str(actor.error) == (
+        "no learner answered within 0.05 s: waited for a learner of run 'cartpol'; the runs here are 'one', 'two'; "
+        "choose with --run"
+    )
+    assert all(learner.joins.get(timeout=LIMIT).spaces is None for learner in learners)
+
+
+@pytest.mark.parametrize("any_run", [False, True])
+def test_actor_stays_with_the_run_that_it_joined_first_unless_told_otherwise(
+    network: MemoryNetwork, any_run: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner_queries, "_LOOK_AROUND_SECONDS", 0.1)
+    first = ScriptedLearner(network, run="first")
+    actor = RunningActor(network, any_run=any_run)
+    first.publish(0)
+    first.receive()
+    other = ScriptedLearner(network, run="other", epoch=2)
+    other.publish(0)
+    first.transport.close()
+    if any_run:
+        assert other.receive()[0].identity.learner_epoch == 2
+    else:
+        until(lambda: "waiting for a learner of run 'first'; the runs here are 'other'" in LINES)
+        again = ScriptedLearner(network, run="first", epoch=3)
+        again.publish(0)
+        assert again.receive()[0].identity.learner_epoch == 3
+        assert other.rollouts.empty()
+    actor.stop.set()
+    actor.join()
 
 
 def test_actor_ends_after_its_timeout_without_a_learner(network: MemoryNetwork) -> None:

@@ -87,7 +87,7 @@ def test_actors_find_a_learner_that_was_restarted(start: Start, address: str, tm
     learner.process.kill()
     learner.wait()
     actor.expect("the learner went away")
-    second = start("learner", "cartpole", "--listen", address, "--run-dir", "run-2", "--env-steps", 30000)
+    second = start("learner", "cartpole", "--listen", address, "--run-dir", "new/run", "--env-steps", 30000)
     assert second.wait() == 3, second.output
     assert actor.wait() == 0, actor.output
     assert sum("joined run" in line for line in actor.lines) == 2
