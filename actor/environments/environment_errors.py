@@ -5,6 +5,8 @@ import importlib
 from collections.abc import Collection
 from types import ModuleType
 
+_MOST_CHARACTERS = 160  # of a space in a message
+
 
 class EnvironmentSetupError(Exception):
     """The environment cannot be created or stepped; the message says why and what to do."""
@@ -32,3 +34,9 @@ def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
             f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]", '
             "or use another backend (--set environment.backend=gymnasium)"
         ) from None
+
+
+def described(space: object) -> str:
+    """Return a space in one short line: gymnasium writes bounds that differ as arrays of many lines."""
+    line = " ".join(str(space).split())
+    return line if len(line) <= _MOST_CHARACTERS else f"{line[:_MOST_CHARACTERS]}..."
