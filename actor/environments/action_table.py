@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 
 
 def table_actions(table: tuple[tuple[float, ...], ...], space: gymnasium.Space) -> np.ndarray:
@@ -13,7 +13,8 @@ def table_actions(table: tuple[tuple[float, ...], ...], space: gymnasium.Space) 
     """
     if not isinstance(space, gymnasium.spaces.Box):
         raise EnvironmentSetupError(
-            f"environment.action_table has {len(table)} rows, but action space {space} needs no table: leave it out"
+            f"environment.action_table has {len(table)} rows, but action space {described(space)} needs no table: "
+            "leave it out"
         )
     return _checked(table, space)
 
@@ -23,11 +24,13 @@ def _checked(table: tuple[tuple[float, ...], ...], space: gymnasium.spaces.Box) 
         if len(row) != _size(space):
             raise EnvironmentSetupError(
                 f"environment.action_table row {number} has {len(row)} numbers, "
-                f"but an action of space {space} has {_size(space)}"
+                f"but an action of space {described(space)} has {_size(space)}"
             )
         action = np.asarray(row, space.dtype)
         if not ((action >= space.low.ravel()) & (action <= space.high.ravel())).all():
-            raise EnvironmentSetupError(f"environment.action_table row {number} is {row}, outside action space {space}")
+            raise EnvironmentSetupError(
+                f"environment.action_table row {number} is {row}, outside action space {described(space)}"
+            )
     return np.asarray(table, space.dtype).reshape(len(table), *space.shape)
 
 

@@ -14,7 +14,7 @@ from gymnasium import spaces as gym
 from pydantic import ValidationError
 
 from daedalus.actor.environments.action_table import table_actions
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
 
 _UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
@@ -43,9 +43,11 @@ def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
     found = tuple(Leaf(".".join(map(_cleaned, path)) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
     names = [leaf.name for leaf in found]
     if not found:
-        raise EnvironmentSetupError(f"{whole} space {space} is empty: it must have at least one component")
+        raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
     if len(set(names)) < len(names):
-        raise EnvironmentSetupError(f"{whole} space {space} has components with like names: {', '.join(names)}")
+        raise EnvironmentSetupError(
+            f"{whole} space {described(space)} has components with like names: {', '.join(names)}"
+        )
     return found
 
 
@@ -68,8 +70,8 @@ def unsupported(kind: str, leaf: Leaf) -> EnvironmentSetupError:
     """Return the error for a leaf of a kind that has no component."""
     where = f" (component {leaf.name!r})" if leaf.path else ""
     return EnvironmentSetupError(
-        f"{kind} space {leaf.space}{where} is not supported: use Box, Discrete, MultiDiscrete or MultiBinary, "
-        "or a Dict or Tuple of these"
+        f"{kind} space {described(leaf.space)}{where} is not supported: use Box, Discrete, MultiDiscrete or "
+        "MultiBinary, or a Dict or Tuple of these"
     )
 
 
@@ -95,7 +97,7 @@ class ObservationComponent(NamedTuple):
             values = values - self.first
             if ((values < 0) | (values >= self.counts)).any():
                 raise EnvironmentSetupError(
-                    f"the environment returned an observation outside its space {self.leaf.space}"
+                    f"the environment returned an observation outside its space {described(self.leaf.space)}"
                 )
             return values
         return values if values.dtype in (np.uint8, np.float32) else values.astype(np.float32)
@@ -135,7 +137,9 @@ class ActionComponents:
         try:
             self.spaces: dict[str, ActionSpace] = {leaf.name: self._component(leaf) for leaf in self._leaves}
         except ValidationError as error:
-            raise EnvironmentSetupError(f"action space {space} is not supported: {error.errors()[0]['msg']}") from None
+            raise EnvironmentSetupError(
+                f"action space {described(space)} is not supported: {error.errors()[0]['msg']}"
+            ) from None
 
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
@@ -218,7 +222,7 @@ def batch_of_one(space: gymnasium.Space, value: Any, where: str = "the observati
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{where} has a value that is not finite")
     if not isinstance(space, gym.Box) and not space.contains(array.astype(space.dtype)):
-        raise ValueError(f"{where} is {value}, which is outside {space}")
+        raise ValueError(f"{where} is {value}, which is outside {described(space)}")
     return array.astype(space.dtype)[None]
 
 

@@ -8,6 +8,8 @@ from types import ModuleType
 
 import gymnasium
 
+_MOST_CHARACTERS = 160  # of a space in a message
+
 
 class EnvironmentSetupError(Exception):
     """The environment cannot be created or stepped; the message says why and what to do."""
@@ -52,3 +54,9 @@ def creation_errors(environment: str) -> Iterator[None]:
         ) from None
     except Exception as error:  # broad: the constructor of a user's environment may raise anything
         raise EnvironmentSetupError(f"environment {environment} cannot be created: {first_line(error)}") from error
+
+
+def described(space: object) -> str:
+    """Return a space in one short line: gymnasium writes bounds that differ as arrays of many lines."""
+    line = " ".join(str(space).split())
+    return line if len(line) <= _MOST_CHARACTERS else f"{line[:_MOST_CHARACTERS]}..."

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spec import EnvironmentSpec
 
 _GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0.299, 0.587, 0.114
@@ -33,7 +33,7 @@ class Pixels:
                 frames = transform(frames)
             except ValueError as error:
                 raise EnvironmentSetupError(
-                    f"environment.{name} does not fit observation space {space}: {error}"
+                    f"environment.{name} does not fit observation space {described(space)}: {error}"
                 ) from None
         self.shape: tuple[int, ...] = frames.shape[1:]  # of one transformed frame
 

@@ -13,7 +13,7 @@ from daedalus.actor.environments.components import (
     observation_components,
     only_of_batch,
 )
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
 from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
@@ -51,7 +51,9 @@ class Transforms:
         self._mask_source = mask_component(components, self._actions.spaces)
         self._observations = [component for component in components if component is not self._mask_source]
         if not self._observations:
-            raise EnvironmentSetupError(f"observation space {observation_space} has nothing but the {MASK_KEY}")
+            raise EnvironmentSetupError(
+                f"observation space {described(observation_space)} has nothing but the {MASK_KEY}"
+            )
         example = action_mask if self._mask_source is None else np.ones((1, *self._mask_source.shape), np.bool_)
         self._masks = Masks(self._actions.spaces, example)
         self._pixels = _pixels(spec, self._observations)
@@ -62,7 +64,8 @@ class Transforms:
             )
         except ValidationError as error:
             raise EnvironmentSetupError(
-                f"observation space {observation_space} is not supported: {error.errors()[0]['msg']}"
+                f"observation space {described(observation_space)} with action space {described(action_space)} is not "
+                f"supported: {error.errors()[0]['msg']}"
             ) from None
 
     def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
@@ -172,7 +175,9 @@ def _is_image(component: ObservationComponent) -> bool:
 def _box(component: ObservationComponent) -> gymnasium.spaces.Box:
     space = component.leaf.space
     if not isinstance(space, gymnasium.spaces.Box):
-        raise EnvironmentSetupError(f"environment.crop, grey and resize do not fit observation space {space}")
+        raise EnvironmentSetupError(
+            f"environment.crop, grey and resize do not fit observation space {described(space)}"
+        )
     return space
 
 

@@ -221,13 +221,14 @@ def test_neutral_noise_gives_the_most_probable_choice() -> None:
     assert chosen.tolist() == [[1, 0], [0, 1]]
 
 
-def test_illegal_choices_have_probability_zero_and_entropy_stays_finite() -> None:
+@pytest.mark.parametrize("legal", [0.0, -1e12])  # a policy that diverges still takes legal actions
+def test_illegal_choices_have_probability_zero_and_entropy_stays_finite(legal: float) -> None:
     family = Categorical(DiscreteSpace(counts=(4,)))
     mask = torch.tensor([True, False, True, False]).expand(SAMPLES, -1)
-    logits = without_illegal(torch.tensor([0.0, 9.0, 0.0, 9.0]).expand(SAMPLES, -1), mask)
+    logits = without_illegal(torch.tensor([legal, 9.0, legal, 9.0]).expand(SAMPLES, -1), mask)
     logits.requires_grad_()
     actions = sampled(family, logits)
-    assert set(actions.flatten().tolist()) == {0, 2}
+    assert set(actions.flatten().tolist()) == ({0, 2} if legal == 0.0 else {0})  # noise is lost beside 1e12
     log_probs, entropy = family.log_prob_and_entropy(logits, actions)
     torch.testing.assert_close(log_probs, torch.full((SAMPLES,), -math.log(2)))
     torch.testing.assert_close(entropy, torch.full((SAMPLES,), math.log(2)))

@@ -6,7 +6,7 @@ from torch import Tensor
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.protocol.spaces import DiscreteSpace
 
-_ABSENT = -1e9  # logit of a choice that a variable does not have, or that is not legal: its probability is exactly 0
+_ABSENT = -1e30  # logit of a choice that a variable does not have, or that is not legal: its probability is exactly 0
 
 
 class Categorical(Distribution):

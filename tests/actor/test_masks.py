@@ -1,0 +1,125 @@
+"""Masks of illegal actions, by each convention that environments have."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces as gym
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import EnvironmentSpec
+
+SPEC = EnvironmentSpec(id="Any-v0")
+
+
+class Narrowing(gymnasium.Env):
+    """Episodes of three steps. After step t only choice t is legal; the convention is an argument."""
+
+    observation_space = gym.Box(0, 9, (1,), np.float32)
+    action_space = gym.Discrete(3)
+
+    def __init__(self, convention: str) -> None:
+        self._convention = convention
+        self._step = 0
+        if convention == "observation":
+            self.observation_space = gym.Dict(
+                {"seen": gym.Box(0, 9, (1,)), "action_mask": gym.Box(0, 1, (3,), np.int8)}
+            )
+        if convention == "method":
+            self.action_masks = self.mask
+
+    def mask(self) -> np.ndarray:
+        return np.arange(3) == self._step % 3
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        self._step = 0
+        return self._shown()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        assert self.mask()[action], "an illegal action was taken"
+        self._step += 1
+        seen, info = self._shown()
+        return seen, 1.0, self._step == 3, False, info
+
+    def _shown(self) -> tuple[Any, dict]:
+        seen = np.array([self._step], np.float32)
+        if self._convention == "observation":
+            return {"seen": seen, "action_mask": self.mask().astype(np.int8)}, {}
+        return seen, {"action_mask": self.mask().astype(np.int8)} if self._convention == "info" else {}
+
+
+@pytest.fixture(autouse=True)
+def _registered() -> Any:
+    gymnasium.register("Narrowing-v0", Narrowing)
+    yield
+    del gymnasium.registry["Narrowing-v0"]
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation"])
+def test_masks_accompany_their_observations(convention: str) -> None:
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
+    environments = make_environments(spec, 2)
+    try:
+        assert environments.spaces.actions == {"action": DiscreteSpace(counts=(3,), masked=True)}
+        assert list(environments.spaces.observations) == ["seen" if convention == "observation" else "observation"]
+        observed = environments.reset(1)
+        legal = []
+        for _ in range(8):  # two episodes, each with the row that only resets
+            legal.append(np.flatnonzero(observed.masks["action"][0]).tolist())
+            observed, *_ = environments.step({"action": observed.masks["action"].argmax(1)[:, None]})
+        assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
+    finally:
+        environments.close()
+
+
+def test_environments_without_masks_have_none() -> None:
+    environments = make_environments(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "none"}), 1)
+    assert environments.spaces.masks == {}
+    assert environments.reset(1).masks == {}
+
+
+def test_masks_of_several_components_are_a_map() -> None:
+    action = gym.Dict({"a": gym.Discrete(2), "b": gym.MultiDiscrete([2, 3]), "c": gym.Box(-1, 1)})
+    example = {"b": np.ones((1, 5), np.int8)}
+    transforms = Transforms(SPEC, gym.Box(0, 1), action, example)
+    assert transforms.spaces.masks == {"b": 5}
+    observed = transforms.observe_one(np.zeros(1), {"b": np.array([0, 1, 1, 0, 0])})
+    assert observed.masks["b"].tolist() == [[False, True, True, False, False]]
+
+
+def observe(mask: Any, needed: bool = True, example: Any = None, action: gymnasium.Space | None = None) -> np.ndarray:
+    """Return the mask of one observation of an environment with masks."""
+    space = action or gym.MultiDiscrete([2, 3])
+    transforms = Transforms(SPEC, gym.Box(0, 1), space, np.ones((1, 5)) if example is None else example)
+    return transforms.observe_one(np.zeros(1), mask, needed).masks["action"]
+
+
+def test_forbidding_every_choice_is_refused_unless_no_action_is_taken() -> None:
+    with pytest.raises(ValueError, match="'action' forbids every choice of variable 1 in environment 0: one must be"):
+        observe(np.array([1, 0, 0, 0, 0]))
+    assert observe(np.array([1, 0, 0, 0, 0]), needed=False).tolist() == [[True, False, True, True, True]]
+
+
+@pytest.mark.parametrize(
+    ("mask", "reason"),
+    [
+        (None, "no 'action_mask' any more"),
+        (np.ones(4), r"of 'action' has shape \(4,\), but the action has 5 choices"),
+        (np.array(["x"] * 5), "has shape"),
+        ({"gripper": np.ones(5)}, "names 'gripper', which is no discrete component"),
+        ({}, "has no entry for 'action' any more"),
+    ],
+)
+def test_mask_that_does_not_fit_is_refused(mask: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        observe(mask)
+
+
+def test_one_mask_for_several_discrete_components_is_refused() -> None:
+    action = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
+    with pytest.raises(EnvironmentSetupError, match="the action has 2 discrete components: give a map"):
+        Transforms(SPEC, gym.Box(0, 1), action, np.ones((1, 5)))
