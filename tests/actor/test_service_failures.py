@@ -202,6 +202,7 @@ def test_quarantine_ends_the_actor_with_the_reason(network: MemoryNetwork) -> No
     actor.join()
     assert isinstance(actor.error, ActorError)
     assert "quarantined this actor: 3 unfit rollouts in a row" in str(actor.error)
+    assert not any(join.failure for join in learner.joins.queue)  # the learner knows the reason
 
 
 def test_consecutive_rejections_are_warned_of_once_with_the_reason(network: MemoryNetwork, actor: RunningActor) -> None:
