@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, learners, network, wire
+from benchmarks.chaos import actors, clocks, endings, learners, network, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -29,6 +29,8 @@ def main() -> int:
         "freezes": lambda: actors.freezes(scaled(20)),
         "accounting": lambda: actors.accounting(scaled(30)),
         "learners": lambda: learners.kills(scaled(50)),
+        "ends": lambda: endings.run_ends(scaled(100)),
+        "restarts": lambda: endings.restarts(scaled(100)),
         "stops": lambda: learners.stops(scaled(8)),
         "routers": lambda: network.routers(scaled(20)),
         "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),

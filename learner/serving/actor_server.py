@@ -24,7 +24,7 @@ from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, JOIN_LIMITS, SNAPSHOT_REQUEST_LIMITS, Limits
-from daedalus.protocol.messages import Refusal, RunEnded, StatusReport
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, StatusReport
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -94,6 +94,7 @@ class ActorServer:
         self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
         self._serve(keys.status(run), self._on_status)
+        self._serve(keys.drain(run, "*"), self._on_drain)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
@@ -188,6 +189,14 @@ class ActorServer:
 
     def _on_join(self, request: Request) -> None:
         request.reply(self._responses.join(request.payload, time.monotonic()))
+
+    def _on_drain(self, request: Request) -> None:
+        name = keys.last_chunk(request.key)
+        with self.lock:
+            refusal = self.fleet.drain(name)
+        if refusal is None:
+            _logger.info("actor %s is drained: it leaves after its current rollout", name)
+        request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
 
     def _on_status(self, request: Request) -> None:
         with self.lock:

@@ -64,6 +64,7 @@ class Actor:
     non_finite: int = 0  # rollouts without a finite gradient
     finite_in_a_row: int = 0  # rollouts that were trained on since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
+    drained: bool = False  # whether an operator asked the newest incarnation to leave
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of the newest rollout
@@ -119,7 +120,8 @@ class Actor:
         self.incarnation = incarnation
         self.incarnations += 1
         self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
-        self.quarantined, self.fetches, self.compact_snapshots = "", False, False
+        self.quarantined, self.drained = "", False
+        self.fetches = self.compact_snapshots = False
         self.windows[incarnation] = self.windows.pop(incarnation, SequenceWindow())
         while len(self.windows) > _MAX_WINDOWS:
             del self.windows[next(iter(self.windows))]
@@ -155,6 +157,8 @@ class Fleet:
                 code="name_taken",
                 reason=f"actor name {join.actor!r} is already in use: choose another --name",
             )
+        if known is not None and known.incarnation == join.incarnation and known.drained:
+            return Refusal(code="drained", reason="an operator drained this actor")
         if join.spaces is None:
             return None
         if not 1 <= join.environments <= 4096:
@@ -173,6 +177,14 @@ class Fleet:
         if actor.incarnation != join.incarnation:
             actor.start_incarnation(join.incarnation)
         actor.environments = join.environments
+        return None
+
+    def drain(self, name: str) -> Refusal | None:
+        """Ask an actor to leave after its current rollout. Return None, or a Refusal if it does not take part."""
+        actor = self.actors.get(name)
+        if actor is None or not self.is_present(actor):
+            return Refusal(code="unknown", reason=f"no actor {name[:64]!r} takes part: `daedalus status` lists them")
+        actor.drained = True
         return None
 
     def _ensure_capacity(self) -> bool:

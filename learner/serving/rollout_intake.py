@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Set
+from dataclasses import replace
 
 import numpy as np
 
@@ -218,7 +219,10 @@ class RolloutIntake:
             self._store(verdict, size)
         else:
             self._counters.rollouts_rejected[verdict.cause] += 1
-        return acknowledgement(verdict, self._published_version())
+        answer = acknowledgement(verdict, self._published_version())
+        actor = self._fleet.actors.get(sender)
+        is_final = answer.verdict in ("accepted", "rejected")
+        return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer
 
     def _is_surplus(self, content: Rollout | Rejected) -> bool:
         """Return whether the barrier already holds a rollout of the actor.
