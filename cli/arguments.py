@@ -19,9 +19,9 @@ def command_parser(name: str, description: str, examples: str) -> argparse.Argum
     )
 
 
-def add_connect(options: argparse._ActionsContainer, help: str) -> None:
-    """Add --connect, which is required and may be given several times."""
-    options.add_argument("--connect", required=True, action="append", metavar="tcp/HOST:PORT", help=help)
+def add_connect(options: argparse._ActionsContainer, help: str, *, required: bool = True) -> None:
+    """Add --connect, which may be given several times."""
+    options.add_argument("--connect", required=required, action="append", metavar="tcp/HOST:PORT", help=help)
 
 
 def add_tls(options: argparse._ActionsContainer) -> None:

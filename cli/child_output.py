@@ -95,7 +95,7 @@ class ChildOutput:
         now = time.monotonic()
         self._limits = {stream: RateLimit(now) for stream in self._write}
         self._lock = threading.Lock()  # guards all but the threads
-        self._withheld = 0  # lines that were not shown
+        self.withheld = 0  # lines that should have been shown, and were not
         self._unshown: dict[str, deque[str]] = {}  # newest lines of standard error that were not shown, by process
         self._threads: dict[str, list[threading.Thread]] = {}
 
@@ -127,8 +127,8 @@ class ChildOutput:
         self._join([thread for threads in self._threads.values() for thread in threads])
         with self._lock:
             self._log.close()
-            if self._withheld:
-                self._show("stdout", [f"{self._withheld:,} lines of output were not shown; see {self._log_path}"])
+            if self.withheld:
+                self._show("stdout", [f"{self.withheld:,} lines of output were not shown; see {self._log_path}"])
 
     def __enter__(self) -> Self:
         return self
@@ -161,9 +161,9 @@ class ChildOutput:
             if stream == "stderr":
                 self._unshown.setdefault(name, deque(maxlen=_KEPT_LINES)).extend(lines[count:])
             if shown and count < len(lines):
-                if not self._withheld:
+                if not self.withheld:
                     self._show("stdout", [f"more lines of output are in {self._log_path} only"])
-                self._withheld += len(lines) - count
+                self.withheld += len(lines) - count
 
     def _show(self, stream: str, lines: Sequence[str]) -> None:
         for line in lines:

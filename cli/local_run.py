@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
+from daedalus.cli.confirmation import confirmation, confirmation_arguments
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
@@ -48,6 +49,7 @@ class LocalRun:
     directory: Path
     spec: RunSpec
     started: float  # on the monotonic clock; the seconds of the run count from this time
+    lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
@@ -159,7 +161,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:
-            return start("daedalus.cli.commands.learner", *arguments, streams=streams)
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=run.lock)
 
     return Supervised("the learner", begin, ended=_FINISHED)
 
@@ -198,14 +200,21 @@ def _warn(message: str | None) -> None:
 def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
-    Raises EvaluationFailedError.
+    If training stopped at its target, the policy of that moment also plays new sampled episodes. Raises
+    EvaluationFailedError.
     """
     began = time.monotonic()
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *_logging_options(run.log_level, run.log_json)]
-    options += allow_settings(run.spec.environment.user_modules)
-    chosen = select_best(run.directory, run.spec, options, stopping, output)
-    (evaluation,) = play([[str(run.directory), *options]], stopping, output)
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
+    common = [*_logging_options(run.log_level, run.log_json), *allow_settings(run.spec.environment.user_modules)]
+    options = ["--episodes", str(run.spec.evaluation.final_episodes), *common]
+    chosen = select_best(run.directory, run.spec, options, stopping, output)
+    evaluations = [options]
+    if summary.get("solved") and run.spec.training.stop_when_solved:
+        evaluations.append([*confirmation_arguments(run.spec), *common])
+    evaluation, *confirmations = play([[str(run.directory), *each] for each in evaluations], stopping, output)
+    for confirmed in confirmations:
+        summary["confirmation"] = confirmation(confirmed)
+        summary["confirmation_return_mean"] = confirmed["return_mean"]
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
     summary["evaluation"] = {**evaluation, "select_best": chosen, "seconds": time.monotonic() - began}

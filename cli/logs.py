@@ -45,7 +45,7 @@ def _print(line: str) -> None:
     print(line, flush=True)
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Return `text` with control characters escaped: it may come from a peer, and a terminal would obey them."""
     return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
@@ -60,7 +60,7 @@ class _LineHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """See logging.Handler."""
         try:
-            self._write(_printable(self.format(record)))
+            self._write(printable(self.format(record)))
         except (OSError, ValueError):  # closed
             return
         except Exception:

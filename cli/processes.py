@@ -14,9 +14,8 @@ _logger = logging.getLogger(__name__)
 
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
-_STUCK_SECONDS = 4.0  # a process ends within 5 s of a signal
-
-
+_STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
+_END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
 
 
@@ -34,16 +33,20 @@ def raise_descriptor_limit() -> None:
             return
 
 
-def stop_on_signals() -> threading.Event:
+def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
     The signal handlers only set the event, so that the process closes its resources before it ends. A thread sets it
     too: Python calls no handler while the main thread runs native code, such as a simulator or a policy.
+
+    With `exit_if_stuck`, the process ends with status 1 if the main thread does not return from native code within
+    `_STUCK_SECONDS` of the event, or does not end within `_END_SECONDS` more.
     """
-    stop = threading.Event()
+    stop, responded = threading.Event(), threading.Event()
 
     def handle(_number: int, _frame: object) -> None:
         stop.set()
+        responded.set()
 
     def watch() -> None:
         while number := os.read(reader, 1):
@@ -57,22 +60,22 @@ def stop_on_signals() -> threading.Event:
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
     threading.Thread(target=watch, name="signals", daemon=True).start()
+    if exit_if_stuck:
+        threading.Thread(target=_exit_if_stuck, args=(stop, responded), name="stuck-watch", daemon=True).start()
     return stop
 
 
-def exit_if_stuck(stop: threading.Event) -> None:
-    """End the process with status 1 if it still runs `_STUCK_SECONDS` after `stop`: a native call does not return."""
-
-    def watch() -> None:
-        stop.wait()
-        time.sleep(_STUCK_SECONDS)
-        try:
-            _logger.error("the process still runs %g s after it was asked to stop: it ends now", _STUCK_SECONDS)
-            sys.stdout.flush()
-        finally:
-            os._exit(1)
-
-    threading.Thread(target=watch, name="stuck-watch", daemon=True).start()
+def _exit_if_stuck(stop: threading.Event, responded: threading.Event) -> None:
+    """Wait for `stop`, and end the process unless it ends by itself; `responded` is set by the signal handler."""
+    stop.wait()
+    os.kill(os.getpid(), signal.SIGTERM)  # another part of the process may have set `stop`
+    if responded.wait(_STUCK_SECONDS):
+        time.sleep(_END_SECONDS)
+    try:
+        _logger.error("the process was asked to stop, but a call of native code does not return: it ends now")
+        sys.stdout.flush()
+    finally:
+        os._exit(1)
 
 
 def exit_with_parent(stop: threading.Event) -> None:

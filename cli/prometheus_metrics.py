@@ -38,6 +38,9 @@ _OF_A_RUN: tuple[tuple[_Family, str, str, Callable[[RunStatus], float | None]], 
         lambda run: run.episode_return_mean,
     ),
     (GaugeMetricFamily, "policy_lag_updates", "Recent mean policy lag.", lambda run: run.policy_lag_mean),
+    (CounterMetricFamily, "rollouts_accepted", "Rollouts accepted.", lambda run: run.rollouts_accepted),
+    (CounterMetricFamily, "rollouts_missed", "Rollouts that never arrived.", lambda run: run.rollouts_missed),
+    (CounterMetricFamily, "busy_answers", "Rollouts answered with busy.", lambda run: run.busy_answers),
     (GaugeMetricFamily, "queue_bytes", "Bytes of rollouts in the queue.", lambda run: run.queue_bytes),
     (GaugeMetricFamily, "queue_limit_bytes", "Actors get the answer busy above it.", lambda run: run.queue_bytes_limit),
     (
@@ -102,7 +105,8 @@ _OF_AN_ACTOR: tuple[tuple[_Family, str, str, Callable[[ActorStatus], float]], ..
 def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     """Yield all metrics of the runs that answered, or only `daedalus_up` 0 if no run answered.
 
-    Actors that are gone have no series of their own. They are only counted, by their state.
+    Actors that are gone have no series of their own. They are only counted, by their state, and after a minute only in
+    the counters of the run.
     """
     runs = list({status.run: status for status in statuses}.values())
     yield GaugeMetricFamily("daedalus_up", "1 if a learner answers, else 0.", value=bool(runs))
@@ -113,9 +117,8 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
     rejected = CounterMetricFamily("daedalus_rollouts_rejected", "Rejected rollouts by cause.", labels=["run", "cause"])
     for run in runs:
         info.add_metric([run.run, run.environment, run.algorithm], 1)
-        states = [_state(actor) for actor in run.actors]
-        for state in ("alive", "quarantined", "gone"):
-            actors.add_metric([run.run, state], states.count(state))
+        for state, count in _states(run).items():
+            actors.add_metric([run.run, state], count)
         for cause, count in sorted(run.rollouts_rejected.items()):
             rejected.add_metric([run.run, cause], count)
     yield from (info, actors, rejected)
@@ -134,5 +137,5 @@ def metrics(statuses: Iterable[RunStatus]) -> Iterator[Metric]:
         yield family
 
 
-def _state(actor: ActorStatus) -> str:
-    return "gone" if not actor.alive else "quarantined" if actor.quarantined else "alive"
+def _states(run: RunStatus) -> dict[str, int]:
+    return {"alive": run.actors_alive, "quarantined": run.actors_quarantined, "gone": run.actors_gone}

@@ -83,6 +83,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
         wrap=arguments.wrap,
     )
     override(settings, arguments.set)
+    check_environment(arguments.env, settings)
     spec = run_spec(settings)
     return spec, arguments.run_dir or named_directory(arguments.preset, spec)
 
@@ -114,9 +115,20 @@ def chosen_settings(
     return settings
 
 
+def check_environment(env: str | None, settings: dict[str, Any]) -> None:
+    """Check that other settings name no other environment than `env`. Raises SettingsError."""
+    chosen = settings["environment"].get("id")
+    if env is not None and chosen != env:
+        raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
+
+
 def named_directory(preset: str | None, spec: RunSpec) -> Path:
-    """Return the default run directory, named after the preset or the environment."""
-    return run_directory.default_directory(Path(preset).stem if preset else spec.environment.id, spec)
+    """Return the default run directory, named after the preset or file, or after the environment.
+
+    A repeated config.toml of another run has no name of its own.
+    """
+    name = spec.environment.id if preset is None or Path(preset).name == run_directory.CONFIG else Path(preset).stem
+    return run_directory.default_directory(name, spec)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,10 +24,19 @@ _ACTORS_NICENESS = 5  # added to the niceness of the learner
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
-def start(module: str, *arguments: str, streams: Streams, one_thread: bool = False) -> subprocess.Popen[bytes]:
+def start(
+    module: str, *arguments: str, streams: Streams, descriptors: tuple[int, ...] = (), one_thread: bool = False
+) -> subprocess.Popen[bytes]:
     """Start `python -m module` with a pipe as its standard input.
 
     The pipe closes when this process ends for any reason, and the child process then ends by itself.
+
+    Args:
+      module: the module to run.
+      arguments: its command line.
+      streams: its standard output and standard error.
+      descriptors: file descriptors that it inherits.
+      one_thread: limit the thread pools of its libraries.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
@@ -35,6 +44,7 @@ def start(module: str, *arguments: str, streams: Streams, one_thread: bool = Fal
         stdout=streams.stdout,
         stderr=streams.stderr,
         env={**os.environ, **_ONE_THREAD} if one_thread else None,
+        pass_fds=descriptors,
     )
 
 

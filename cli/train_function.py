@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
-from daedalus.cli.settings_arguments import chosen_settings, named_directory
+from daedalus.cli.settings_arguments import check_environment, chosen_settings, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign, run_spec
 
@@ -38,6 +38,7 @@ class RunResult:
     episode_return_mean: float | None  # mean of the newest training episodes; None if none has ended
     evaluation_return_mean: float  # over evaluation.final_episodes episodes of the best policy
     evaluation_return_std: float
+    confirmation_return_mean: float | None  # over new sampled episodes; None unless training stopped at the target
     wall_seconds: float  # training, without the final evaluation
     seconds_to_target: float | None
     env_steps_per_second: float
@@ -83,11 +84,12 @@ def train(
             assign(chosen, path, value)
         except SettingsError as error:
             raise SettingsError(f"settings {path!r}: {error}") from None
+    check_environment(env, chosen)
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    run_directory.create(directory, spec)
-    end = _run(LocalRun(directory=directory, spec=spec, started=started), quiet)
-    return _result(directory, end)
+    with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
+        end = _run(LocalRun(directory=lock.directory, spec=spec, started=started, lock=lock.inheritable), quiet)
+    return _result(lock.directory, end)
 
 
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
@@ -109,11 +111,14 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
 
     failure: RunFailedError | None = None
     log, records = run.directory / run_directory.OUTPUT, logging.NullHandler() if quiet else logging.StreamHandler(out)
+    output = ChildOutput(log, lambda line: write(line, out), write_error)
     try:
-        with _records_to(records), ChildOutput(log, lambda line: write(line, out), write_error) as output:
+        with _records_to(records), output:
             return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
+    if not output.withheld:
+        run_directory.remove_failed(run.directory)
     # A restarted process fails with the same message.
     reasons = dict.fromkeys([*errors, *str(failure).splitlines()])
     raise TrainingError("\n".join(filter(None, reasons)) or f"the learner ended with status {failure.status}")

@@ -19,6 +19,7 @@ from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
@@ -89,6 +90,7 @@ class LearnerService:
             self._annealing = _resumed_annealing(restored, spec)
         epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
+        self._heartbeat = Heartbeat(directory)
         self._health = Health(
             started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
         )
@@ -127,7 +129,7 @@ class LearnerService:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop)
+            spaces = self._server.await_spaces(self._stop, self._heartbeat.beat)
             if spaces is None:
                 _logger.info("stopped before the first actor joined")
                 return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
@@ -143,6 +145,7 @@ class LearnerService:
             return self._learn(learner, self._checkpointer(learner))
         finally:
             self._server.close(_STOPPED)  # unless it is closed
+            self._heartbeat.clear()
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
         """Publish the policy and return its checkpointer."""
@@ -201,6 +204,7 @@ class LearnerService:
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+            self._heartbeat.beat()
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._counters.reached(training.target_return):

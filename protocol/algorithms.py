@@ -3,6 +3,7 @@
 The learner's buffers, the actors and the command line read these records; the losses are in daedalus/algorithms.
 """
 
+import difflib
 from dataclasses import dataclass
 
 
@@ -45,5 +46,7 @@ ALGORITHMS = {
 def check_algorithm(name: str) -> str:
     """Return `name` if there is such an algorithm. Raises ValueError, naming all of them, if not."""
     if name not in ALGORITHMS:
-        raise ValueError(f"must be one of {', '.join(ALGORITHMS)}")
+        near = difflib.get_close_matches(name, ALGORITHMS, 1, 0.5)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        raise ValueError(f"must be one of {', '.join(ALGORITHMS)}{hint}")
     return name

@@ -23,9 +23,9 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
-def join(run: str) -> str:
-    """Return the key of the queries by which actors join."""
-    return f"daedalus/{run}/join"
+def join(run: str, actor: str) -> str:
+    """Return the key of the queries by which an actor joins (`*` for all actors)."""
+    return f"daedalus/{run}/join/{actor}"
 
 
 def program(run: str, program_hash: str) -> str:
@@ -79,8 +79,21 @@ def status(run: str) -> str:
     return f"daedalus/{run}/status"
 
 
+def intersection(served: str, queried: str) -> str:
+    """Return the key of a query to a server: where the query has `*`, the chunk that is served.
+
+    Where both have `*`, it stays. A query with `**`, which nobody of ours sends, has the served key.
+    """
+    if "*" not in queried:
+        return queried
+    ours, theirs = served.split("/"), queried.split("/")
+    if len(ours) != len(theirs):
+        return served
+    return "/".join(mine if "*" in other else other for mine, other in zip(ours, theirs, strict=True))
+
+
 def last_chunk(key: str) -> str:
-    """Return the last chunk: the actor's name in a rollouts or drain key, the evaluator's in an evaluations key."""
+    """Return the last chunk of a key: the name of the actor or evaluator."""
     return key.rsplit("/", 1)[-1]
 
 

@@ -31,6 +31,7 @@ class Limits:
 
 # Read by the learner; a larger message is malformed.
 JOIN_LIMITS = Limits(max_bytes=0, max_header_bytes=16 << 10, max_arrays=0)  # names and spaces, no arrays
+STATUS_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)  # a name
 SNAPSHOT_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)  # a name and three numbers
 EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)  # returns and lengths
 
@@ -40,4 +41,4 @@ SNAPSHOT_PART_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_
 LEARNER_LIMITS = Limits(max_bytes=1 << 30)  # any message of the learner: weights and programs may be large
 
 # Read by operators.
-STATUS_LIMITS = Limits()  # grows with the number of actors
+STATUS_LIMITS = Limits(max_bytes=0, max_arrays=0)  # one page of actors

@@ -14,7 +14,7 @@ import numpy as np
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 
@@ -269,9 +269,23 @@ class RunEnded:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
-    """State of the run and its actors, in answer to a `status` query."""
+    """State of the run and its first actors, in answer to a `status` query without payload."""
 
     status: RunStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsRequest:
+    """Request of an operator for the next actors of the status. Operator -> learner, on `status`."""
+
+    after: str  # the last name that the operator has
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorsReport:
+    """The actors with the next names, in answer to an ActorsRequest; none after the last."""
+
+    page: ActorsPage
 
 
 Message = (
@@ -289,4 +303,6 @@ Message = (
     | EvaluationReport
     | RunEnded
     | StatusReport
+    | ActorsRequest
+    | ActorsReport
 )

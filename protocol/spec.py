@@ -84,8 +84,11 @@ class EnvironmentSpec(Specification):
 class PolicySpec(Specification):
     """Network: an encoder, an optional memory, then a policy head and a value head."""
 
-    encoder: Annotated[str, Field(pattern=rf"^(mlp|small|nature|impala|article|{_OBJECT})$", max_length=200)] = "mlp"
-    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own."""
+    encoder: Annotated[str, Field(pattern=rf"^(auto|mlp|small|nature|impala|article|{_OBJECT})$", max_length=200)] = (
+        "auto"
+    )
+    """Encoder of observations: `mlp`, `small`, `nature`, `impala`, `article`, or `module:Class` for your own. `auto`:
+    `nature` for images, `impala` for images smaller than 36 pixels, `mlp` for everything else."""
     hidden: Annotated[tuple[PositiveInt, ...], Field(max_length=8)] = (64, 64)
     """Units of each hidden layer; the `mlp` encoder only."""
     activation: Literal["tanh", "relu"] = "tanh"

@@ -2,6 +2,8 @@
 
 from daedalus.protocol.specification import Specification
 
+PAGE_ACTORS = 100  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
+
 
 class ActorStatus(Specification):
     """State of one actor."""
@@ -24,8 +26,15 @@ class ActorStatus(Specification):
     bytes_down_per_hour: float  # of snapshots
 
 
+class ActorsPage(Specification):
+    """Part of the list of all actors, sorted by name."""
+
+    learner_epoch: int
+    actors: tuple[ActorStatus, ...]
+
+
 class RunStatus(Specification):
-    """State of a run and its actors; the answer to a `status` query."""
+    """State of a run and its actors. The answer to a `status` query has the first actors only (PAGE_ACTORS)."""
 
     run: str
     learner_epoch: int
@@ -45,5 +54,11 @@ class RunStatus(Specification):
     queue_bytes_limit: int
     checkpoint_age_seconds: float | None  # None before the first checkpoint of this process
     certificate_days_left: float | None  # of the learner's certificate; None without one
+    rollouts_accepted: int
     rollouts_rejected: dict[str, int]  # by cause, including senders that never joined
-    actors: tuple[ActorStatus, ...]
+    rollouts_missed: int  # sequence numbers that never arrived
+    busy_answers: int  # how often the learner answered busy
+    actors_alive: int
+    actors_quarantined: int  # present, but their rollouts are no longer accepted
+    actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
+    actors: tuple[ActorStatus, ...]  # sorted by name

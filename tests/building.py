@@ -88,5 +88,5 @@ def joined_fleet(*actors: str, environments: int = ENVIRONMENTS, spaces: Spaces 
     fleet = Fleet(seed, None)
     for actor in actors:
         assert fleet.join(Join(actor=actor, incarnation=1, spaces=spaces, environments=environments), 0.0) is None
-        fleet.set_present(actor, 1, True)
+        fleet.set_present(actor, 1, True, 0.0)
     return fleet

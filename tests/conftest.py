@@ -7,7 +7,13 @@ from pathlib import Path
 
 import log_lines
 import pytest
+from hypothesis import Phase, settings
 from processes import Running
+
+# No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
+settings.register_profile("daedalus", deadline=None)
+settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
+settings.load_profile("daedalus")
 
 
 @pytest.fixture(autouse=True)

@@ -60,7 +60,7 @@ class ScriptedLearner:
         self.transport.serve(keys.evaluations("r", "*"), self.received.put)
         self.transport.serve(keys.program("r", "*"), self._program)
         self.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, _: self.present.append(key))
-        self.transport.serve(keys.join("r"), self._join)
+        self.transport.serve(keys.join("r", "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())

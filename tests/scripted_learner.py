@@ -69,7 +69,7 @@ class ScriptedLearner:
         self.transport.serve(keys.rollouts("r", "*"), self.rollouts.put)
         self.transport.serve(keys.snapshots("r"), self._newest)
         self.transport.serve(keys.program("r", "*"), self._program)
-        self.transport.serve(keys.join("r"), self._join)
+        self.transport.serve(keys.join("r", "*"), self._join)
 
     def _join(self, request: Request) -> None:
         message = decode(request.payload, Limits())

@@ -6,7 +6,7 @@ Each line is one JSON object, or empty if no learner answers. The program runs u
 import sys
 import threading
 
-from daedalus.cli.commands.status import ask
+from daedalus.cli.status_query import ask
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import TransportError
 

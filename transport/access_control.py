@@ -51,7 +51,7 @@ def access_control(actors: Iterable[str], operators: Iterable[str]) -> dict[str,
     for actor in sorted(actors):
         rules += _own_rules(actor)
         subjects.append({"id": f"actor {actor}", "cert_common_names": [common_name("actor", actor)]})
-        own = [f"{actor} uploads", f"{actor} is present", f"{actor} receives replies"]
+        own = [f"{actor} joins and uploads", f"{actor} is present", f"{actor} receives replies"]
         policies.append({"rules": [*shared, *own], "subjects": [f"actor {actor}"]})
     return {
         "enabled": True,
@@ -73,10 +73,10 @@ def _rule(name: str, flows: Iterable[str], messages: Iterable[str], key_expressi
 
 
 def _actors_rules() -> list[dict[str, Any]]:
-    """Return the rules of every actor: query `join`, programs, snapshots; subscribe; watch the learner."""
-    queried = [keys.join(_RUN), keys.program(_RUN, "*"), keys.snapshots(_RUN)]
+    """Return the rules of every actor: query programs and snapshots; subscribe; watch the learner."""
+    queried = [keys.program(_RUN, "*"), keys.snapshots(_RUN)]
     published = [keys.snapshots(_RUN), keys.run_end(_RUN)]
-    served = [*queried, keys.rollouts(_RUN, "*"), keys.evaluations(_RUN, "*")]
+    served = [*queried, *_own_keys("*")]
     return [
         _rule("actors query", ["ingress"], ["query"], queried),
         _rule("actors receive replies", ["egress"], ["reply"], queried),
@@ -93,12 +93,17 @@ def _actors_rules() -> list[dict[str, Any]]:
     ]
 
 
+def _own_keys(name: str) -> list[str]:
+    """Return the keys of the queries that only the actor or evaluator `name` may send."""
+    return [keys.join(_RUN, name), keys.rollouts(_RUN, name), keys.evaluations(_RUN, name)]
+
+
 def _own_rules(actor: str) -> list[dict[str, Any]]:
     """Return the rules of one actor for its own name and for `NAME.anything`: one certificate serves a whole host."""
     names = [actor, f"{actor}.$*"]
-    sent = [key for name in names for key in (keys.rollouts(_RUN, name), keys.evaluations(_RUN, name))]
+    sent = [key for name in names for key in _own_keys(name)]
     return [
-        _rule(f"{actor} uploads", ["ingress"], ["query"], sent),
+        _rule(f"{actor} joins and uploads", ["ingress"], ["query"], sent),
         _rule(f"{actor} receives replies", ["egress"], ["reply"], sent),
         _rule(
             f"{actor} is present", ["ingress"], ["liveliness_token"], [keys.presence(_RUN, name, "*") for name in names]

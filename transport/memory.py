@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from daedalus.protocol import keys
 from daedalus.transport.interface import Inbox, OnAnswer, Request
 
 
@@ -106,7 +107,7 @@ class MemoryTransport:
 
     def _handlers(self, key: str) -> list[tuple[str, Callable[[Request], None]]]:
         return [
-            (key if "*" in served else served, handler)
+            (keys.intersection(served, key), handler)
             for end in self._ends()
             for served, handler in end._served.items()
             if matches(served, key)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 import zenoh
 
+from daedalus.protocol import keys
+
 
 class ZenohRequest:
     """A query that Zenoh delivered; finalised as soon as it is answered or garbage-collected."""
@@ -14,7 +16,7 @@ class ZenohRequest:
     def __init__(self, query: zenoh.Query, served: str) -> None:
         self._query: zenoh.Query | None = query
         self._buffers = query.payload
-        self.key = served if "*" in str(query.key_expr) else str(query.key_expr)
+        self.key = keys.intersection(served, str(query.key_expr))
         self.size = 0 if self._buffers is None else len(self._buffers)
 
     @property

@@ -93,7 +93,7 @@ def _small_queries() -> list[dict[str, Any]]:
         rule(
             "small queries",
             JOIN_LIMITS.message_bytes,
-            keys.join("*"),
+            keys.join("*", "*"),
             keys.program("*", "*"),
             keys.snapshots("*"),
             keys.status("*"),

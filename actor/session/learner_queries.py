@@ -101,7 +101,7 @@ class LearnerQueries:
 
     def request_join(self, run: str, join: Join) -> Welcome | None:
         """Send a request to join; return None if no learner is ready. Raises ActorError or RunOverError if refused."""
-        answers = self._ask(keys.join(run), encode(join))
+        answers = self._ask(keys.join(run, join.actor), encode(join))
         welcomes = [answer for answer in answers if isinstance(answer, Welcome)]
         if len(welcomes) > 1:
             names = ", ".join(sorted(welcome.run for welcome in welcomes))
@@ -119,7 +119,7 @@ class LearnerQueries:
 
     def learner_responds(self, run: str, join: Join) -> bool:
         """Return whether any learner of `run` answers a request to join. Raises RunOverError if the answer says so."""
-        answers = self._ask(keys.join(run), encode(join))
+        answers = self._ask(keys.join(run, join.actor), encode(join))
         _raise_if_over(answers)
         return bool(answers)
 

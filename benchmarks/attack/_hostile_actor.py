@@ -30,7 +30,7 @@ class HostileActor:
         self._incarnation += 1
         self._sequence = 0
         join = Join(actor=self._name, incarnation=self._incarnation, spaces=_SPACES, environments=1)
-        welcome = self._ask(keys.join("run"), join)
+        welcome = self._ask(keys.join("run", self._name), join)
         if not isinstance(welcome, Welcome):
             raise RuntimeError(f"the learner refused the actor: {welcome}")
         self._epoch, self.rows = welcome.learner_epoch, welcome.spec.collection.rollout_length

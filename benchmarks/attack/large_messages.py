@@ -48,11 +48,11 @@ def _router() -> tuple[float, float]:
             closing(connect([address], load(certificates / "learner", "learner"))) as learner,
             closing(connect([address], load(certificates / "actor-arm", "actor"))) as actor,
         ):
-            learner.serve(keys.join("r"), lambda request: request.reply(b"welcome"))
-            here.wait("an answer", lambda: actor.query(keys.join("r"), timeout=5.0))
+            learner.serve(keys.join("r", "arm"), lambda request: request.reply(b"welcome"))
+            here.wait("an answer", lambda: actor.query(keys.join("r", "arm"), timeout=5.0))
             before = _peak_mib(running.process.pid)
             actor.query(keys.rollouts("r", "box"), bytes(700 * _MEGABYTE), timeout=1.0)  # denied: another's name
-            here.wait("an answer after the attack", lambda: actor.query(keys.join("r"), timeout=5.0))
+            here.wait("an answer after the attack", lambda: actor.query(keys.join("r", "arm"), timeout=5.0))
             return before, _peak_mib(running.process.pid)
 
 
@@ -65,8 +65,8 @@ def _learner() -> tuple[float, float, str]:
         pid = running.process.pid
         before, payload = _peak_mib(pid), bytes(400 * _MEGABYTE)
         with closing(connect([here.address])) as stranger:
-            for key in (keys.join("run"), keys.rollouts("run", "stranger"), keys.evaluations("run", "stranger")):
-                stranger.query(key, payload, timeout=1.0)
+            for key_of in (keys.join, keys.rollouts, keys.evaluations):
+                stranger.query(key_of("run", "stranger"), payload, timeout=1.0)
             refusal = stranger.query(keys.rollouts("run", "stranger"), payload[: 40 * _MEGABYTE], timeout=60.0)
         here.wait_for_training("honest")
         answer = decode(refusal[0], Limits()) if refusal else None

@@ -16,7 +16,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_if_stuck, exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
@@ -37,8 +37,7 @@ def main() -> int:
     except (ValueError, *SECURITY_ERRORS) as error:
         print(f"daedalus actor: {error}", file=sys.stderr)
         return 2
-    stop = stop_on_signals()
-    exit_if_stuck(stop)
+    stop = stop_on_signals(exit_if_stuck=True)
     if arguments.exit_with_parent:
         exit_with_parent(stop)
 

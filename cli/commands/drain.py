@@ -5,7 +5,7 @@ import sys
 import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.commands import status
+from daedalus.cli.status_query import ask
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
@@ -73,7 +73,7 @@ def drain(arguments: list[str]) -> int:
 
 def _runs_with(transport: Transport, run: str, name: str) -> list[str]:
     """Return the runs, `run` or any, that an actor takes part in. Raises DrainError if there is none."""
-    statuses = status.ask(transport, run)
+    statuses = ask(transport, run)
     if not statuses:
         raise DrainError("no learner answers at this address: is a learner running?")
     runs = [each.run for each in statuses if any(actor.actor == name and actor.alive for actor in each.actors)]
@@ -96,7 +96,7 @@ def _await_departures(transport: Transport, run: str, names: set[str], timeout: 
     """Wait until no actor of these names is alive. Raises DrainError after `timeout` seconds."""
     deadline = None if timeout is None else time.monotonic() + timeout
     while True:
-        statuses = status.ask(transport, run)
+        statuses = ask(transport, run)
         if not statuses:
             raise DrainError("the learner went away: it is not known whether the actors have left")
         alive = {actor.actor for each in statuses for actor in each.actors if actor.alive}

@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.commands.status import ask
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import stop_on_signals
+from daedalus.cli.status_query import ask, fleet_size
 from daedalus.protocol.codec import ProtocolError
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
@@ -24,11 +25,13 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 
 _LISTEN = "127.0.0.1:9464"
+_MAX_ACTORS = 1000  # of a run with series of their own
 _REOPEN_SECONDS = 10.0  # after this time without an answer, a new session replaces the old one
 
 _DESCRIPTION = """\
 Serves the values of `daedalus status` as Prometheus metrics. It queries the learners at each scrape and stores nothing.
-It may start before a learner: while no learner answers, daedalus_up is 0. deploy/grafana has a dashboard."""
+It may start before a learner: while no learner answers, daedalus_up is 0. Of a run with more than 1,000 actors, the
+first 1,000 by name have series of their own; the metrics of the run are over all. deploy/grafana has a dashboard."""
 
 _EXAMPLES = """\
 examples:
@@ -67,6 +70,7 @@ class StatusCollector:
     def __init__(self) -> None:
         self.transport: Transport | None = None  # None until a router answers
         self.unanswered = False  # whether no learner answered the last scrape
+        self._warned = False  # that not all actors have series
 
     def collect(self) -> Iterator["Metric"]:
         """Query the learners and return their metrics."""
@@ -75,9 +79,22 @@ class StatusCollector:
         statuses = []
         if self.transport is not None:
             with contextlib.suppress(TransportError, ProtocolError):
-                statuses = ask(self.transport)
+                statuses = ask(self.transport, max_actors=_MAX_ACTORS)
         self.unanswered = not statuses
+        self._warn_of_large_fleet(statuses)
         return metrics(statuses)
+
+    def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
+        """Warn once if not all actors have series of their own."""
+        for status in statuses:
+            if fleet_size(status) > len(status.actors) and not self._warned:
+                self._warned = True
+                _logger.warning(
+                    "run %r has %d actors: %d of them have metrics of their own; those of the run are over all",
+                    status.run,
+                    fleet_size(status),
+                    len(status.actors),
+                )
 
     def describe(self) -> list["Metric"]:
         """Return nothing, so that the registry does not query the learners to find the metrics."""

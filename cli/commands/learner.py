@@ -10,6 +10,8 @@ import logging
 import sys
 import threading
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +29,8 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.heartbeat import Heartbeat
+from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.serving.rollout_intake import largest_request
@@ -53,6 +57,7 @@ if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
+_FAILURES = CheckpointMismatchError, CredentialsError, DamagedError, NetworkError, SettingsError, TransportError
 
 
 def main() -> int:
@@ -73,26 +78,47 @@ def main() -> int:
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
+    Heartbeat(run.directory).clear()  # before a router is waited for
     progress = Progress(sys.stdout, run.spec.training.env_steps)
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
-        restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
-        transport = _open_transport(arguments, run.spec, credentials, stop)
-    except (TransportError, DamagedError, CredentialsError) as error:
+        with ExitStack() as stack:
+            return _serve(run, arguments, credentials, stop, progress, arguments.started or started, stack)
+    except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
+
+
+def _serve(
+    run: ChosenRun,
+    arguments: argparse.Namespace,
+    credentials: Credentials | None,
+    stop: threading.Event,
+    progress: Progress,
+    started: float,
+    stack: ExitStack,
+) -> int:
+    """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
+    if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
+        stack.enter_context(RunLock(run.directory))
+    restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
+    transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
         return stopped
+    stack.callback(transport.close)
+    if not run.exists:
+        lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
+        stack.enter_context(lock)
+        run = replace(run, directory=lock.directory)
     try:
         _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, arguments.started or started, restored, credentials)
-        return _status(outcome, run.spec, stopped)
-    except (CheckpointMismatchError, NetworkError, SettingsError, TransportError) as error:
-        print(f"daedalus learner: {error}", file=sys.stderr)
-        return FAILED
-    finally:
-        transport.close()
+        outcome = _train(run, transport, stop, progress, started, restored, credentials)
+    except _FAILURES:
+        if not run.exists:
+            run_directory.remove_failed(run.directory)
+        raise
+    return _status(outcome, run.spec, stopped)
 
 
 def _credentials(arguments: argparse.Namespace) -> Credentials | None:
@@ -121,9 +147,7 @@ def _open_transport(
 
 
 def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
-    """Create the run directory if it is new, and log how actors join. Raises SettingsError."""
-    if not run.exists:
-        run_directory.create(run.directory, run.spec)
+    """Log how actors join."""
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)

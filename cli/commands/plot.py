@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
-from daedalus.learner.run.run_directory import METRICS
+from daedalus.learner.run.run_directory import CONFIG, METRICS
 
 _DESCRIPTION = "Draws return, entropy, value loss and policy lag of runs over their env_steps."
 
@@ -55,11 +55,19 @@ def plot(arguments: list[str]) -> int:
 
 
 def _read(directory: Path) -> dict[str, list[float]]:
-    """Return the columns of a run's metrics. Unknown values are NaN."""
-    with open(directory / METRICS, newline="", encoding="utf-8") as file:
+    """Return the columns of a run's metrics. Unknown values are NaN. Raises ValueError without metrics."""
+    path = directory / METRICS
+    if not path.exists():
+        if not (directory / CONFIG).exists():
+            raise ValueError(f"{directory} is not a run directory: it has neither {CONFIG} nor {METRICS}")
+        raise ValueError(f"{directory} has no metrics yet: wait until the run has made its first updates")
+    with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     if not rows:
-        raise ValueError(f"{directory / METRICS} has no rows yet: wait until the run has made its first updates")
+        raise ValueError(f"{directory} has no metrics yet: wait until the run has made its first updates")
+    missing = {"env_steps", "episode_return_std", *(column for column, _ in _PANELS)} - rows[0].keys()
+    if missing:
+        raise ValueError(f"{path} has no column {min(missing)}: it is not the metrics of a run")
     return {name: [float(row[name]) if row[name] else float("nan") for row in rows] for name in rows[0]}
 
 

@@ -2,16 +2,18 @@
 
 import argparse
 import sys
+from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
+from daedalus.cli.logs import printable
+from daedalus.cli.status_query import ask, fleet_size
+from daedalus.learner.run.heartbeat import silence
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode
-from daedalus.protocol.limits import STATUS_LIMITS
-from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, RunStatus
 from daedalus.transport.connecting import connect
 from daedalus.transport.credentials import WARNING_DAYS
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 HEALTHY, NO_ANSWER, BAD_USAGE, UNHEALTHY = 0, 1, 2, 3
@@ -25,17 +27,27 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447
   daedalus status --connect tcp/gpu-box:7447 --json
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
+  daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
 MB/h up counts rollouts, MB/h down counts snapshots. An s marks an actor that fetches compact snapshots, over a slow
 link.
 
-exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems)"""
+exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
+0 alive or starting, 1 not alive"""
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus status`."""
     options = command_parser("status", _DESCRIPTION, _EXAMPLES)
-    add_connect(options, "address of the learner or of its router. May be given several times")
+    where = options.add_mutually_exclusive_group(required=True)
+    add_connect(where, "address of the learner or of its router. May be given several times", required=False)
+    where.add_argument(
+        "--alive",
+        type=Path,
+        metavar="RUN_DIR",
+        help="check only that the learner of this run directory works: it renewed its heartbeat file within the last "
+        "two minutes. Needs no network and no router. For a liveness probe",
+    )
     options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="show only this run")
     output = options.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print each run as one JSON object per line")
@@ -44,16 +56,11 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
-def ask(transport: Transport, run: str = keys.ANY_RUN) -> list[RunStatus]:
-    """Return the status of each learner that answers within 5 s. Raises TransportError or ProtocolError."""
-    answers = transport.query(keys.status(run), timeout=5.0)
-    reports = [decode(answer, STATUS_LIMITS) for answer in answers]
-    return [report.status for report in reports if isinstance(report, StatusReport)]
-
-
 def status(arguments: list[str]) -> int:
     """Run `daedalus status` and return its exit status."""
     parsed = parser().parse_args(arguments)
+    if parsed.alive is not None:
+        return _check_alive(parsed.alive)
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
@@ -62,7 +69,7 @@ def status(arguments: list[str]) -> int:
     try:
         transport = connect(parsed.connect, credentials)
         try:
-            statuses = ask(transport, parsed.run)
+            statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet else None)
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
@@ -75,11 +82,19 @@ def status(arguments: list[str]) -> int:
         if parsed.json:
             print(status.model_dump_json())
         elif not parsed.quiet:
-            print(_table(status))
+            print(printable(_table(status)))
         else:
             for problem in status.problems:
-                print(f"{status.run}: {problem}")
+                print(printable(f"{status.run}: {problem}"))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
+
+
+def _check_alive(directory: Path) -> int:
+    silent = silence(directory)
+    if silent is None:
+        return HEALTHY
+    print(f"daedalus status: the learner of {directory} has been silent for {silent:.0f} s", file=sys.stderr)
+    return NO_ANSWER
 
 
 def _table(status: RunStatus) -> str:
@@ -95,11 +110,14 @@ def _table(status: RunStatus) -> str:
         f"updates {status.updates:,}{skipped}",
         f"  {status.env_steps_per_second:,.0f} env_steps/s, {status.updates_per_second:,.1f} updates/s, "
         f"policy lag {status.policy_lag_mean:.1f}",
+        f"  actors: {status.actors_alive:,} alive, {status.actors_quarantined:,} quarantined, {status.actors_gone:,} "
+        f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
         f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
         f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}  rejected",
         *(f"  {_line(actor)}" for actor in status.actors),
+        *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
     ]
     return "\n".join(lines)
@@ -109,6 +127,11 @@ def _expiry(days: float | None) -> list[str]:
     if days is None or days > WARNING_DAYS:
         return []
     return [f"  the learner's certificate expires in {days:.0f} days: renew it (daedalus certs renew)"]
+
+
+def _missing_actors(status: RunStatus) -> list[str]:
+    missing = fleet_size(status) - len(status.actors)
+    return [f"  ... and {missing:,} more, which the learner did not report in time"] if missing > 0 else []
 
 
 def _line(actor: ActorStatus) -> str:

@@ -13,6 +13,7 @@ from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
 from daedalus.cli.settings_arguments import add_settings, resolve
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
@@ -27,7 +28,8 @@ _TRAIN = """\
 Starts a learner and actors as processes of this machine and shows their progress. Training stops when the target is
 reached or the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes). If the run was
 evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as many new episodes
-each to select the best. Otherwise the newest policy is used."""
+each to select the best. Otherwise the newest policy is used. If the target was reached, the policy of that moment also
+plays 100 new sampled episodes (training.target_episodes) to confirm it."""
 
 _TRAIN_EXAMPLES = """\
 examples:
@@ -60,11 +62,15 @@ def train(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
-        run_directory.create(directory, spec)
+        lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None)
+    except RunInUseError as error:
+        print(f"daedalus train: {error}", file=sys.stderr)
+        return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
-    return _run(directory, spec, parsed, started, resume=False)
+    with lock:
+        return _run(lock, spec, parsed, started, resume=False)
 
 
 def resume(arguments: list[str]) -> int:
@@ -76,16 +82,25 @@ def resume(arguments: list[str]) -> int:
         spec = run_directory.read_config(parsed.directory)
         source = str(parsed.directory / run_directory.CONFIG)
         UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
-        if parsed.env_steps is not None:
-            spec = run_directory.with_budget(spec, parsed.env_steps)
-            run_directory.write_config(parsed.directory, spec)
+        lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
         print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
         return 2
+    except RunInUseError as error:
+        print(f"daedalus resume: {error}", file=sys.stderr)
+        return 1
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
-    return _run(parsed.directory, spec, parsed, started, resume=True)
+    with lock:
+        try:
+            if parsed.env_steps is not None:
+                spec = run_directory.with_budget(spec, parsed.env_steps)
+                run_directory.write_config(parsed.directory, spec)
+        except SettingsError as error:
+            print(f"daedalus resume: {error}", file=sys.stderr)
+            return 2
+        return _run(lock, spec, parsed, started, resume=True)
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -121,12 +136,14 @@ def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
-def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
+def _run(lock: RunLock, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
     """Run to the end, print the result, and return the exit status."""
+    directory = lock.directory
     run = LocalRun(
         directory=directory,
         spec=spec,
         started=started,
+        lock=lock.inheritable,
         resume=resume,
         listen=parsed.listen,
         tls=parsed.tls,
@@ -135,8 +152,9 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
         log_json=parsed.log_json,
     )
     configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
     try:
-        with ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err) as output:
+        with output:
             end = run_locally(run, stop_on_signals(), output)
     except RunStoppedError:
         options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
@@ -145,6 +163,8 @@ def _run(directory: Path, spec: RunSpec, parsed: argparse.Namespace, started: fl
     except RunFailedError as error:
         if str(error):
             print(f"daedalus train: {str(error).rstrip()}", file=sys.stderr)
+        if not (resume or output.withheld):
+            run_directory.remove_failed(directory)
         return error.status
     print(_report(run, end.summary))
     return end.status
@@ -183,4 +203,18 @@ def _report(run: LocalRun, summary: dict[str, Any]) -> str:
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
-    return "\n".join([trained, evaluated, *evaluation["notes"], folder])
+    return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+
+
+def _confirmed(summary: dict[str, Any]) -> list[str]:
+    """Return the line about the new episodes that confirm "solved", if there is one."""
+    confirmation = summary.get("confirmation")
+    if confirmation is None:
+        return []
+    line = (
+        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
+        "of the policy at that moment"
+    )
+    if confirmation["interval"] is not None:
+        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
+    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]

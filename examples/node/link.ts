@@ -50,7 +50,8 @@ export class LearnerLostError extends Error {}
  * RefusedError or RunOverError if a learner refuses.
  */
 export async function join(bridge: Bridge, run: string, fields: Message["fields"]): Promise<Welcome> {
-  const answers = await query(bridge, `daedalus/${run}/join`, encode({ kind: "Join", fields, arrays: {} }));
+  const request = encode({ kind: "Join", fields, arrays: {} });
+  const answers = await query(bridge, `daedalus/${run}/join/${fields.actor}`, request);
   const welcomes = answers.filter((answer) => answer.kind === "Welcome");
   if (welcomes.length > 1) throw new RefusedError("several learners answer here: choose one with --run");
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;

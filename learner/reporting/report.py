@@ -9,6 +9,7 @@ import numpy as np
 from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.fleet_status import page, totals
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
@@ -174,7 +175,8 @@ def run_status(
     queue_bytes: int,
     now: float,
 ) -> RunStatus:
-    """Return the answer to a status query. `now` is on the monotonic clock, in seconds."""
+    """Return the status of the run with its first actors. `now` is on the monotonic clock, in seconds."""
+    fleet.forget_absent(now)
     return RunStatus(
         run=run,
         learner_epoch=learner_epoch,
@@ -194,8 +196,10 @@ def run_status(
         queue_bytes_limit=spec.service.queue_bytes,
         checkpoint_age_seconds=None if health.saved is None else now - health.saved,
         certificate_days_left=health.certificate_days_left(),
+        rollouts_accepted=counters.rollouts_accepted,
         rollouts_rejected=dict(counters.rollouts_rejected),
-        actors=fleet.statuses(now),
+        **totals(fleet),
+        actors=page(fleet, "", now),
     )
 
 
@@ -228,6 +232,7 @@ def summary(
         "episode_return_mean": counters.episode_return_mean,
         "evaluation_return_mean": None,
         "evaluation_return_std": None,
+        "confirmation_return_mean": None,
         "policy_lag_mean": counters.policy_lag_mean,
         "policy_lag_max": counters.policy_lag_max,
         "rollouts_accepted": counters.rollouts_accepted,

@@ -3,19 +3,24 @@
 config.toml      all settings; reproduces the run      metrics.csv   one row for each log interval
 versions.json    versions of the packages              checkpoints/  by policy version; the newest are kept
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
+learner.lock     locked by the learner that runs
+heartbeat        its age shows that the learner works (heartbeat.py)
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
 """
 
+import itertools
 import json
 import os
 import platform
 import re
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
+from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.protocol.spec import RunSpec
 
@@ -43,7 +48,7 @@ def default_directory(name: str, spec: RunSpec) -> Path:
 
 def check_free(directory: Path) -> None:
     """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty."""
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+    if directory.exists() and (not directory.is_dir() or any(entry.name != LOCK for entry in directory.iterdir())):
         raise SettingsError(
             f"run directory {directory} exists: continue the run with `daedalus resume {directory}`, "
             "or choose another directory with --run-dir"
@@ -51,17 +56,59 @@ def check_free(directory: Path) -> None:
 
 
 def create(directory: Path, spec: RunSpec) -> None:
-    """Create the directory of a new run, with config.toml and versions.json.
+    """Create the directory of a new run, with config.toml and versions.json. See create_locked."""
+    create_locked(directory, spec).close()
 
-    Raises SettingsError if the directory is not empty or cannot be created.
+
+def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False) -> RunLock:
+    """Create the directory of a new run, with config.toml and versions.json, and return its lock.
+
+    Args:
+      directory: its path.
+      spec: the settings of the run.
+      numbered: add a number to the name if the directory exists; the lock has the resulting path.
+
+    Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
-    check_free(directory)
     try:
+        if numbered:
+            directory = _make_numbered(directory)
+        check_free(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        write_config(directory, spec)
-        write_json(directory / VERSIONS, _versions())
+        lock = RunLock(directory)
+        try:
+            check_free(directory)  # another process may have held the lock before
+            write_config(directory, spec)
+            write_json(directory / VERSIONS, _versions())
+        except BaseException:
+            lock.close()
+            raise
+        return lock
     except OSError as error:
         raise SettingsError(f"run directory {directory}: {error.strerror}") from None
+
+
+def _make_numbered(directory: Path) -> Path:
+    """Create a new directory with this name, or with the first number that makes its name new."""
+    for number in itertools.count(1):
+        numbered = directory if number == 1 else directory.with_name(f"{directory.name}-{number}")
+        with suppress(FileExistsError):
+            numbered.mkdir(parents=True)
+            return numbered
+    raise AssertionError
+
+
+def remove_failed(directory: Path) -> None:
+    """Remove the files of a run that failed before it had a result, and the directory unless it has other files."""
+    if (directory / METRICS).exists() or any((directory / "checkpoints").glob("*")):
+        return
+    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, "events.out.*", ".*.partial"):
+        for file in directory.glob(pattern):
+            with suppress(OSError):
+                file.unlink()
+    for folder in (directory / "checkpoints", directory):
+        with suppress(OSError):  # not empty, or a mount point
+            folder.rmdir()
 
 
 def write_config(directory: Path, spec: RunSpec) -> None:

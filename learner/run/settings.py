@@ -122,11 +122,22 @@ def _one_line(error: ValidationError) -> str:
         return f"unknown setting {name}: {hint}"
     if first["type"] == "missing":
         return f"setting {name} is missing: add it"
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    value, message = first["input"], first["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if not name:
         return message
+    if first["type"] == "tuple_type":
+        return f"setting {name} is {value!r}, which is not a list: write {name}=[{value}]"
+    if first["type"] == "string_pattern_mismatch":
+        return f"setting {name} is {value!r}, which is not valid. {_description(path)}"
     bounds = _bounds(path)
-    return f"setting {name} {message}, not {first['input']!r}{f' (it must be {bounds})' if bounds else ''}"
+    return f"setting {name} {message}, not {value!r}{f' (it must be {bounds})' if bounds else ''}"
+
+
+def _description(path: list[str]) -> str:
+    """Return the description of a setting in one line, or an empty string."""
+    model = _model(path[:-1])
+    field = model.model_fields.get(path[-1]) if model else None
+    return " ".join((field.description or "").split()) if field else ""
 
 
 def _known_names(path: list[str]) -> list[str]:

@@ -17,17 +17,32 @@ from collections.abc import Callable
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.fleet_status import page
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.rollout_intake import HEARTBEAT_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol import keys
-from daedalus.protocol.codec import encode
-from daedalus.protocol.limits import EVALUATION_LIMITS, JOIN_LIMITS, SNAPSHOT_REQUEST_LIMITS, Limits
-from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, StatusReport
+from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.limits import (
+    EVALUATION_LIMITS,
+    JOIN_LIMITS,
+    SNAPSHOT_REQUEST_LIMITS,
+    STATUS_REQUEST_LIMITS,
+    Limits,
+)
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    ActorsReport,
+    ActorsRequest,
+    Message,
+    Refusal,
+    RunEnded,
+    StatusReport,
+)
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import RunStatus
+from daedalus.protocol.status import ActorsPage, RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
@@ -61,7 +76,7 @@ class ActorServer:
           spec: specification of the run.
           transport: the network.
           counters: updated by the server; other threads read them under `lock`.
-          status: function that returns the answer to a status query; called with the lock held.
+          status: function that returns the status with the first page of actors; called with the lock held.
           learner_epoch: epoch of this learner process.
           start_version, spaces: from the checkpoint that the run continues from, else 0 and None.
         """
@@ -93,12 +108,12 @@ class ActorServer:
         self._serve(keys.rollouts(run, "*"), self.rollouts.offer)
         self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
-        self._serve(keys.status(run), self._on_status)
-        self._serve(keys.drain(run, "*"), self._on_drain)
+        self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
+        self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
-        self._serve(keys.join(run), self._on_join, JOIN_LIMITS)
+        self._serve(keys.join(run, "*"), self._on_join, JOIN_LIMITS)
         self._watchdog.open()
 
     def _serve(self, key: str, handler: Callable[[Request], None], limits: Limits | None = None) -> None:
@@ -161,11 +176,15 @@ class ActorServer:
         with self.lock:
             return bool(self.fleet.live) or self._were_cut_off or now < self._responses.postponed_at + _ASK_SECONDS
 
-    def await_spaces(self, stop: threading.Event) -> Spaces | None:
-        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first."""
+    def await_spaces(self, stop: threading.Event, on_wait: Callable[[], None] = lambda: None) -> Spaces | None:
+        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first.
+
+        `on_wait` is called again and again meanwhile.
+        """
         hint_at: float | None = time.monotonic() + _HINT_SECONDS
         with self.lock:
             while self.fleet.spaces is None and not stop.is_set():
+                on_wait()
                 self.lock.wait(HEARTBEAT_SECONDS)
                 if hint_at is not None and time.monotonic() > hint_at:
                     _logger.info("waiting for the first actor: start one with `daedalus actor --connect ADDRESS`")
@@ -184,11 +203,12 @@ class ActorServer:
         actor = keys.parse_presence(key)
         if actor is not None:
             with self.lock:
-                self.fleet.set_present(*actor, present)
+                self.fleet.set_present(*actor, present, time.monotonic())
                 self.lock.notify_all()
 
     def _on_join(self, request: Request) -> None:
-        request.reply(self._responses.join(request.payload, time.monotonic()))
+        name = keys.last_chunk(request.key)
+        request.reply(self._responses.join(name, request.payload, time.monotonic()))
 
     def _on_drain(self, request: Request) -> None:
         name = keys.last_chunk(request.key)
@@ -199,6 +219,19 @@ class ActorServer:
         request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
 
     def _on_status(self, request: Request) -> None:
+        request.reply(encode(self._status_answer(request)))
+
+    def _status_answer(self, request: Request) -> Message:
+        """Return the answer to a status query: the status, or the page of actors that an ActorsRequest names."""
+        if not request.size:
+            with self.lock:
+                return StatusReport(status=self._status())
+        try:
+            message = decode(request.payload, STATUS_REQUEST_LIMITS)
+        except ProtocolError as error:
+            return Refusal(code="malformed", reason=str(error))
+        if not isinstance(message, ActorsRequest):
+            return Refusal(code="malformed", reason="expected an ActorsRequest message")
         with self.lock:
-            status = self._status()
-        request.reply(encode(StatusReport(status=status)))
+            actors = page(self.fleet, message.after, time.monotonic())
+        return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))

@@ -137,6 +137,7 @@ class Intake:
             if isinstance(verdict, Rejected) and verdict.cause == "unfit":
                 actor.count_unfit(verdict.reason)
                 if actor.quarantined:
+                    self._fleet.changed()
                     verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 

@@ -39,14 +39,23 @@ class QueryResponses:
         self._ending: Refusal | None = None  # of joins after the end
         self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
 
-    def join(self, data: bytes, now: float) -> bytes:
-        """Return the answer to a Join: a Welcome, or a Refusal with the reason. Notifies the lock after a Welcome."""
+    def join(self, name: str, data: bytes, now: float) -> bytes:
+        """Return the answer to a Join: a Welcome, or a Refusal with the reason. Notifies the lock after a Welcome.
+
+        Args:
+          name: name of the actor in the key of the query, which access control has checked.
+          data: the encoded message.
+          now: time on the monotonic clock, in seconds.
+        """
         try:
             message = decode(data, JOIN_LIMITS)
         except ProtocolError as error:
             return encode(Refusal(code="mismatch", reason=str(error)))
         if not isinstance(message, Join):
             return encode(Refusal(code="malformed", reason="expected a Join message"))
+        if message.actor != name:
+            reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
+            return encode(Refusal(code="malformed", reason=reason))
         if self._ending is not None:
             return encode(self._ending)
         with self._lock:

@@ -160,6 +160,7 @@ class RolloutIntake:
                 if actor is not None:
                     actor.count_trained(finite=finite)
                 if not finite:
+                    self._fleet.changed()
                     self._counters.rollouts_rejected["non_finite"] += 1
                 if not finite and actor is not None and actor.rejected["non_finite"] == 1:
                     _logger.warning("a rollout of actor %r has no finite gradient, and was left out", actor.name)

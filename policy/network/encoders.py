@@ -17,6 +17,8 @@ from daedalus.protocol.spec import PolicySpec
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 _GAIN = math.sqrt(2.0)
+_SMALLEST_IMAGE = 16  # pixels of its shorter side; smaller arrays of bytes are no pictures
+_SMALLEST_FOR_NATURE = 36
 
 
 class MultilayerPerceptron(nn.Module):
@@ -53,7 +55,8 @@ def build_encoder(spec: PolicySpec, space: ArraySpace, modules: UserModules = NO
     Raises NetworkError if a custom encoder may not or cannot be imported, or the encoder does not accept the
     observations.
     """
-    match spec.encoder:
+    name = _chosen(space) if spec.encoder == "auto" else spec.encoder
+    match name:
         case "mlp":
             return MultilayerPerceptron(space, spec.hidden, spec.activation)
         case "nature":
@@ -64,5 +67,13 @@ def build_encoder(spec: PolicySpec, space: ArraySpace, modules: UserModules = NO
             return impala(space)
         case "article":
             return ArticleEncoder(space)
-        case name:
+        case _:
             return CustomEncoder(name, space, modules)
+
+
+def _chosen(space: ArraySpace) -> str:
+    """Return the encoder for a space: convolutions for images of bytes."""
+    sides = sorted(space.shape)[-2:]  # colours first or last: the longest sides are those of the image
+    if space.dtype != "uint8" or len(space.shape) not in (2, 3) or min(sides) < _SMALLEST_IMAGE:
+        return "mlp"
+    return "nature" if min(sides) >= _SMALLEST_FOR_NATURE else "impala"

@@ -127,7 +127,7 @@ def test_two_learners_require_a_choice(network: MemoryNetwork) -> None:
     for run in ("one", "two"):
         transport = MemoryTransport(network)
         welcome = encode(Welcome(run=run, learner_epoch=1, seed=1, spec=SPEC))
-        transport.serve(keys.join(run), lambda request, welcome=welcome: request.reply(welcome))
+        transport.serve(keys.join(run, "*"), lambda request, welcome=welcome: request.reply(welcome))
     actor = RunningActor(network)
     actor.join()
     assert "several learners answer here (one, two): choose one with --run" in str(actor.error)
@@ -178,9 +178,9 @@ def test_actor_probes_a_silent_learner_and_rejoins_if_it_does_not_respond(
     for _ in range(3):
         assert learner.joins.get(timeout=LIMIT).spaces is None  # the probe is answered: the learner is only slow
     assert not any("went away" in text for text in LINES)
-    learner.transport.serve(keys.join("r"), lambda request: request.reply(b""))  # no valid message
+    learner.transport.serve(keys.join("r", "*"), lambda request: request.reply(b""))  # no valid message
     until(lambda: any("went away" in text for text in LINES))
-    learner.transport.serve(keys.join("r"), learner._join)
+    learner.transport.serve(keys.join("r", "*"), learner._join)
     again = learner.receive()
     assert again[0].identity in [rollout.identity for rollout, _ in held]  # the same rollout again
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import Stream, lambda_return, n_step_return, vtrace, vtrace_advantage
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from daedalus.algorithms.returns import actor_critic_targets, lambda_returns, n_step_returns, vtrace_targets
 
+repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 NUMBER = st.floats(-10.0, 10.0, width=32)
 UNIT = st.floats(0.0, 1.0, width=32)
 CLIP = st.floats(0.125, 4.0, width=32)
@@ -64,12 +65,14 @@ def assert_rows(result: Tensor, columns: list[Stream], expected) -> None:
 # --------------------------------------------------------------------------------------------- oracles
 
 
+@repeatable
 @given(ROLLOUTS, UNIT)
 def test_n_step_returns_are_the_explicit_sums(columns: list[Stream], gamma: float) -> None:
     result = n_step_returns(*Columns(columns, gamma).of_returns)
     assert_rows(result, columns, lambda x, t: n_step_return(x, gamma, t, len(x.r)))
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT)
 def test_lambda_returns_are_the_weighted_mixture_of_n_step_returns(
     columns: list[Stream], gamma: float, lam: float
@@ -78,6 +81,7 @@ def test_lambda_returns_are_the_weighted_mixture_of_n_step_returns(
     assert_rows(result, columns, lambda x, t: lambda_return(x, gamma, lam, t))
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT)
 def test_actor_critic_advantages_are_returns_minus_values(columns: list[Stream], gamma: float, lam: float) -> None:
     data = Columns(columns, gamma)
@@ -86,6 +90,7 @@ def test_actor_critic_advantages_are_returns_minus_values(columns: list[Stream],
     assert_rows(targets.advantages, columns, lambda x, t: lambda_return(x, gamma, lam, t) - x.V[t])
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT, CLIP, CLIP)
 def test_vtrace_equals_the_sum_of_products_in_the_paper(
     columns: list[Stream], gamma: float, lam: float, rho_bar: float, c_bar: float
@@ -99,6 +104,7 @@ def test_vtrace_equals_the_sum_of_products_in_the_paper(
 # ------------------------------------------------------------------------------------------ identities
 
 
+@repeatable
 @given(ROLLOUTS, UNIT)
 def test_lambda_of_0_gives_one_step_returns(columns: list[Stream], gamma: float) -> None:
     data = Columns(columns, gamma)
@@ -106,12 +112,14 @@ def test_lambda_of_0_gives_one_step_returns(columns: list[Stream], gamma: float)
     assert_close(lambda_returns(*data.of_returns, 0.0), expected)
 
 
+@repeatable
 @given(ROLLOUTS, UNIT)
 def test_lambda_of_1_gives_n_step_returns(columns: list[Stream], gamma: float) -> None:
     data = Columns(columns, gamma)
     assert torch.equal(lambda_returns(*data.of_returns, 1.0), n_step_returns(*data.of_returns))
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT, st.floats(1.0, 4.0), st.floats(1.0, 4.0))
 def test_vtrace_on_policy_is_the_lambda_return_and_its_advantage(
     columns: list[Stream], gamma: float, lam: float, rho_bar: float, c_bar: float
@@ -124,6 +132,7 @@ def test_vtrace_on_policy_is_the_lambda_return_and_its_advantage(
     assert_close(targets.advantages, expected.advantages, rtol=1e-5, atol=1e-4)
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT, CLIP)
 def test_vtrace_with_rho_clip_near_0_returns_the_values(
     columns: list[Stream], gamma: float, lam: float, c_bar: float
@@ -134,6 +143,7 @@ def test_vtrace_with_rho_clip_near_0_returns_the_values(
     assert torch.where(data.valid, targets.weights, 0.0).abs().max() < 1e-6
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, CLIP)
 def test_vtrace_with_trace_clip_near_0_returns_one_step_targets(
     columns: list[Stream], gamma: float, rho_bar: float
@@ -145,6 +155,7 @@ def test_vtrace_with_trace_clip_near_0_returns_one_step_targets(
     assert_close(targets.values[data.valid], one_step[data.valid], rtol=1e-5, atol=1e-5)
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT)
 def test_vtrace_clips_ratios_above_both_clips(columns: list[Stream], gamma: float, lam: float) -> None:
     data = Columns(columns, gamma)
@@ -155,6 +166,7 @@ def test_vtrace_clips_ratios_above_both_clips(columns: list[Stream], gamma: floa
     assert torch.equal(first.advantages, second.advantages)
 
 
+@repeatable
 @given(ROLLOUTS, UNIT, UNIT, NUMBER)
 def test_content_of_reset_rows_does_not_change_other_rows(
     columns: list[Stream], gamma: float, lam: float, garbage: float

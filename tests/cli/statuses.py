@@ -1,5 +1,6 @@
 """Examples of the status that a learner sends."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from daedalus.protocol.status import ActorStatus, RunStatus
@@ -47,7 +48,21 @@ def run_status(**changes: Any) -> RunStatus:
         "queue_bytes_limit": 1024,
         "checkpoint_age_seconds": 3.0,
         "certificate_days_left": None,
+        "rollouts_accepted": 30,
         "rollouts_rejected": {"stale": 2},
+        "rollouts_missed": 4,
+        "busy_answers": 5,
         "actors": (),
     }
-    return RunStatus(**{**values, **changes})
+    return RunStatus(**{**values, **_counts(changes.get("actors", ())), **changes})
+
+
+def _counts(actors: Sequence[ActorStatus]) -> dict[str, int]:
+    """Return the number of actors in each state."""
+    present = [actor for actor in actors if actor.alive]
+    quarantined = sum(bool(actor.quarantined) for actor in present)
+    return {
+        "actors_alive": len(present) - quarantined,
+        "actors_quarantined": quarantined,
+        "actors_gone": len(actors) - len(present),
+    }

@@ -28,3 +28,21 @@ def test_plot_writes_a_picture_of_a_run_with_evaluations(tmp_path: Path, capsys:
     (tmp_path / "metrics.csv").write_text(ROWS)
     assert plot([str(tmp_path), "--output", str(tmp_path / "curve.png")]) == 0, capsys.readouterr().err
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_without_metrics_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(directory: Path) -> str:
+        assert plot([str(directory), "--output", str(tmp_path / "curve.png")]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("daedalus plot: ")
+
+    nothing = refused(tmp_path / "nowhere")
+    assert nothing == f"{tmp_path}/nowhere is not a run directory: it has neither config.toml nor metrics.csv"
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.toml").touch()
+    assert refused(run) == f"{run} has no metrics yet: wait until the run has made its first updates"
+    (run / "metrics.csv").write_text(ROWS.splitlines()[0])
+    assert refused(run) == f"{run} has no metrics yet: wait until the run has made its first updates"
+    (run / "metrics.csv").write_text("a,b\n1,2\n")
+    assert refused(run) == f"{run}/metrics.csv has no column entropy: it is not the metrics of a run"

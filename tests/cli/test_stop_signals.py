@@ -12,20 +12,30 @@ SECONDS = 60.0  # generous for slow machines; a process that ignores the signal 
 PREAMBLE = """
     import os, sys, threading
     from daedalus.cli import processes
-    stop = processes.stop_on_signals()
+    processes._STUCK_SECONDS = 0.2
 """
 # A second lock of the same mutex never returns, and releases the interpreter's lock while it waits.
 STUCK = """
     import ctypes
-    processes._STUCK_SECONDS = 0.2
-    processes.exit_if_stuck(stop)
+    processes._END_SECONDS = 0.2  # in case that the signal comes before the first lock
+    processes.stop_on_signals(exit_if_stuck=True)
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
     while True:
         libc.pthread_mutex_lock(mutex)
 """
+SLOW_END = """
+    import time
+    stop = processes.stop_on_signals(exit_if_stuck=True)
+    processes.exit_with_parent(stop)
+    print("ready", flush=True)
+    stop.wait()
+    time.sleep(0.5)
+    os._exit(8)
+"""
 SEEN_BY_A_THREAD = """
     import ctypes
+    stop = processes.stop_on_signals()
     threading.Thread(target=lambda: (stop.wait(), os._exit(7))).start()
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
@@ -34,6 +44,7 @@ SEEN_BY_A_THREAD = """
 """
 CHILD = """
     import signal, time
+    stop = processes.stop_on_signals()
     child = os.fork()
     if child == 0:
         time.sleep(1000)
@@ -48,15 +59,21 @@ CHILD = """
 
 
 @pytest.mark.parametrize(
-    ("program", "status"), [(STUCK, 1), (SEEN_BY_A_THREAD, 7), (CHILD, 0)], ids=["stuck", "seen by a thread", "child"]
+    ("program", "by_signal", "status"),
+    [(STUCK, True, 1), (SLOW_END, True, 8), (SLOW_END, False, 8), (SEEN_BY_A_THREAD, True, 7), (CHILD, True, 0)],
+    ids=["stuck", "slow end", "slow end after the parent", "seen by a thread", "child"],
 )
-def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, status: int) -> None:
+def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:
     command = [sys.executable, "-c", textwrap.dedent(PREAMBLE) + textwrap.dedent(program)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
+            assert process.stdin is not None
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
-            process.send_signal(signal.SIGTERM)
+            if by_signal:
+                process.send_signal(signal.SIGTERM)
+            else:
+                process.stdin.close()
             assert process.wait(SECONDS) == status
         finally:
             process.kill()

@@ -160,15 +160,16 @@ def test_the_command_of_each_container_is_valid() -> None:
     assert commands == ["router", "learner", "actor", "exporter"]
 
 
-def test_the_probes_query_the_status_of_the_run() -> None:
+def test_the_probes_check_the_run_of_the_learner() -> None:
     (learner,) = (container for _, container in containers() if container["name"] == "learner")
-    ready, alive = (learner[probe]["exec"]["command"][-1] for probe in ("readinessProbe", "livenessProbe"))
+    ready, alive = (learner[probe]["exec"]["command"] for probe in ("readinessProbe", "livenessProbe"))
     words = words_of(learner)
-    run = Path(words[words.index("--run-dir") + 1]).name
-    probe = words_of({"command": [ready], "env": learner["env"]})
+    run_directory = words[words.index("--run-dir") + 1]
+    probe = words_of({"command": ready, "env": learner["env"]})
     assert check(probe) == "status"
-    assert probe[probe.index("--run") + 1] == run
-    assert alive == f"{ready}; test $? -ne 1"
+    assert probe[probe.index("--run") + 1] == Path(run_directory).name
+    assert check(alive[1:]) == "status"
+    assert alive[2:] == ["--alive", run_directory]
 
 
 # The learner of the manifest is replaced by a program that ends with the given status, or waits for a signal.

@@ -47,6 +47,8 @@ def parse(words: Sequence[str], *, whole: bool) -> argparse.Namespace:
     assert command in parsers, f"`daedalus {command}`: there is no such command"
     for action in parsers[command]._actions:
         action.required = action.required and whole
+    for group in parsers[command]._mutually_exclusive_groups:
+        group.required = group.required and whole
     return parsers[command].parse_args(arguments)
 
 

@@ -355,12 +355,38 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
     assert [best_score(each) for each in best_checkpoints(run)] == [round(each, 1) for _, each in scores]
 
 
+def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path, output: ChildOutput) -> None:
+    training = {"target_return": 20.0, "target_episodes": 40}
+    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 3}, training=training)
+    score(run, 77.0, 4)
+    spec = read_policy(run / "checkpoints" / "0000000005").spec
+    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 20.5}
+    write_json(run / "summary.json", solved)
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    summary = evaluate_run(local_run, threading.Event(), output)
+    confirmation = read_json(run / "summary.json")["confirmation"]
+    assert (confirmation["policy_version"], confirmation["best_checkpoint"]) == (5, False)
+    assert (confirmation["episodes"], confirmation["actions"], confirmation["seed"]) == (40, "sampled", 1 + 2**34)
+    low, high = confirmation["interval"]
+    mean = summary["confirmation_return_mean"]
+    assert mean == confirmation["return_mean"]
+    assert (
+        high - mean
+        == pytest.approx(mean - low)
+        == pytest.approx(2.0227 * confirmation["return_std"] / 39**0.5, rel=1e-4)
+    )
+    report = train_command._report(local_run, summary)
+    assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
+    assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 20.5")
+
+
 def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:
     return evaluate(run / "checkpoints" / f"{version:010d}", "--episodes", 20)["return_mean"]
 
 
 def test_the_final_evaluation_ends_when_training_is_stopped(tmp_path: Path, output: ChildOutput) -> None:
     run = save(tmp_path / "run", CARTPOLE, 1, evaluation={"final_episodes": 10_000})
+    write_json(run / "summary.json", {})
     spec = read_policy(run / "checkpoints" / "0000000001").spec
     stopping = threading.Event()
     stopping.set()

@@ -292,7 +292,7 @@ def test_arbitrary_bytes_on_any_key_change_nothing(
                     damaged[noise.randrange(len(damaged))] = noise.randrange(256)
                 payload = bytes(damaged)
             for key in (
-                keys.join(run),
+                keys.join(run, "stranger"),
                 keys.program(run, "0" * 64),
                 keys.rollouts(run, "good"),
                 keys.rollouts(run, "stranger"),
@@ -320,7 +320,7 @@ def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
     """Send two hundred rollouts at once to a queue that holds a few, while an actor plays."""
-    learner("--set", "service.queue_megabytes=0.02", "--set", "training.max_policy_lag=1000000")
+    learner("--set", "service.queue_megabytes=0.2", "--set", "training.max_policy_lag=1000000")
     start("actor", "--connect", address, "--name", "good")
     wait_for_training(status, "good")
     sender = Sender(address, "flood")

@@ -25,7 +25,7 @@ def client(start: Start, address: str) -> Iterator[Transport]:
     learner.expect("actors join with")
     transport = connect([address])
     try:
-        until(lambda: transport.query(keys.join("run"), timeout=30.0))  # the key that the learner serves last
+        until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))  # the key that the learner serves last
         yield transport
         assert learner.process.poll() is None, learner.output
     finally:
@@ -44,7 +44,7 @@ def join(**kwargs: object) -> bytes:
 def test_another_protocol_version_is_refused_and_both_versions_are_named(client: Transport) -> None:
     other = bytearray(join())
     struct.pack_into("<H", other, 4, 7)
-    answer = ask(client, keys.join("run"), bytes(other))
+    answer = ask(client, keys.join("run", "client"), bytes(other))
     assert isinstance(answer, Refusal)
     assert answer.code == "mismatch"
     assert "protocol version 7" in answer.reason
@@ -52,10 +52,10 @@ def test_another_protocol_version_is_refused_and_both_versions_are_named(client:
 
 
 def test_mismatching_spaces_are_refused_and_both_are_named(client: Transport) -> None:
-    first = ask(client, keys.join("*"), join(spaces=CARTPOLE, environments=2))
+    first = ask(client, keys.join("*", "client"), join(spaces=CARTPOLE, environments=2))
     assert isinstance(first, Welcome)
     other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
-    answer = ask(client, keys.join("run"), join(spaces=other, environments=2))
+    answer = ask(client, keys.join("run", "client"), join(spaces=other, environments=2))
     assert isinstance(answer, Refusal)
     assert "3 choices" in answer.reason
     assert "2 choices" in answer.reason
@@ -64,7 +64,7 @@ def test_mismatching_spaces_are_refused_and_both_are_named(client: Transport) ->
 def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) -> None:
     for payload in (b"", b"\x00", b"DAED", b"\xff" * 5000, join()[:-3]):
         for key in (
-            keys.join("run"),
+            keys.join("run", "client"),
             keys.rollouts("run", "x"),
             keys.program("run", "x"),
             keys.snapshots("run"),
@@ -75,7 +75,7 @@ def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) ->
     answer = ask(client, keys.rollouts("run", "client"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "fenced"
-    ask(client, keys.join("run"), join(spaces=CARTPOLE, environments=2))
+    ask(client, keys.join("run", "client"), join(spaces=CARTPOLE, environments=2))
     answer = ask(client, keys.rollouts("run", "client"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "rejected"
@@ -102,7 +102,7 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
     try:
         first = start("learner", "cartpole", "--connect", address, "--run-dir", "one/run")
         first.expect("actors join with")
-        until(lambda: router.query(keys.join("run"), timeout=30.0))
+        until(lambda: router.query(keys.join("run", "client"), timeout=30.0))
         second = start("learner", "cartpole", "--connect", address, "--run-dir", "two/run")
         assert second.wait() == 1
         second.expect("another learner already serves run 'run': stop that learner, or rename this run")
@@ -113,7 +113,7 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
 
 def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transport, address: str) -> None:
     other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
-    ask(client, keys.join("run"), join(spaces=other, environments=2))
+    ask(client, keys.join("run", "client"), join(spaces=other, environments=2))
     actor = start("actor", "--connect", address)
     assert actor.wait() == 1
     actor.expect("learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from processes import Running, listening_ports, processes_mentioning, until
+
+from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
@@ -33,6 +36,14 @@ def newest_checkpoint(directory: Path) -> Path:
 
 def is_socket_removed(output: str) -> bool:
     return not Path(output.split("unixsock-stream/")[1].split(";")[0]).parent.exists()
+
+
+def is_free(directory: Path) -> bool:
+    try:
+        RunLock(directory).close()
+    except RunInUseError:
+        return False
+    return True
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +74,9 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     assert result["rollouts_rejected"] == {}
     assert result["snapshots_published"] == result["updates"] + 1
     assert "solved: mean return 475 reached" in output
+    assert result["confirmation"]["episodes"] == 100
+    assert result["confirmation_return_mean"] > 400
+    assert "over 100 new sampled episodes of the policy at that moment, 95 % interval" in output
     assert "evaluation: return" in output
 
 
@@ -79,7 +93,15 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
     names = {entry.name.split(".out.")[0] for entry in directory.iterdir()} - {
         "output.log"
     }  # written by a slow evaluation
-    assert names == {"config.toml", "versions.json", "metrics.csv", "events", "checkpoints", "summary.json"}
+    assert names == {
+        "learner.lock",
+        "config.toml",
+        "versions.json",
+        "metrics.csv",
+        "events",
+        "checkpoints",
+        "summary.json",
+    }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
     assert float(rows[-1]["entropy"]) > 0
@@ -141,12 +163,19 @@ def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: 
     assert is_socket_removed(running.output)
 
 
-def test_the_child_processes_end_when_train_is_killed(start: Start) -> None:
+def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
     running = start("train", "cartpole", "--run-dir", "orphan-run", *ENDLESS)
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
+    second = start("resume", "orphan-run")
+    assert second.wait() == 1
+    assert second.lines == [
+        f"daedalus resume: run directory orphan-run is in use by process {running.process.pid} on "
+        f"{socket.gethostname()}: stop it first, or choose another --run-dir"
+    ]
     running.process.kill()
     until(lambda: not processes_mentioning(address) and not processes_mentioning("orphan-run"))
+    until(lambda: is_free(tmp_path / "orphan-run"))
 
 
 def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
@@ -190,7 +219,9 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     assert running.wait() in (0, 3), running.output
     records = [json.loads(line) for line in running.lines if line.startswith("{")]
     assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.cli.local_run", "daedalus.learner.service"} <= {record["logger"] for record in records}
+    assert {"daedalus.cli.local_run", "daedalus.learner.serving.evaluation_server"} <= {
+        record["logger"] for record in records
+    }
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
     *progress, outcome, evaluation, folder = plain

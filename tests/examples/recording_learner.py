@@ -48,7 +48,7 @@ class RecordingLearner:
         transport.serve(keys.snapshots("r"), lambda request: request.reply(self.snapshot()))
         transport.serve(keys.program("r", "*"), lambda request: request.reply(self._program()))
         transport.serve(keys.rollouts("r", "*"), self._on_rollout)
-        transport.serve(keys.join("r"), self._on_join)
+        transport.serve(keys.join("r", "*"), self._on_join)
 
     def snapshot(self) -> bytes:
         if not self.weights:

@@ -84,7 +84,7 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
         return acknowledgement.verdict
 
     try:
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         assert verdict(0, version=1) == "rejected"
         assert verdict(1, version=0) == "accepted"
         assert len(server.rollouts.take_batch(0)) == 1
@@ -107,7 +107,7 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
     try:
         server.offer_policy(b"program", state_size)
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         rollout = make_rollout(identity("a"), state_size=state_size)
         actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         rollouts = server.rollouts.take_batch(0)
@@ -125,7 +125,7 @@ def test_rows_that_only_reset_are_not_counted_for_their_actor(network: MemoryNet
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
     try:
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         rollout = make_rollout(identity("a"))
         actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
         server.rollouts.count_trained(server.rollouts.take_batch(0), [])
@@ -322,7 +322,7 @@ def test_stale_rollouts_are_counted_for_the_run_when_their_actor_was_evicted(net
     actor = MemoryTransport(network)
     try:
         actor.query(
-            keys.join("r"),
+            keys.join("r", "a"),
             encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)),
             timeout=LIMIT,
         )
@@ -354,7 +354,7 @@ def test_queue_holds_only_rollouts_that_are_not_stale_at_their_turn(
     answers: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     try:
         join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actor.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
         held = max(spec.training.batch_rollouts or 2, 2)
         for sequence in range(held + 1):
             payload = encode(make_rollout(identity("a", sequence)))
@@ -380,7 +380,7 @@ def with_fleet(network: MemoryNetwork, server: ActorServer, count: int) -> Memor
     actors = MemoryTransport(network)
     for number in range(count):
         join = Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-        actors.query(keys.join("r"), encode(join), timeout=LIMIT)
+        actors.query(keys.join("r", f"a{number}"), encode(join), timeout=LIMIT)
         actors.declare_presence(keys.presence("r", f"a{number}", 1))
     return actors
 

@@ -2,74 +2,20 @@
 
 import pytest
 from building import SPACES, identity, joined_fleet
-from hypothesis import given
-from hypothesis import strategies as st
 
-from daedalus.learner.serving.fleet import Fleet, SequenceWindow
+from daedalus.learner.serving import fleet as fleet_module
+from daedalus.learner.serving import fleet_status, former_incarnations, presence
+from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 WINDOW = 1024
-HUGE = 2**62
+MINUTE = 60.0
 
 
-class NaiveWindow:
-    """Reference implementation: one set of all received numbers."""
-
-    def __init__(self) -> None:
-        self.taken: set[int] = set()
-
-    @property
-    def low(self) -> int:
-        """All numbers below were received or given up."""
-        return max(0, max(self.taken, default=-1) - WINDOW + 1)
-
-    def __contains__(self, sequence: int) -> bool:
-        return sequence in self.taken or sequence < self.low
-
-    @property
-    def gaps(self) -> int:
-        return self.low - sum(sequence < self.low for sequence in self.taken)
-
-
-NEAR = st.integers(0, 40)
-ANYWHERE = st.one_of(NEAR, NEAR, st.integers(0, 3000), st.sampled_from([HUGE, HUGE - 1, HUGE - WINDOW, 2**63 - 1]))
-
-
-@given(st.lists(st.tuples(ANYWHERE, st.booleans()), max_size=60))
-def test_sequence_window_equals_a_set_of_all_numbers(steps: list[tuple[int, bool]]) -> None:
-    window, naive, last = SequenceWindow(), NaiveWindow(), 0
-    for number, from_here in steps:
-        sequence = min(last + number if from_here else number, 2**63 - 1)
-        last = sequence
-        assert (sequence in window) == (sequence in naive)
-        if sequence not in window:
-            window.add(sequence)
-            naive.taken.add(sequence)
-        assert sequence in window
-        assert window.gaps == naive.gaps
-    for probe in {probe for taken in naive.taken for probe in (taken - WINDOW, taken - 1, taken + 1) if probe >= 0}:
-        assert (probe in window) == (probe in naive)
-
-
-def test_sequence_window_is_bounded_by_the_reordering_distance() -> None:
-    window = SequenceWindow()
-    for sequence in range(0, 20 * WINDOW, 2):  # every second number is lost
-        window.add(sequence)
-    assert len(window._above) <= WINDOW
-    in_order = SequenceWindow()
-    for sequence in range(20 * WINDOW):
-        in_order.add(sequence)
-    assert (in_order.low, in_order.gaps, len(in_order._above)) == (20 * WINDOW, 0, 0)
-
-
-def test_large_jump_counts_all_skipped_numbers_as_gaps() -> None:
-    window = SequenceWindow()
-    window.add(3)
-    window.add(HUGE)
-    assert window.gaps == HUGE - WINDOW + 1 - 1
-    assert HUGE - WINDOW in window
-    assert HUGE - WINDOW + 1 not in window
+def attempt(fleet: Fleet, name: str, incarnation: int = 1, now: float = 0.0) -> Refusal | None:
+    """Let an incarnation join with spaces."""
+    return fleet.join(Join(actor=name, incarnation=incarnation, spaces=SPACES, environments=3), now)
 
 
 # --------------------------------------------------------------------------------------------- joining
@@ -124,7 +70,7 @@ def test_new_incarnation_replaces_an_absent_one_and_starts_without_sequence_numb
     actor = fleet.actors["a"]
     assert fleet.find(identity("a")) is actor
     actor.sequences.add(0)
-    fleet.set_present("a", 1, False)
+    fleet.set_present("a", 1, False, 0.0)
     assert fleet.join(Join(actor="a", incarnation=2), 0.0) is None
     assert fleet.find(identity("a")) is actor  # a Join without spaces replaces no incarnation
     assert fleet.find(identity("a", incarnation=2)) is None
@@ -144,14 +90,6 @@ def test_second_join_of_an_incarnation_keeps_its_sequence_numbers() -> None:
     assert fleet.find(identity("a")) is not None
 
 
-def test_number_of_remembered_incarnations_is_bounded() -> None:
-    fleet = joined_fleet("a")
-    for incarnation in range(1000):
-        fleet.join(Join(actor="a", incarnation=incarnation, spaces=SPACES, environments=3), 0.0)
-        fleet.actors["a"].sequences.add(0)
-    assert len(fleet.actors["a"].windows) <= 8
-
-
 def test_find_returns_none_for_an_unknown_actor() -> None:
     assert joined_fleet("a").find(identity("b")) is None
 
@@ -159,11 +97,11 @@ def test_find_returns_none_for_an_unknown_actor() -> None:
 def test_live_actors_are_present_and_have_joined_with_spaces() -> None:
     fleet = joined_fleet("a", "b")
     fleet.join(Join(actor="c", incarnation=1), 0.0)
-    fleet.set_present("c", 1, True)
-    fleet.set_present("d", 1, True)
+    fleet.set_present("c", 1, True, 0.0)
+    fleet.set_present("d", 1, True, 0.0)
     fleet.join(Join(actor="e", incarnation=1, spaces=SPACES, environments=1), 0.0)
     assert fleet.live == {"a", "b"}
-    fleet.set_present("a", 1, False)
+    fleet.set_present("a", 1, False, 0.0)
     assert fleet.live == {"b"}
 
 
@@ -177,25 +115,47 @@ def test_join_with_an_invalid_name_is_refused(name: str) -> None:
     assert not fleet.actors
 
 
-def test_actor_absent_longest_is_evicted_at_capacity() -> None:
+def test_actor_absent_longest_is_evicted_at_capacity(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_module, "_MAX_ACTORS", 20)
     fleet = Fleet(1, None)
-
-    def join(number: int) -> Refusal | None:
-        return fleet.join(Join(actor=f"a{number}", incarnation=1, spaces=SPACES, environments=1), float(number))
-
-    most = 16_384
-    for number in range(most):
-        assert join(number) is None
-        fleet.set_present(f"a{number}", 1, True)
-    refusal = join(most)
+    for number in range(20):
+        assert attempt(fleet, f"a{number}", now=float(number)) is None
+        fleet.set_present(f"a{number}", 1, True, float(number))
+    refusal = attempt(fleet, "a20", now=20.0)
     assert refusal is not None
-    assert (refusal.code, refusal.reason) == ("full", f"{most} actors have already joined")
-    for away in (7, 5, 9):
-        fleet.set_present(f"a{away}", 1, False)
-    assert join(most) is None
-    assert len(fleet.actors) == most
+    assert (refusal.code, refusal.reason) == ("full", "20 actors have already joined")
+    for away, at in ((7, 22.0), (5, 21.0), (9, 23.0)):
+        fleet.set_present(f"a{away}", 1, False, at)
+    assert attempt(fleet, "a20", now=24.0) is None
+    assert len(fleet.actors) == 20
     assert "a5" not in fleet.actors
     assert {"a7", "a9"} < fleet.actors.keys()
+
+
+def test_one_owner_cannot_fill_the_fleet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A certificate for NAME allows NAME.anything."""
+    monkeypatch.setattr(fleet_module, "_MAX_OF_ONE_OWNER", 3)
+    fleet = joined_fleet("arm", "arm.1", "arm.2")
+    refusal = attempt(fleet, "arm.3")
+    assert refusal is not None
+    assert (refusal.code, refusal.reason) == ("full", "3 actors have already joined as 'arm' or arm.ANYTHING")
+    assert attempt(fleet, "box.3") is None
+    fleet.set_present("arm.1", 1, False, 1.0)
+    assert attempt(fleet, "arm.3", now=2.0) is None
+    assert fleet.actors.keys() == {"arm", "arm.2", "arm.3", "box.3"}
+
+
+def test_tokens_of_one_owner_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(presence, "_MAX_OF_ONE_OWNER", 2)
+    fleet = joined_fleet("arm", "arm.1", "arm.2", "box")
+    assert fleet.live == {"arm", "arm.1", "box"}
+    fleet.set_present("arm.2", 1, False, 0.0)
+    fleet.set_present("arm.1", 1, False, 0.0)
+    fleet.set_present("arm.2", 1, True, 0.0)
+    assert fleet.live == {"arm", "arm.2", "box"}
+    for name in ("arm", "arm.2", "box"):
+        fleet.set_present(name, 1, False, 0.0)
+    assert not fleet._presence._of_owner
 
 
 def test_name_is_refused_while_its_incarnation_is_live() -> None:
@@ -208,9 +168,9 @@ def test_name_is_refused_while_its_incarnation_is_live() -> None:
     assert (
         fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=5), 2.0) is None
     )  # the same incarnation
-    fleet.set_present("a", 2, True)  # its token may be present before it joins
+    fleet.set_present("a", 2, True, 0.0)  # its token may be present before it joins
     assert fleet.join(other, 3.0) is not None
-    fleet.set_present("a", 1, False)
+    fleet.set_present("a", 1, False, 0.0)
     assert fleet.join(other, 4.0) is None
     assert fleet.live == {"a"}
     assert fleet.actors["a"].incarnations == 2
@@ -224,15 +184,15 @@ def test_name_of_a_quarantined_actor_can_be_reused() -> None:
 
 def test_presence_of_another_incarnation_does_not_make_an_actor_live() -> None:
     fleet = joined_fleet("a")
-    fleet.set_present("a", 2, True)
-    fleet.set_present("a", 1, False)
+    fleet.set_present("a", 2, True, 0.0)
+    fleet.set_present("a", 1, False, 0.0)
     assert not fleet.live
-    assert [status.alive for status in fleet.statuses(0.0)] == [False]
+    assert [status.alive for status in fleet_status.page(fleet, "", 0.0)] == [False]
 
 
 def test_presence_without_join_does_not_create_an_actor() -> None:
     fleet = Fleet(1, None)
-    fleet.set_present("a", 1, True)
+    fleet.set_present("a", 1, True, 0.0)
     assert not fleet.actors
     fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=1), 0.0)
     assert fleet.live == {"a"}
@@ -241,11 +201,11 @@ def test_presence_without_join_does_not_create_an_actor() -> None:
 def test_missed_rollouts_are_counted_and_fit_the_wire_integer() -> None:
     fleet = joined_fleet("a")
     fleet.actors["a"].sequences.add(WINDOW + 4)
-    assert fleet.statuses(0.0)[0].rollouts_missed == 5
+    assert fleet_status.page(fleet, "", 0.0)[0].rollouts_missed == 5
     fleet.actors["a"].sequences.add(2**63 - 1)
     fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=1), 0.0)
     fleet.actors["a"].sequences.add(2**63 - 1)
-    assert fleet.statuses(0.0)[0].rollouts_missed < 2**63
+    assert fleet_status.page(fleet, "", 0.0)[0].rollouts_missed < 2**63
 
 
 def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
@@ -267,8 +227,102 @@ def test_statuses_are_sorted_by_actor_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
     fleet.actors["b"].accepted = 5
-    fleet.set_present("b", 1, False)
-    first, second = fleet.statuses(3.0)
+    fleet.set_present("b", 1, False, 0.0)
+    first, second = fleet_status.page(fleet, "", 3.0)
     assert (first.actor, first.alive, first.seconds_since_seen, first.environments) == ("a", True, 3.0, 3)
     assert (second.actor, second.alive, second.rollouts_accepted) == ("b", False, 5)
     assert second.rollouts_rejected == {"stale": 2}
+
+
+# ------------------------------------------------------------------------------------------ forgetting
+
+
+def test_actor_is_forgotten_a_minute_after_it_left() -> None:
+    fleet = joined_fleet("a", "b")
+    fleet.set_present("a", 1, False, 100.0)
+    fleet.forget_absent(99.0 + MINUTE)
+    assert fleet.actors.keys() == {"a", "b"}
+    fleet.forget_absent(101.0 + MINUTE)
+    assert fleet.actors.keys() == {"b"}
+    fleet.forget_absent(500.0)
+    assert fleet.actors.keys() == {"b"}  # it is present, however long it sends nothing
+
+
+def test_run_totals_do_not_fall_when_an_actor_is_forgotten() -> None:
+    fleet = joined_fleet("a", "b")
+    for name in ("a", "b"):
+        fleet.actors[name].busy = 5
+        fleet.actors[name].sequences.add(WINDOW + 1)
+    fleet.actors["b"].quarantined = "unfit"
+    expected = {"rollouts_missed": 4, "busy_answers": 10, "actors_alive": 1, "actors_quarantined": 1, "actors_gone": 0}
+    assert fleet_status.totals(fleet) == expected
+    fleet.set_present("a", 1, False, 1.0)
+    assert fleet_status.totals(fleet) == {**expected, "actors_alive": 0, "actors_gone": 1}
+    fleet.forget_absent(2.0 + MINUTE)
+    missed = 4 + WINDOW - 1  # what was missing within the window is given up
+    assert fleet_status.totals(fleet) == {**expected, "actors_alive": 0, "rollouts_missed": missed}
+
+
+def test_forgotten_incarnation_that_returns_continues_above_its_highest_sequence_number() -> None:
+    """Otherwise a rollout that is sent again would be trained on twice."""
+    fleet = joined_fleet("a")
+    for sequence in (0, 1, 4):
+        fleet.actors["a"].sequences.add(sequence)
+    seed = fleet.seed_for("a", 0)
+    fleet.set_present("a", 1, False, 0.0)
+    fleet.forget_absent(1.0 + MINUTE)
+    assert fleet.find(identity("a")) is None
+    assert attempt(fleet, "a", now=100.0) is None
+    sequences = fleet.actors["a"].sequences
+    assert [number for number in range(7) if number not in sequences] == [5, 6]
+    assert fleet.seed_for("a", 0) != seed
+
+
+def test_replaced_incarnation_never_becomes_current_again() -> None:
+    """After however many others: its rollouts of that time cannot be trained on twice."""
+    fleet = joined_fleet("a")
+    fleet.set_present("a", 1, False, 0.0)
+    for incarnation in range(2, 40):
+        assert attempt(fleet, "a", incarnation) is None
+    for incarnation in (1, 2, 38):
+        for join in (Join(actor="a", incarnation=incarnation), None):
+            refusal = fleet.join(join, 0.0) if join else attempt(fleet, "a", incarnation)
+            assert refusal is not None
+            assert refusal.code == "name_taken"
+            assert "another process has joined as 'a' since" in refusal.reason
+    assert attempt(fleet, "a", 39) is None
+    fleet.forget_absent(1.0 + MINUTE)
+    assert not fleet.actors
+    assert attempt(fleet, "a", 1, now=200.0) is not None
+
+
+def test_quarantined_incarnation_is_not_accepted_after_it_was_forgotten() -> None:
+    fleet = joined_fleet("a")
+    fleet.actors["a"].quarantined = "nonsense"
+    fleet.set_present("a", 1, False, 0.0)
+    fleet.forget_absent(1.0 + MINUTE)
+    refusal = attempt(fleet, "a", now=100.0)
+    assert refusal is not None
+    assert (refusal.code, refusal.reason) == ("malformed", "this process was quarantined: nonsense; restart it")
+    assert attempt(fleet, "a", 2, now=100.0) is None
+
+
+def test_number_of_remembered_incarnations_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(former_incarnations, "_MAX_FORMER", 10)
+    fleet = Fleet(1, None)
+    for incarnation in range(100):
+        assert attempt(fleet, "a", incarnation) is None
+    assert len(fleet._former) == 10
+
+
+# ---------------------------------------------------------------------------------------------- status
+
+
+def test_pages_of_the_status_contain_every_actor_once() -> None:
+    fleet = joined_fleet(*(f"a{number}" for number in range(250)))
+    pages, after = [], ""
+    while page := fleet_status.page(fleet, after, 0.0):
+        pages.append([status.actor for status in page])
+        after = page[-1].actor
+    assert [len(each) for each in pages] == [100, 100, 50]
+    assert [name for each in pages for name in each] == sorted(fleet.actors)

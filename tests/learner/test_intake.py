@@ -113,9 +113,9 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 
 def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
-    weights = {str(number): np.zeros(1, np.float32) for number in range(17)}
+    weights = {str(number): np.zeros(1, np.float32) for number in range(33)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    assert_rejected(harness, data, "malformed", "17 arrays, the limit is 16")
+    assert_rejected(harness, data, "malformed", "33 arrays, the limit is 32")
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -397,7 +397,7 @@ def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness,
 
 
 def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
-    harness.fleet.set_present("a", 1, False)
+    harness.fleet.set_present("a", 1, False, 0.0)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = harness.receive(encode(good()))
     assert isinstance(verdict, Rejected)
@@ -408,7 +408,7 @@ def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
 def test_rollout_is_fenced_if_its_incarnation_was_replaced_while_it_was_decoded(harness: Harness) -> None:
     content = harness.intake.read("a", encode(good()))
     assert isinstance(content, Rollout)
-    harness.fleet.set_present("a", 1, False)
+    harness.fleet.set_present("a", 1, False, 0.0)
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     verdict = harness.intake.judge("a", content, VERSION, 0.0)
     assert isinstance(verdict, Rejected)
@@ -481,7 +481,7 @@ def test_quarantine_ends_with_a_new_incarnation_but_not_with_a_second_join(harne
     harness.fleet.join(Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
     assert verdicts(harness, encode(good(rollout_identity=identity(sequence=5)))) == ["quarantined"]
     harness.fleet.join(Join(actor="a", incarnation=2, spaces=SPACES, environments=ENVIRONMENTS), 0.0)
-    harness.fleet.set_present("a", 2, True)
+    harness.fleet.set_present("a", 2, True, 0.0)
     assert harness.fleet.live == {"a", "b"}
     assert verdicts(harness, encode(good(rollout_identity=identity(incarnation=2)))) == ["accepted"]
 
@@ -508,7 +508,8 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
 
 def test_episode_length_of_0_is_rejected_as_unfit(harness: Harness) -> None:
     lengths = np.zeros_like(good().episode_lengths)
-    assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit", "episode_lengths")
+    verdict = assert_rejected(harness, encode(good(episode_lengths=lengths)), "unfit")
+    assert verdict.reason == "episode_lengths has a value below 1"
 
 
 def test_returns_of_episodes_that_did_not_end_are_rejected_as_unfit(harness: Harness) -> None:
@@ -581,16 +582,20 @@ SEQUENCES = st.one_of(st.integers(0, 6), st.integers(0, 3000), st.sampled_from([
 
 
 class Traffic(RuleBasedStateMachine):
-    """Model test with stale, duplicate, reordered and unfit rollouts, also from replaced incarnations."""
+    """Model test with stale, duplicate, reordered and unfit rollouts, also from replaced and forgotten incarnations."""
 
     def __init__(self) -> None:
         super().__init__()
         self.fleet = Fleet(1, None)
         self.intake = Intake(run_spec(rows=1, max_policy_lag=2), EPOCH, self.fleet)
         self.version = 0
+        self.now = 0.0
         self.newest = {"a": 0, "b": 0}  # the highest incarnation that joined; they count from 1
-        self.incarnations = {"a": 0, "b": 0}  # the incarnation that joined last
+        self.incarnations = {"a": 0, "b": 0}  # the current incarnation; 0: none joined, or the actor was forgotten
         self.unfit = {"a": 0, "b": 0}  # in a row, of the incarnation that joined last
+        self.remembered = {"a": 0, "b": 0}  # rollouts that were accepted since the actor was last forgotten
+        self.barred: set[tuple[str, int]] = set()  # incarnations that were replaced, or quarantined and forgotten
+        self.given_up: dict[tuple[str, int], int] = {}  # of forgotten incarnations, the highest number received
         self.taken: dict[tuple[str, int], set[int]] = {}
         self.accepted: list[tuple[str, int, int]] = []
         self.sent: list[tuple[str, Rollout]] = []  # accepted rollouts, with their senders
@@ -606,11 +611,25 @@ class Traffic(RuleBasedStateMachine):
             self._join(name, self.newest[name] - older)
 
     def _join(self, name: str, incarnation: int) -> None:
-        if self.incarnations[name] != incarnation:
-            self.unfit[name] = 0
-        self.incarnations[name] = incarnation
         join = Join(actor=name, incarnation=incarnation, spaces=TINY, environments=1)
-        assert self.fleet.join(join, 0.0) is None
+        refusal = self.fleet.join(join, self.now)
+        assert (refusal is not None) == ((name, incarnation) in self.barred)
+        previous = self.incarnations[name]
+        if refusal is not None or previous == incarnation:
+            return
+        if previous:
+            self.barred.add((name, previous))
+        self.incarnations[name], self.unfit[name] = incarnation, 0
+
+    @rule()
+    def both_actors_are_forgotten(self) -> None:
+        self.now += 100.0
+        self.fleet.forget_absent(self.now)
+        for name, incarnation in self.incarnations.items():
+            if incarnation and self.unfit[name] == 3:
+                self.barred.add((name, incarnation))
+            self.given_up[name, incarnation] = max(self.taken.get((name, incarnation), set()), default=-1)
+            self.incarnations[name] = self.remembered[name] = 0
 
     @rule()
     def learner_makes_an_update(self) -> None:
@@ -628,7 +647,7 @@ class Traffic(RuleBasedStateMachine):
     def rollout_arrives(
         self, name: str, key: str, older: int, sequence: int, lag: int, epoch: int, reward: float
     ) -> None:
-        sent = identity(name, sequence, max(self.incarnations[name] - older, 0), epoch)
+        sent = identity(name, sequence, max(self.newest[name] - older, 0), epoch)
         version = max(self.version - lag, 0)
         rewards = np.full((1, 1), reward, np.float32)
         rollout = make_rollout(sent, version=version, rows=1, environments=1, shape=(1,), rewards=rewards)
@@ -640,7 +659,7 @@ class Traffic(RuleBasedStateMachine):
         self._deliver(*data.draw(st.sampled_from(self.sent)))
 
     def _deliver(self, sender: str, rollout: Rollout) -> None:
-        verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, 0.0)
+        verdict = self.intake.judge(sender, self.intake.read(sender, encode(rollout)), self.version, self.now)
         expected = self._expected(sender, rollout)
         assert (verdict.cause if isinstance(verdict, Rejected) else "") == expected
         sent = rollout.identity
@@ -654,6 +673,7 @@ class Traffic(RuleBasedStateMachine):
             self.taken.setdefault((sent.actor, sent.incarnation), set()).add(sent.sequence)
         if isinstance(verdict, Rollout):
             self.accepted.append((sent.actor, sent.incarnation, sent.sequence))
+            self.remembered[sender] += 1
             self.sent.append((sender, rollout))
 
     def _expected(self, sender: str, rollout: Rollout) -> str:
@@ -670,7 +690,8 @@ class Traffic(RuleBasedStateMachine):
         if not np.isfinite(rollout.rewards).all():
             return "unfit"
         taken = self.taken.get((sent.actor, sent.incarnation), set())
-        if sent.sequence in taken or sent.sequence <= max(taken, default=0) - 1024:
+        given_up = self.given_up.get((sent.actor, sent.incarnation), -1)
+        if sent.sequence in taken or sent.sequence <= max(given_up, max(taken, default=0) - 1024):
             return "duplicate"
         if rollout.policy_version > self.version:
             return "unfit"
@@ -681,7 +702,7 @@ class Traffic(RuleBasedStateMachine):
         assert len(set(self.accepted)) == len(self.accepted)
         for name, actor in self.fleet.actors.items():
             assert bool(actor.quarantined) == (self.unfit[name] == 3)
-            assert actor.accepted == sum(accepted[0] == name for accepted in self.accepted)
+            assert actor.accepted == self.remembered[name]
 
 
 TestTraffic = Traffic.TestCase

@@ -196,7 +196,7 @@ def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_trainin
         assert isinstance(status, StatusReport)
         spaces = Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=2))
         join = Join(actor="hostile", incarnation=1, spaces=spaces, environments=1)
-        hostile.query(keys.join("run"), encode(join), timeout=LIMIT)
+        hostile.query(keys.join("run", "hostile"), encode(join), timeout=LIMIT)
         answer, sequence = Acknowledgement(verdict="busy"), 0
         while answer.verdict != "quarantined":
             rollout = make_rollout(

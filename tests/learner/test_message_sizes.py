@@ -59,9 +59,11 @@ def ask(transport: MemoryTransport, served: str, request: UnreadRequest) -> Mess
     return answer
 
 
-@pytest.mark.parametrize("key", [keys.join("r"), keys.snapshots("r"), keys.evaluations("r", "e")])
+@pytest.mark.parametrize(
+    "key", [keys.join("r", "a"), keys.snapshots("r"), keys.evaluations("r", "e"), keys.status("r")]
+)
 def test_oversized_query_is_refused_unread(server: ActorServer, transport: MemoryTransport, key: str) -> None:
-    served = keys.evaluations("r", "*") if "evaluations" in key else key
+    served = {"join": keys.join("r", "*"), "evaluations": keys.evaluations("r", "*")}.get(key.split("/")[2], key)
     answer = ask(transport, served, UnreadRequest(key, 400 * MIB))
     assert isinstance(answer, Refusal)
     assert answer.code == "malformed"
@@ -83,7 +85,7 @@ def test_oversized_rollout_of_an_unknown_sender_is_fenced_unread(
 
 def test_rollout_above_the_size_of_the_run_is_rejected_unread(server: ActorServer, transport: MemoryTransport) -> None:
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
-    transport.query(keys.join("r"), encode(join), timeout=1.0)
+    transport.query(keys.join("r", "a"), encode(join), timeout=1.0)
     answer = send_rollout(transport, 400 * MIB)
     assert answer.verdict == "rejected"
     assert answer.reason.startswith("the message has 419,430,400 bytes, and a rollout of this actor at most ")
@@ -95,7 +97,7 @@ def test_rollout_above_the_queue_is_rejected_with_the_setting_to_raise(
 ) -> None:
     """It fits the specification, but never the queue: after three, the actor is quarantined with this reason."""
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=4000)
-    transport.query(keys.join("r"), encode(join), timeout=1.0)
+    transport.query(keys.join("r", "a"), encode(join), timeout=1.0)
     answers = [send_rollout(transport, 75_000) for _ in range(3)]
     assert [answer.verdict for answer in answers] == ["rejected", "rejected", "quarantined"]
     assert "service.queue_megabytes allows 73,400: raise that setting" in answers[0].reason

@@ -26,7 +26,7 @@ def read(data: bytes) -> Message:
 
 def test_welcome_contains_run_epoch_specification_and_seed() -> None:
     responses, fleet = make_responses()
-    answer = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    answer = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(answer, Welcome)
     assert (answer.run, answer.learner_epoch, answer.spec) == ("run", 5, SPEC)
     assert answer.seed == fleet.seed_for("a", 0)
@@ -38,7 +38,7 @@ def test_message_that_is_not_a_join_is_refused() -> None:
         (b"\xff", "mismatch"),
         (encode(RunEnded(learner_epoch=1, outcome="finished", reason="")), "malformed"),
     ):
-        answer = read(responses.join(data, 0.0))
+        answer = read(responses.join("a", data, 0.0))
         assert isinstance(answer, Refusal)
         assert answer.code == code
     assert not fleet.actors
@@ -78,7 +78,7 @@ def test_snapshot_query_returns_refusal_then_snapshot_then_run_ended() -> None:
     assert unchanged.code == "not_ready"
     responses.end(b"run_ended", finished=True)
     assert responses.snapshot() == responses.snapshot(4) == b"run_ended"
-    late = read(responses.join(encode(Join(actor="a", incarnation=1)), 0.0))
+    late = read(responses.join("a", encode(Join(actor="a", incarnation=1)), 0.0))
     assert isinstance(late, Refusal)
     assert late.code == "finished"
 
@@ -88,7 +88,7 @@ def test_join_with_observations_too_large_for_memory_is_refused_and_fixes_no_spa
     responses, fleet = make_responses()
     huge = ArraySpace.model_construct(kind="array", shape=(2**40,), dtype="float32", frames=1)
     spaces = Spaces.model_construct(observation=huge, action=DiscreteSpace(count=2))
-    answer = read(responses.join(encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
+    answer = read(responses.join("a", encode(Join(actor="a", incarnation=1, spaces=spaces, environments=1)), 0.0))
     assert isinstance(answer, Refusal)
     assert "use at most" in answer.reason
     assert fleet.spaces is None

@@ -90,7 +90,7 @@ def test_episode_statistics_are_over_the_newest_episodes() -> None:
 def test_row_has_every_column_when_all_values_are_known() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
-    fleet.set_present("b", 1, False)
+    fleet.set_present("b", 1, False, 0.0)
     rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
     learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}

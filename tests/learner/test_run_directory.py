@@ -78,7 +78,9 @@ def test_config_toml_can_be_used_as_a_preset(tmp_path: Path) -> None:
 
 def test_new_run_directory_contains_config_and_versions(tmp_path: Path) -> None:
     run_directory.create(tmp_path / "runs" / "new", run_spec())
-    assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == ["config.toml", "versions.json"]
+    assert sorted(entry.name for entry in (tmp_path / "runs" / "new").iterdir()) == [
+        *("config.toml", "learner.lock", "versions.json")
+    ]
     versions = run_directory.read_json(tmp_path / "runs" / "new" / run_directory.VERSIONS)
     assert {"python", "torch", "numpy", "eclipse-zenoh"} <= versions.keys()
 

@@ -140,7 +140,7 @@ def test_new_policies_are_nearly_uniform() -> None:
 
 
 def test_convolutional_is_true_for_image_encoders(policy: Policy) -> None:
-    assert policy.network.convolutional == (policy.spec.encoder != "mlp")
+    assert policy.network.convolutional == (policy.spec.encoder not in ("auto", "mlp"))
 
 
 # ------------------------------------------------------------------------------------------- encoders
@@ -273,3 +273,24 @@ def test_values_near_100_that_differ_by_a_tenth_stay_distinct(mixed: bool) -> No
         logits, values = network(seen, state, starts)
     assert torch.equal(values[0], seen[0, :, 0])
     assert torch.equal(logits[0, :, 0], seen[0, :, 0])
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "encoder"),
+    [
+        ((4,), "float32", "mlp"),
+        ((128,), "uint8", "mlp"),
+        ((7, 7, 3), "uint8", "mlp"),
+        ((84, 84), "float32", "mlp"),
+        ((84, 84), "uint8", "nature"),
+        ((210, 160, 3), "uint8", "nature"),
+        ((3, 36, 64), "uint8", "nature"),
+        ((35, 84), "uint8", "impala"),
+        ((16, 16, 3), "uint8", "impala"),
+    ],
+)
+def test_encoder_is_chosen_by_the_space(shape: tuple[int, ...], dtype: str, encoder: str) -> None:
+    chosen, named = encoder_of("auto", shape, dtype), encoder_of(encoder, shape, dtype)
+    assert {name: value.shape for name, value in chosen.state_dict().items()} == {
+        name: value.shape for name, value in named.state_dict().items()
+    }

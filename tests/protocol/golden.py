@@ -12,6 +12,8 @@ from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsReport,
+    ActorsRequest,
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
@@ -30,7 +32,7 @@ from daedalus.protocol.messages import (
 )
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, RunStatus
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4
@@ -55,6 +57,25 @@ def _rollout(frames: np.ndarray) -> Rollout:
         episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
     )
 
+
+_ACTOR = ActorStatus(
+    actor="wing-1",
+    alive=True,
+    quarantined="",
+    lives=2,
+    seconds_since_seen=0.25,
+    environments=2,
+    env_steps=100,
+    env_steps_per_second=50.0,
+    rollouts_accepted=8,
+    rollouts_rejected={"stale": 2},
+    rollouts_missed=1,
+    busy_answers=3,
+    policy_lag=1,
+    compact_snapshots=True,
+    bytes_up_per_hour=7200.0,
+    bytes_down_per_hour=1.5,
+)
 
 MESSAGES: dict[str, Message] = {
     "join": Join(
@@ -126,29 +147,18 @@ MESSAGES: dict[str, Message] = {
             queue_bytes_limit=2**26,
             checkpoint_age_seconds=None,
             certificate_days_left=600.5,
+            rollouts_accepted=8,
             rollouts_rejected={"stale": 2, "unfit": 1},
-            actors=(
-                ActorStatus(
-                    actor="wing-1",
-                    alive=True,
-                    quarantined="",
-                    lives=2,
-                    seconds_since_seen=0.25,
-                    environments=2,
-                    env_steps=100,
-                    env_steps_per_second=50.0,
-                    rollouts_accepted=8,
-                    rollouts_rejected={"stale": 2},
-                    rollouts_missed=1,
-                    busy_answers=3,
-                    policy_lag=1,
-                    compact_snapshots=True,
-                    bytes_up_per_hour=7200.0,
-                    bytes_down_per_hour=1.5,
-                ),
-            ),
+            rollouts_missed=1,
+            busy_answers=3,
+            actors_alive=1,
+            actors_quarantined=2,
+            actors_gone=3,
+            actors=(_ACTOR,),
         )
     ),
+    "actors_request": ActorsRequest(after="wing-0"),
+    "actors_report": ActorsReport(page=ActorsPage(learner_epoch=9, actors=(_ACTOR,))),
 }
 
 

@@ -8,6 +8,8 @@ from wire_format import DTYPES, bits
 
 from daedalus.protocol.messages import (
     Acknowledgement,
+    ActorsReport,
+    ActorsRequest,
     CompactSnapshot,
     EvaluationReport,
     EvaluationRequest,
@@ -33,7 +35,7 @@ from daedalus.protocol.spec import (
     ServiceSpec,
     TrainingSpec,
 )
-from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.protocol.status import ActorsPage, ActorStatus, RunStatus
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)
@@ -109,6 +111,8 @@ statuses = st.builds(
     certificate_days_left=st.none() | floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), counters),
+    **dict.fromkeys(("actors_alive", "actors_quarantined", "actors_gone"), counters),
+    **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), counters),
     **dict.fromkeys(("run", "algorithm", "environment"), text),
     **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), counters),
     **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), floats),
@@ -224,5 +228,10 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
     ),
     StatusReport: st.builds(StatusReport, status=statuses),
+    ActorsRequest: st.builds(ActorsRequest, after=text),
+    ActorsReport: st.builds(
+        ActorsReport,
+        page=st.builds(ActorsPage, learner_epoch=counters, actors=st.lists(actor_statuses, max_size=3).map(tuple)),
+    ),
 }
 messages = st.one_of(*KINDS.values())

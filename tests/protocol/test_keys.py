@@ -26,7 +26,7 @@ def test_invalid_name_is_rejected(name: str) -> None:
 @given(run=names, actor=names)
 def test_keys_of_a_run_are_distinct_and_under_its_name(run: str, actor: str) -> None:
     made = [
-        keys.join(run),
+        keys.join(run, actor),
         keys.program(run, actor),
         keys.rollouts(run, actor),
         keys.evaluations(run, actor),
@@ -42,6 +42,7 @@ def test_keys_of_a_run_are_distinct_and_under_its_name(run: str, actor: str) -> 
 @offline
 @given(run=names, actor=names)
 def test_last_chunk_of_an_actors_keys_is_its_name(run: str, actor: str) -> None:
+    assert keys.last_chunk(keys.join(run, actor)) == actor
     assert keys.last_chunk(keys.rollouts(run, actor)) == actor
     assert keys.last_chunk(keys.evaluations(run, actor)) == actor
 
@@ -55,3 +56,20 @@ def test_presence_key_is_parsed(run: str, actor: str, incarnation: int) -> None:
 @pytest.mark.parametrize("life", ["", "x", "-1", "1.0", "*", "9" * 20, "\u0663"])
 def test_malformed_presence_key_gives_none(life: str) -> None:
     assert keys.parse_presence(keys.presence("r", "a", life)) is None
+
+
+@pytest.mark.parametrize(
+    ("queried", "expected"),
+    [
+        ("daedalus/r/join/a", "daedalus/r/join/a"),
+        ("daedalus/*/join/a", "daedalus/r/join/a"),
+        ("daedalus/r/join/*", "daedalus/r/join/*"),
+        ("daedalus/$*/join/a", "daedalus/r/join/a"),
+        ("daedalus/**", "daedalus/r/join/*"),
+        ("daedalus/**/join/a", "daedalus/r/join/a"),
+        ("**", "daedalus/r/join/*"),
+    ],
+)
+def test_intersection_takes_the_chunks_that_are_not_wildcards(queried: str, expected: str) -> None:
+    """Whatever a stranger queries, it must not raise: that would end the learner."""
+    assert keys.intersection("daedalus/r/join/*", queried) == expected

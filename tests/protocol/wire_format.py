@@ -104,6 +104,8 @@ STATUS = wire(  # every field of a status, as another implementation could write
                 **dict.fromkeys(("learner_epoch", "env_steps", "env_steps_budget", "updates"), 1),
                 **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second"), 1.0),
                 "policy_lag_mean": 0.0,
+                **dict.fromkeys(("actors_alive", "actors_quarantined", "actors_gone"), 0),
+                **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), 0),
                 **dict.fromkeys(("updates_skipped", "queue_bytes", "queue_bytes_limit"), 0),
                 **dict.fromkeys(("episode_return_mean", "checkpoint_age_seconds", "certificate_days_left")),
                 "problems": [],

@@ -74,7 +74,8 @@ class _Worker:
                 pass
             except BaseException as error:
                 kernel.fail(error)
-            sys.settrace(None)
+            if kernel.fine_files:
+                sys.settrace(None)
             self.task = self.kernel = None  # type: ignore[assignment]
             _Worker.idle.append(self)
             kernel.finish(task)
@@ -91,10 +92,10 @@ class Kernel:
           preemption: probability that a thread is interrupted where it meets a lock or the network.
           fine_files: source files in which a thread is interrupted at any line, with a tenth of that probability.
         """
-        self.random, self.now = random, 0.0
+        self.random, self.now, self.preemption = random, 0.0, preemption
+        self.chance = random.random
         self.fine_files = fine_files
         self.failure: BaseException | None = None
-        self._preemption = preemption
         self._events: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._event_count = self._steps = 0
         self._ready: list[Task] = []
@@ -153,15 +154,20 @@ class Kernel:
             task.parked, task.woken = False, True
             self.enqueue(task)
 
-    def preempt(self, rarity: float = 1.0) -> None:
-        """Perhaps let other threads run first, for no time or for a short one."""
+    def perhaps_preempt(self, rarity: float = 1.0) -> None:
+        """Let other threads run first, with the probability of a preemption."""
+        if self.preemption and self.chance() < self.preemption / rarity:
+            self.preempt()
+
+    def preempt(self) -> None:
+        """Let other threads run first, for no time or for a short one."""
         task = self.current
         if task.killed:
             raise Killed
-        if task.lock is None or task.process is None or self.random.random() >= self._preemption / rarity:
+        if task.lock is None or task.process is None:
             return
-        if self.random.random() < 0.2:
-            self.park(self.random.random() * _SLOW_SECONDS)
+        if self.chance() < 0.2:
+            self.park(self.chance() * _SLOW_SECONDS)
             return
         self.enqueue(task)
         self._switch(task)
@@ -172,7 +178,7 @@ class Kernel:
 
     def _trace_line(self, _frame: FrameType, event: str, _argument: Any) -> Any:
         if event == "line" and not self.current.killed:
-            self.preempt(_LINE_RARITY)
+            self.perhaps_preempt(_LINE_RARITY)
         return self._trace_line
 
     def enqueue(self, task: Task) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from daedalus.protocol import keys
 from daedalus.transport.interface import Inbox, OnAnswer, Request, TransportError
 
 from .network import Network, matches
@@ -98,7 +99,7 @@ class Link:
     # ---------------------------------------------------------------------------------------------- Transport
 
     def _enter(self, operation: str) -> None:
-        self.network.kernel.preempt()
+        self.network.kernel.perhaps_preempt()
         if not self.alive:
             raise TransportError("the session is closed")
         if not self.passes() and self.network.chance(self.network.weather.refused):
@@ -165,7 +166,7 @@ class Link:
                 if network.chance(network.weather.noticed):
                     kernel.after(kernel.random.random(), query.finish, None)
                 continue
-            request = LinkRequest(server, query, key if "*" in served else served, payload)
+            request = LinkRequest(server, query, keys.intersection(served, key), payload)
             request.finds_others = finds_others
             self.send(self._arrive, request, served, server.session)
 

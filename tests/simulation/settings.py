@@ -6,10 +6,12 @@ from random import Random
 from daedalus.protocol.keys import ANY_RUN
 from daedalus.protocol.spec import RunSpec
 
+from . import codec
 from .actors import ActorSettings
 from .network import Weather
 
 RUN = "r"
+_MORE_ACTORS = 2  # may join later
 FAULTS = (
     "kill actor",
     "stop actor",
@@ -40,7 +42,7 @@ class Settings:
     weather: Weather  # before the network is healed
     faulty_seconds: float
     faults: tuple[tuple[float, str, float], ...]  # when, which, for how long
-    actors: tuple[ActorSettings, ...]  # two more than start
+    actors: tuple[ActorSettings, ...]  # `_MORE_ACTORS` more than start
     train_seconds: float  # of one batch
     checkpoint_seconds: float
     ends_by: str  # finish or stop
@@ -54,7 +56,7 @@ def draw(seed: int) -> Settings:
     """Return the settings of a seed."""
     random = Random(seed)
     real_codec = random.random() < 0.05
-    spec = _spec(random, small_queue=0.004 if real_codec else 0.0002)
+    spec = _spec(random, message_bytes=1000 if real_codec else codec.SIZE)
     faulty = random.uniform(1.0, 12.0)
     collect = random.choice((0.1, 0.5, 1.0))
     return Settings(
@@ -64,7 +66,7 @@ def draw(seed: int) -> Settings:
         weather=_weather(random),
         faulty_seconds=faulty,
         faults=_faults(random, faulty),
-        actors=tuple(_actor(random, spec, collect) for _ in range(spec.collection.actors + 2)),
+        actors=tuple(_actor(random, spec, collect) for _ in range(spec.collection.actors + _MORE_ACTORS)),
         train_seconds=random.choice((0.0, 0.01, 0.1, 0.5)),
         checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
@@ -85,21 +87,23 @@ def _actor(random: Random, spec: RunSpec, seconds: float) -> ActorSettings:
     )
 
 
-def _spec(random: Random, small_queue: float) -> RunSpec:
+def _spec(random: Random, message_bytes: int) -> RunSpec:
     actors = random.choice((1, 2, 2, 3))
+    most = actors + _MORE_ACTORS
     algorithm = random.choice(("a2c", "a2c", "a3c", "impala", "appo"))
     window = random.randint(1, 4)
     training: dict[str, object] = {"algorithm": algorithm, "passes": 1, "minibatches": 2, "env_steps": 10**9}
     if algorithm in ("impala", "appo"):
         training["batch_rollouts"] = random.choice((None, 1, 2, 3))
     if algorithm != "a2c" and random.random() < 0.5:
-        training["max_policy_lag"] = random.choice((2, 4)) * actors * window
+        # Large enough for every actor: where the learner is the bottleneck, all rollouts in flight wait in a queue.
+        training["max_policy_lag"] = random.choice((2, 4)) * most * window
     return RunSpec.model_validate(
         {
             "environment": {"id": "simulated"},
             "collection": {"actors": actors, "envs_per_actor": 1, "rollout_length": 1, "window": window},
             "training": training,
-            "service": {"queue_megabytes": random.choice((64.0, small_queue))},
+            "service": {"queue_megabytes": random.choice((64.0, 2 * most * message_bytes / 2**20))},
         }
     )
 

@@ -47,7 +47,7 @@ def address(certificates: Path) -> Iterator[str]:
     where, router = listen_somewhere(certificates / "router")
     with closing(router), closing(connect([where], load(certificates / "learner", "learner"))) as learner:
         for key in (
-            keys.join("r"),
+            keys.join("r", "*"),
             keys.rollouts("r", "*"),
             keys.evaluations("r", "*"),
             keys.program("r", "*"),
@@ -89,7 +89,7 @@ class Scene:
         inbox = other.subscribe(key, lambda: news.append(inbox.take() or b""))
         self.until_heard(lambda: self.learner.publish(key, b"first"), lambda: b"first" in news)
         end.publish(key, b"second")
-        end.query(keys.join("r"), timeout=DENIED_SECONDS)  # returns after everything sent before has arrived
+        end.query(keys.join("r", self.name), timeout=DENIED_SECONDS)  # returns after everything sent before has arrived
         self.until_heard(lambda: self.learner.publish(key, b"third"), lambda: b"third" in news)
         return b"second" in news
 
@@ -109,7 +109,19 @@ class Scene:
 
 
 def joins(scene: Scene) -> bool:
-    return scene.answered(keys.join("r")) and scene.answered(keys.join("*")) and scene.answered(keys.program("r", "*"))
+    queried = [keys.join("r", scene.name), keys.join("*", scene.name), keys.program("r", "*")]
+    return all(scene.answered(key) for key in queried)
+
+
+def joins_as_another(scene: Scene) -> bool:
+    return any(scene.answered(keys.join(run, name)) for run in ("r", "*") for name in others(scene))
+
+
+def others(scene: Scene) -> list[str]:
+    """Return names that are not the owner's, though some look like it."""
+    own = scene.name.partition(".")[0]
+    other = "arm" if own == "box" else "box"
+    return [other, f"{own}x", f"{other}.{own}", "*"]
 
 
 def uploads_as_itself(scene: Scene) -> bool:
@@ -117,10 +129,8 @@ def uploads_as_itself(scene: Scene) -> bool:
 
 
 def uploads_as_another(scene: Scene) -> bool:
-    own = scene.name.partition(".")[0]
-    other = "arm" if own == "box" else "box"
-    keys_of_others = [keys.rollouts("r", name) for name in (other, f"{own}x", f"{other}.{own}", "*")]
-    return any(scene.answered(key) for key in [*keys_of_others, keys.evaluations("r", other)])
+    queried = [key_of("r", name) for key_of in (keys.rollouts, keys.evaluations) for name in others(scene)]
+    return any(scene.answered(key) for key in queried)
 
 
 def reads_publications(scene: Scene) -> bool:
@@ -136,9 +146,9 @@ def publishes(scene: Scene) -> bool:
 
 
 def answers_joins(scene: Scene) -> bool:
-    scene.own.serve(keys.join("fake"), lambda request: request.reply(b"come to me"))
-    scene.own.query(keys.join("r"), timeout=DENIED_SECONDS)
-    return scene.actor.query(keys.join("fake"), timeout=DENIED_SECONDS) == [b"come to me"]
+    scene.own.serve(keys.join("fake", "*"), lambda request: request.reply(b"come to me"))
+    scene.own.query(keys.join("r", scene.name), timeout=DENIED_SECONDS)
+    return scene.actor.query(keys.join("fake", "box"), timeout=DENIED_SECONDS) == [b"come to me"]
 
 
 def watches_presence(scene: Scene) -> bool:
@@ -148,7 +158,7 @@ def watches_presence(scene: Scene) -> bool:
     scene.learner.watch_presence(keys.presence("r", "*", "*"), lambda key, _: sure.append(key))
     scene.actor.declare_presence(keys.presence("r", "box", 7))
     scene.until_heard(lambda: None, lambda: bool(sure))
-    scene.own.query(keys.join("r"), timeout=DENIED_SECONDS)
+    scene.own.query(keys.join("r", scene.name), timeout=DENIED_SECONDS)
     time.sleep(0.1)
     return bool(seen)
 
@@ -163,6 +173,7 @@ def drains(scene: Scene) -> bool:
 
 OPERATIONS = (
     joins,
+    joins_as_another,
     uploads_as_itself,
     uploads_as_another,
     reads_publications,

@@ -1,0 +1,54 @@
+"""Queries for the status of learners: the state of each run, then its actors page by page."""
+
+import time
+
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import STATUS_LIMITS
+from daedalus.protocol.messages import ActorsReport, ActorsRequest, StatusReport
+from daedalus.protocol.status import ActorStatus, RunStatus
+from daedalus.transport.interface import Transport
+
+_ANSWER_SECONDS = 5.0
+_PAGES_SECONDS = 3.0  # for all pages of a run
+
+
+def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None = None) -> list[RunStatus]:
+    """Return the status of each learner that answers within 5 s. Raises TransportError or ProtocolError.
+
+    Args:
+      transport: the network.
+      run: name of the run, or `*` for all runs.
+      max_actors: the number of actors of each run after which no further page is fetched; None: all actors.
+    """
+    answers = transport.query(keys.status(run), timeout=_ANSWER_SECONDS)
+    reports = [decode(answer, STATUS_LIMITS) for answer in answers]
+    statuses = [report.status for report in reports if isinstance(report, StatusReport)]
+    return [_with_actors(transport, status, max_actors) for status in statuses]
+
+
+def fleet_size(status: RunStatus) -> int:
+    """Return the number of actors of a run, on whatever page they are."""
+    return status.actors_alive + status.actors_quarantined + status.actors_gone
+
+
+def _with_actors(transport: Transport, status: RunStatus, max_actors: int | None) -> RunStatus:
+    """Return the status with the actors of the further pages, as far as the learner answers in time."""
+    actors, deadline = list(status.actors), time.monotonic() + _PAGES_SECONDS
+    wanted = fleet_size(status) if max_actors is None else min(fleet_size(status), max_actors)
+    while actors and len(actors) < wanted and time.monotonic() < deadline:
+        more = _page(transport, status, actors[-1].actor)
+        if not more:
+            break
+        actors += more
+    return status.model_copy(update={"actors": tuple(actors)})
+
+
+def _page(transport: Transport, status: RunStatus, after: str) -> tuple[ActorStatus, ...]:
+    """Return the actors whose names come next; none without an answer, or if another learner has replaced this one."""
+    request = encode(ActorsRequest(after=after))
+    for answer in transport.query(keys.status(status.run), request, timeout=_ANSWER_SECONDS):
+        report = decode(answer, STATUS_LIMITS)
+        if isinstance(report, ActorsReport) and report.page.learner_epoch == status.learner_epoch:
+            return report.page.actors
+    return ()

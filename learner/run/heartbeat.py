@@ -1,0 +1,59 @@
+"""The heartbeat file of a run directory: shows a probe on the same machine whether the learner still works.
+
+It depends neither on the network nor on the number of actors. It holds the time on the monotonic clock, which all
+processes of a machine share until it restarts, and which nobody sets.
+"""
+
+import contextlib
+import os
+import time
+from pathlib import Path
+
+HEARTBEAT = "heartbeat"
+_BEAT_SECONDS = 1.0
+_MAX_SILENCE_SECONDS = 120.0  # longer than one update or one checkpoint takes
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+class Heartbeat:
+    """Writer of the heartbeat file of one learner process. For the thread that trains."""
+
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / HEARTBEAT
+        self._due = 0.0
+
+    def clear(self) -> None:
+        """Remove the file, at the start and at the end of the process: without a file, nothing is wrong."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def beat(self) -> None:
+        """Renew the file, once a second at most. An error has no effect but that the heartbeat grows old."""
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = now + _BEAT_SECONDS
+        with contextlib.suppress(OSError):
+            file = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o644)  # not cut: a full disk has no room for more
+            try:
+                os.pwrite(file, f"{now:017.3f} {_boot()}\n".encode(), 0)
+            finally:
+                os.close(file)
+
+
+def silence(directory: Path) -> float | None:
+    """Return for how many seconds the learner of a run has been silent, or None if that is no reason for concern."""
+    try:
+        at, boot = (directory / HEARTBEAT).read_text().split()
+        age = time.monotonic() - float(at)
+    except (OSError, ValueError):  # the learner is starting, or the file is being written
+        return None
+    return age if age > _MAX_SILENCE_SECONDS and boot == _boot() else None
+
+
+def _boot() -> str:
+    """Return what identifies this start of the machine."""
+    try:
+        return _BOOT.read_text().strip()
+    except OSError:
+        return "-"

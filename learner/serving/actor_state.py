@@ -1,0 +1,88 @@
+"""State of one actor: its current incarnation, counts and rates. No I/O, no threads."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from daedalus.learner.serving.sequence_window import SequenceWindow
+
+_MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
+_MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
+_FINITE_AGAIN = 100  # rollouts in a row with finite gradients, after which those before no longer count
+
+
+@dataclass(slots=True)
+class Actor:
+    """State of one actor; the counts are over all its incarnations."""
+
+    name: str
+    lives_before: int = 0  # a number that is different after an actor of this name was forgotten
+    incarnation: int = -1  # the newest; -1 before the first Join
+    incarnations: int = 0  # number of incarnations that joined
+    environments: int = 0  # 0 before the actor has joined with its spaces
+    last_seen: float = 0.0
+    sequences: SequenceWindow = field(default_factory=SequenceWindow)  # of the newest incarnation
+    accepted: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+    busy: int = 0  # number of `busy` answers
+    missed_earlier: int = 0  # rollouts of earlier incarnations that never arrived
+    consecutive_unfit: int = 0  # rollouts that violate the specification
+    non_finite: int = 0  # rollouts without a finite gradient
+    finite_in_a_row: int = 0  # rollouts that were trained on since
+    quarantined: str = ""  # the reason, if the newest incarnation is quarantined
+    drained: bool = False  # whether an operator asked the newest incarnation to leave
+    env_steps: int = 0
+    env_steps_per_second: float = 0.0
+    policy_lag: int = 0  # of the newest rollout
+    fetches: bool = False  # whether the actor requests its snapshots instead of subscribing
+    compact_snapshots: bool = False  # whether it requests compact snapshots
+    received_bytes: int = 0  # rollouts, accepted or not
+    answered_bytes: int = 0  # requested snapshots
+    bytes_up_per_hour: float = 0.0
+    bytes_down_per_hour: float = 0.0
+
+    @property
+    def lives(self) -> int:
+        """Number that is different for each incarnation of this name."""
+        return self.incarnations + (self.lives_before << 32)
+
+    @property
+    def missed(self) -> int:
+        """Number of rollouts that never arrived."""
+        return min(self.missed_earlier + self.sequences.gaps, 2**53)
+
+    def count_unfit(self, violation: str) -> None:
+        """Count a rollout that violates the specification. Quarantine the actor after three in a row.
+
+        Only consecutive rollouts count: an occasional failure of a simulator does not exclude the actor.
+        """
+        self.consecutive_unfit += 1
+        if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
+            self.quarantined = f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}"
+
+    def count_trained(self, *, finite: bool) -> None:
+        """Count a rollout that was trained on. Quarantine the actor if several had no finite gradient.
+
+        Unlike a rejected rollout, such a rollout costs the learner much time. Therefore it takes many good ones to make
+        up for it.
+        """
+        if finite:
+            self.finite_in_a_row += 1
+            if self.finite_in_a_row >= _FINITE_AGAIN:
+                self.non_finite = 0
+            return
+        self.rejected["non_finite"] += 1
+        self.non_finite, self.finite_in_a_row = self.non_finite + 1, 0
+        if self.non_finite >= _MAX_NON_FINITE:
+            self.quarantined = (
+                f"{self.non_finite} of its rollouts had no finite gradient: its observations or rewards are too large"
+            )
+
+    def start_incarnation(self, incarnation: int, next_sequence: int = 0) -> None:
+        """Set the newest incarnation, without quarantine; its sequence numbers below `next_sequence` were received."""
+        self.sequences.give_up()
+        self.missed_earlier = self.missed
+        self.incarnation, self.sequences = incarnation, SequenceWindow(low=next_sequence)
+        self.incarnations += 1
+        self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
+        self.quarantined, self.drained = "", False
+        self.fetches = self.compact_snapshots = False

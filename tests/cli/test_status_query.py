@@ -1,0 +1,193 @@
+"""cli/status_query.py against the server of a learner: fleets of any size."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from building import EPOCH, SPACES, run_spec
+from statuses import actor_status, run_status
+
+from daedalus.cli.commands.exporter import StatusCollector
+from daedalus.cli.commands.status import status as status_command
+from daedalus.cli.status_query import ask, fleet_size
+from daedalus.learner.reporting import report
+from daedalus.learner.run import heartbeat
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import STATUS_LIMITS, STATUS_REQUEST_LIMITS
+from daedalus.protocol.messages import ActorsReport, ActorsRequest, Join, Message, Refusal, StatusReport
+from daedalus.protocol.status import PAGE_ACTORS, ActorsPage, RunStatus
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+MANY = 905
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daedalus.cli.status_query._PAGES_SECONDS", 100.0)
+
+
+@pytest.fixture
+def operator() -> MemoryTransport:
+    return MemoryTransport(MemoryNetwork())
+
+
+@pytest.fixture
+def server(operator: MemoryTransport) -> Iterator[ActorServer]:
+    """Server with many actors, half of which are present."""
+    spec, counters = run_spec(), RunCounters(10)
+    health = report.Health(started=0.0, updated=0.0, actor_seen=0.0)
+
+    def status() -> RunStatus:
+        return report.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)
+
+    transport = MemoryTransport(operator._network)
+    opened = ActorServer("r", spec, transport, counters, status, learner_epoch=EPOCH, start_version=0, spaces=SPACES)
+    opened.open()
+    for number in range(MANY):
+        join = Join(actor=f"pod-{number}", incarnation=1, spaces=SPACES, environments=1)
+        assert opened.fleet.join(join, 0.0) is None
+        opened.fleet.set_present(join.actor, 1, number % 2 == 0, 0.0)
+        opened.fleet.actors[join.actor].quarantined = "x" * 500 if number == 2 else ""
+    yield opened
+    opened.close("the test is over")
+
+
+def query(operator: MemoryTransport, payload: bytes) -> Message:
+    (answer,) = operator.query(keys.status("r"), payload, timeout=1.0)
+    return decode(answer, STATUS_LIMITS)
+
+
+def test_status_contains_every_actor_of_a_large_fleet(server: ActorServer, operator: MemoryTransport) -> None:
+    """The status of so many actors once exceeded the reader's limit, and Kubernetes restarted the learner."""
+    (status,) = ask(operator)
+    assert [actor.actor for actor in status.actors] == sorted(server.fleet.actors)
+    assert (status.actors_alive, status.actors_quarantined, status.actors_gone) == (452, 1, 452)
+    assert fleet_size(status) == MANY
+
+
+def test_number_of_fetched_actors_can_be_limited(server: ActorServer, operator: MemoryTransport) -> None:
+    assert [len(ask(operator, max_actors=most)[0].actors) for most in (0, 100, 101)] == [100, 100, 200]
+
+
+def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer, operator: MemoryTransport) -> None:
+    names = sorted(server.fleet.actors)
+    report = query(operator, b"")
+    assert isinstance(report, StatusReport)
+    assert [actor.actor for actor in report.status.actors] == names[:PAGE_ACTORS]
+    for name in (names[5], names[PAGE_ACTORS - 1]):
+        del server.fleet.actors[name]
+    more = query(operator, encode(ActorsRequest(after=names[PAGE_ACTORS - 1])))
+    assert isinstance(more, ActorsReport)
+    assert [actor.actor for actor in more.page.actors] == names[PAGE_ACTORS : 2 * PAGE_ACTORS]
+
+
+def test_page_after_the_last_actor_is_empty(server: ActorServer, operator: MemoryTransport) -> None:
+    report = query(operator, encode(ActorsRequest(after="zzz")))
+    assert isinstance(report, ActorsReport)
+    assert report.page == ActorsPage(learner_epoch=EPOCH, actors=())
+
+
+@pytest.mark.parametrize("payload", [b"x", encode(Join(actor="a", incarnation=1)), b"x" * 5000])
+def test_invalid_request_is_refused(server: ActorServer, operator: MemoryTransport, payload: bytes) -> None:
+    answer = query(operator, payload)
+    assert isinstance(answer, Refusal)
+    assert answer.code == "malformed"
+
+
+def test_pages_of_a_learner_that_replaced_the_first_are_left_out(operator: MemoryTransport) -> None:
+    first = tuple(actor_status(f"a{number:03}") for number in range(PAGE_ACTORS))
+    status = encode(StatusReport(status=run_status(run="r", actors=first, actors_alive=500)))
+    other = encode(ActorsReport(page=ActorsPage(learner_epoch=2, actors=(actor_status("b"),))))
+    learner = MemoryTransport(operator._network)
+    learner.serve(keys.status("r"), lambda request: request.reply(other if request.size else status))
+    assert len(ask(operator)[0].actors) == PAGE_ACTORS
+
+
+def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
+    causes = ("unknown_actor", "quarantined", "malformed", "duplicate", "non_finite", "surplus", "epoch", "stale")
+    largest = 2**62
+    actor = actor_status(
+        "n" * 64,
+        quarantined="\N{EM DASH}" * 300,
+        lives=largest,
+        env_steps=largest,
+        rollouts_accepted=largest,
+        rollouts_rejected=dict.fromkeys(causes, largest),
+        rollouts_missed=largest,
+        busy_answers=largest,
+        policy_lag=largest,
+    )
+    data = encode(ActorsReport(page=ActorsPage(learner_epoch=largest, actors=(actor,) * PAGE_ACTORS)))
+    assert isinstance(decode(data, STATUS_LIMITS), ActorsReport)
+    decode(encode(ActorsRequest(after="n" * 64)), STATUS_REQUEST_LIMITS)
+
+
+def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
+    server: ActorServer,
+    operator: MemoryTransport,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 200)
+    collector = StatusCollector()
+    collector.transport = operator
+    samples = []
+    for _ in range(2):
+        samples = [sample for family in collector.collect() for sample in family.samples]
+    counts = {sample.labels["state"]: sample.value for sample in samples if sample.name == "daedalus_actors"}
+    assert counts == {"alive": 452, "quarantined": 1, "gone": 452}
+    series = {sample.labels["actor"] for sample in samples if "actor" in sample.labels}
+    present = [name for name in sorted(server.fleet.actors)[:200] if int(name[4:]) % 2 == 0]
+    assert series == set(present)
+    (warning,) = caplog.messages
+    assert "has 905 actors: 200 of them have metrics of their own" in warning
+
+
+# -------------------------------------------------------------------------------------------- --alive
+
+
+def test_alive_depends_on_the_age_of_the_heartbeat_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 5000.0
+    monkeypatch.setattr(heartbeat, "time", SimpleNamespace(monotonic=lambda: now))
+    alive, beating = ["--alive", str(tmp_path)], heartbeat.Heartbeat(tmp_path)
+    assert status_command(alive) == 0  # the learner is starting
+    beating.beat()
+    now += 119.0
+    assert status_command(alive) == 0
+    assert capsys.readouterr() == ("", "")
+    now += 2.0
+    assert status_command(alive) == 1
+    assert capsys.readouterr().err == f"daedalus status: the learner of {tmp_path} has been silent for 121 s\n"
+    beating.beat()
+    assert status_command(alive) == 0
+    now += 121.0
+    monkeypatch.setattr(heartbeat, "_BOOT", tmp_path / "missing")
+    assert status_command(alive) == 0  # the file is of before the machine restarted
+    monkeypatch.undo()
+    beating.clear()
+    assert status_command(alive) == 0
+
+
+@pytest.mark.parametrize("content", ["", "x", "12 y z", "nan -"])
+def test_unreadable_heartbeat_is_no_reason_for_a_restart(tmp_path: Path, content: str) -> None:
+    (tmp_path / heartbeat.HEARTBEAT).write_text(content)
+    assert status_command(["--alive", str(tmp_path)]) == 0
+
+
+def test_heartbeat_that_cannot_be_written_does_not_raise(tmp_path: Path) -> None:
+    missing = heartbeat.Heartbeat(tmp_path / "missing")
+    missing.beat()
+    missing.clear()
+
+
+def test_address_and_alive_exclude_one_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in ([], ["--alive", str(tmp_path), "--connect", "tcp/127.0.0.1:1"]):
+        with pytest.raises(SystemExit):
+            status_command(arguments)
+    assert "--alive" in capsys.readouterr().err
