@@ -29,7 +29,7 @@ def provide_environment(folder: Path) -> None:
     shutil.copy(_FILE, folder)
 
 
-def play(address: str, number: int, link: LinkChoice, delay: float, stop: threading.Event) -> None:
+def play(address: str, name: str, link: LinkChoice, delay: float, stop: threading.Event) -> None:
     """Run one actor."""
     if stop.wait(delay):
         return
@@ -38,7 +38,7 @@ def play(address: str, number: int, link: LinkChoice, delay: float, stop: thread
         return
     try:
         config = ActorConfig(
-            name=f"actor-{number}",
+            name=name,
             incarnation=secrets.randbits(62),
             link=link,
             modules=UserModules(allowed=frozenset({MODULE})),
@@ -55,13 +55,20 @@ def main() -> int:
     options.add_argument("address")
     options.add_argument("count", type=int)
     options.add_argument("--link", choices=("auto", "lan", "wan"), default="auto")
+    options.add_argument("--prefix", default="actor", help="of the names")
     options.add_argument("--stagger", type=float, default=0.0, metavar="SECONDS")
     parsed = options.parse_args()
     sys.path.insert(0, "")
     stop, choose = stop_on_signals(), random.Random(1)
     threads = []
     for number in range(parsed.count):
-        arguments = (parsed.address, number, parsed.link, choose.uniform(0.0, parsed.stagger), stop)
+        arguments = (
+            parsed.address,
+            f"{parsed.prefix}-{number}",
+            parsed.link,
+            choose.uniform(0.0, parsed.stagger),
+            stop,
+        )
         threads.append(threading.Thread(target=play, args=arguments, daemon=True))
         threads[-1].start()
     for thread in threads:

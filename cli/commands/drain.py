@@ -10,6 +10,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Refusal
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.connecting import connect
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -60,46 +61,69 @@ def drain(arguments: list[str]) -> int:
     try:
         transport = connect(parsed.connect, credentials)
         try:
-            for name in names:
-                _request(transport, _runs_with(transport, parsed.run, name), name)
-            _await_departures(transport, parsed.run, set(names), parsed.timeout)
+            drain_actors(transport, parsed.run, names, parsed.timeout)
         finally:
             transport.close()
     except (TransportError, ProtocolError, DrainError) as error:
         print(f"daedalus drain: {error}", file=sys.stderr)
         return FAILED
+    except KeyboardInterrupt:
+        print("daedalus drain: interrupted; the requests remain in force", file=sys.stderr)
+        return FAILED
     return LEFT
 
 
-def _runs_with(transport: Transport, run: str, name: str) -> list[str]:
-    """Return the runs, `run` or any, that an actor takes part in. Raises DrainError if there is none."""
+def drain_actors(transport: Transport, run: str, names: list[str], timeout: float | None) -> None:
+    """Ask actors to leave, and wait until they have left.
+
+    Raises DrainError, TransportError or ProtocolError.
+
+    Args:
+      transport: the network.
+      run: name of the run, or `*` for all runs.
+      names: names of the actors.
+      timeout: seconds to wait until they have left; None: no limit.
+    """
+    epochs: set[int] = set()  # of the learners that accepted
+    for name in names:
+        for status in _statuses_with(transport, run, name):
+            _request(transport, status.run, name)
+            epochs.add(status.learner_epoch)
+    _await_departures(transport, run, epochs, set(names), timeout)
+
+
+def _statuses_with(transport: Transport, run: str, name: str) -> list[RunStatus]:
+    """Return the statuses of the runs that an actor takes part in. Raises DrainError if there is none."""
     statuses = ask(transport, run)
     if not statuses:
         raise DrainError("no learner answers at this address: is a learner running?")
-    runs = [each.run for each in statuses if any(actor.actor == name and actor.alive for actor in each.actors)]
-    if not runs:
+    found = [each for each in statuses if any(actor.actor == name and actor.alive for actor in each.actors)]
+    if not found:
         raise DrainError(f"no actor {name!r} takes part: `daedalus status` lists them")
-    return runs
+    return found
 
 
-def _request(transport: Transport, runs: list[str], name: str) -> None:
-    """Ask the learners of `runs` to drain an actor. Raises DrainError if one does not accept the request."""
-    for run in runs:
-        for answer in transport.query(keys.drain(run, name), timeout=_ANSWER_SECONDS):
-            message = decode(answer, ACKNOWLEDGEMENT_LIMITS)
-            if isinstance(message, Refusal):
-                raise DrainError(message.reason)
-            print(f"actor {name} leaves run {run!r} after its current rollout", flush=True)
+def _request(transport: Transport, run: str, name: str) -> None:
+    """Ask the learner of a run to drain an actor. Raises DrainError if the learner does not accept the request."""
+    answers = transport.query(keys.drain(run, name), timeout=_ANSWER_SECONDS)
+    if not answers:
+        raise DrainError(f"the learner of run {run!r} does not answer: run this command again")
+    for answer in answers:
+        message = decode(answer, ACKNOWLEDGEMENT_LIMITS)
+        if isinstance(message, Refusal):
+            raise DrainError(message.reason)
+    print(f"actor {name} leaves run {run!r} after its current rollout", flush=True)
 
 
-def _await_departures(transport: Transport, run: str, names: set[str], timeout: float | None) -> None:
-    """Wait until no actor of these names is alive. Raises DrainError after `timeout` seconds."""
+def _await_departures(transport: Transport, run: str, epochs: set[int], names: set[str], timeout: float | None) -> None:
+    """Wait until no actor of these names is alive. Raises DrainError after `timeout` seconds, or without a learner."""
     deadline = None if timeout is None else time.monotonic() + timeout
     while True:
-        statuses = ask(transport, run)
-        if not statuses:
-            raise DrainError("the learner went away: it is not known whether the actors have left")
-        alive = {actor.actor for each in statuses for actor in each.actors if actor.alive}
+        statuses = [status for status in ask(transport, run) if status.learner_epoch in epochs]
+        if {status.learner_epoch for status in statuses} != epochs:
+            there = ", ".join(sorted(names))
+            raise DrainError(f"the learner ended or was restarted; run this command again if needed for: {there}")
+        alive = {actor.actor for status in statuses for actor in status.actors if actor.alive}
         for name in sorted(names - alive):
             print(f"actor {name} has left", flush=True)
         names &= alive
