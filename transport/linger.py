@@ -6,43 +6,43 @@ would forward nothing for 20 s. Without the option the operating system closes s
 """
 
 import contextlib
+import functools
 import os
 import socket
 import struct
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 _DESCRIPTORS = Path("/dev/fd")  # of this process
 _LINGER = struct.Struct("ii")  # whether close() waits, and for how many seconds
 _ZENOHS_LINGER = _LINGER.pack(1, 10)
-_PAUSE_SECONDS = 0.1  # so that many connections that are opened at the same time are found together
+_PAUSE_SECONDS = 0.5  # so that many connections that are opened at the same time are found together
 
 
 class LingerRemoval:
-    """Removal of the option from every connection of one transport, from `open` to `close`. Has its own thread."""
+    """Removal of the option from every connection of this process. Has its own thread, which never ends."""
 
     def __init__(self) -> None:
-        self._changed, self._closed = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._remove_repeatedly, name="linger removal", daemon=True)
-
-    def open(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop the thread."""
-        self._closed.set()
-        self._changed.set()
+        self._changed = threading.Event()
+        threading.Thread(target=self._remove_repeatedly, name="linger removal", daemon=True).start()
 
     def connections_changed(self, *_: Any) -> None:
         """Note that a connection was opened. From any thread."""
         self._changed.set()
 
     def _remove_repeatedly(self) -> None:
-        while self._changed.wait() and not self._closed.wait(_PAUSE_SECONDS):
+        while self._changed.wait():
+            time.sleep(_PAUSE_SECONDS)
             self._changed.clear()
             remove_linger()
+
+
+@functools.cache
+def linger_removal() -> LingerRemoval:
+    """Return the one of this process."""
+    return LingerRemoval()
 
 
 def remove_linger() -> None:
