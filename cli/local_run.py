@@ -17,6 +17,7 @@ from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.private_address import private_address
 
@@ -51,6 +52,9 @@ class LocalRun:
     started: float  # on the monotonic clock; the seconds of the run count from this time
     lock: tuple[int, ...] = ()  # descriptor of the run's lock, which the learner inherits and holds as long as it lives
     resume: bool = False
+    trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
+    spaces: Spaces | None = None  # of the environment, if it was checked
+    init_from: Path | None = None  # another run, whose weights the learner begins with
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
     insecure: bool = False
@@ -82,7 +86,7 @@ def run_locally(
     Raises RunFailedError or RunStoppedError.
     """
     try:
-        status = _train(run, stopping, output, learner_streams)
+        status = _train(run, stopping, output, learner_streams) if run.trained is None else run.trained
         if stopping.is_set():
             raise RunStoppedError
         if status not in _FINISHED:
@@ -158,6 +162,10 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
         arguments += _logging_options(run.log_level, run.log_json)
         arguments += allow_settings(run.spec.policy.user_modules)
+        if run.spaces is not None:
+            arguments += ["--spaces", run.spaces.model_dump_json()]
+        if run.init_from is not None:
+            arguments += ["--init-from", str(run.init_from)]
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:

@@ -4,6 +4,8 @@ import os
 import sys
 from collections.abc import Callable
 
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status
+
 USAGE = """\
 usage: daedalus COMMAND ...
 
@@ -12,6 +14,7 @@ Actor-critic reinforcement learning with one learner and any number of actors, o
 on this machine:
   train      start a learner and actors, show their progress, evaluate the result
   resume     continue a run from its newest checkpoint
+  check      play an environment with random actions, and report its faults, its speed and what train would choose
 
 on several machines, one process at a time:
   learner    own the weights, and train them on the rollouts of actors
@@ -35,6 +38,10 @@ for the shell:
 
 def main() -> int:
     """Run the command that the command line names, and return its exit status."""
+    return exit_status(_run)
+
+
+def _run() -> int:
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
@@ -50,8 +57,6 @@ def main() -> int:
         hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
         print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
         return 2
-    from daedalus.cli.processes import exit_on_thread_exceptions
-
     exit_on_thread_exceptions()
     return _COMMANDS[command](rest)
 
@@ -69,6 +74,12 @@ def _resume(arguments: list[str]) -> int:
     from daedalus.cli.commands.train import resume
 
     return resume(arguments)
+
+
+def _check(arguments: list[str]) -> int:
+    from daedalus.cli.commands.check import check
+
+    return check(arguments)
 
 
 def _status(arguments: list[str]) -> int:
@@ -116,6 +127,7 @@ def _completion(arguments: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
+    "check": _check,
     "router": _router,
     "status": _status,
     "drain": _drain,

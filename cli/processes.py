@@ -4,16 +4,20 @@ import contextlib
 import logging
 import os
 import resource
+import select
 import signal
 import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
+from typing import TextIO
 
 _logger = logging.getLogger(__name__)
 
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
+UNREAD = 128 + signal.SIGPIPE  # exit status, as of other programs
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
@@ -87,6 +91,32 @@ def exit_with_parent(stop: threading.Event) -> None:
         stop.set()
 
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
+
+
+def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
+    """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
+
+    Every command runs in it. `outputs` are the streams that it writes to, besides standard output and standard error.
+    """
+    try:
+        try:
+            return command()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        unread = [stream for stream in (*outputs, sys.stdout, sys.stderr) if _is_unread(stream)]
+        if not unread:  # another pipe: a fault of ours
+            raise
+        for stream in unread:  # the interpreter flushes them at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return UNREAD
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Return whether the other end of a pipe is closed."""
+    poll = select.poll()
+    poll.register(stream.fileno(), 0)
+    return bool(poll.poll(0))  # of errors and closed ends alone
 
 
 def exit_on_thread_exceptions() -> None:

@@ -11,6 +11,7 @@ from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.algorithms import ALGORITHMS
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
 LISTEN = "tcp/127.0.0.1:7447"
@@ -61,7 +62,6 @@ def add_settings(options: argparse.ArgumentParser) -> None:
         metavar="MODULE:FUNCTION",
         help="your function that takes each gymnasium environment and returns the one to play (environment.wrap)",
     )
-    options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
     options.add_argument(
         "--set",
         action="append",
@@ -71,8 +71,25 @@ def add_settings(options: argparse.ArgumentParser) -> None:
     )
 
 
+def add_new_run(options: argparse.ArgumentParser) -> None:
+    """Add the options of a run that is started."""
+    options.add_argument(
+        "--init-from",
+        type=Path,
+        metavar="RUN_DIR",
+        help="begin with the weights of another run, or of one of its checkpoints. The network must be the same",
+    )
+    options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
+
+
 def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
     """Return the specification and the run directory that the arguments define. Raises SettingsError."""
+    spec = resolve_spec(arguments)
+    return spec, arguments.run_dir or named_directory(arguments.preset, spec)
+
+
+def resolve_spec(arguments: argparse.Namespace) -> RunSpec:
+    """Return the specification that the arguments define. Raises SettingsError."""
     settings = chosen_settings(
         arguments.preset,
         arguments.env,
@@ -84,8 +101,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[RunSpec, Path]:
     )
     override(settings, arguments.set)
     check_environment(arguments.env, settings)
-    spec = run_spec(settings)
-    return spec, arguments.run_dir or named_directory(arguments.preset, spec)
+    return run_spec(settings)
 
 
 def chosen_settings(
@@ -177,6 +193,7 @@ def learner_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus learner`."""
     options = command_parser("learner", DESCRIPTION, EXAMPLES)
     add_settings(options)
+    add_new_run(options)
     addresses = options.add_mutually_exclusive_group()
     addresses.add_argument(
         "--listen", action="append", metavar="tcp/HOST:PORT", help=f"address where actors connect (default: {LISTEN})"
@@ -200,5 +217,6 @@ def learner_parser() -> argparse.ArgumentParser:
     # Options for `daedalus train`, which has created the run directory and its config.toml.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
+    options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options

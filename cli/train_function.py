@@ -13,9 +13,12 @@ from typing import Any, TextIO
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
 from daedalus.cli.settings_arguments import check_environment, chosen_settings, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign, run_spec
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -56,6 +59,7 @@ def train(
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     wrap: str | None = None,
+    init_from: str | Path | None = None,
     quiet: bool = False,
 ) -> RunResult:
     """Train with a learner and actors as processes of this machine, evaluate the policy, and return the result.
@@ -73,6 +77,7 @@ def train(
       run_dir: a new directory for the run (default: a new folder in runs/).
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
+      init_from: another run, or one of its checkpoints, whose weights to begin with; the network must be the same.
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TrainingError if a process failed.
@@ -87,9 +92,28 @@ def train(
     check_environment(env, chosen)
     spec = run_spec(chosen)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    with run_directory.create_locked(directory, spec, numbered=run_dir is None) as lock:
-        end = _run(LocalRun(directory=lock.directory, spec=spec, started=started, lock=lock.inheritable), quiet)
+    run_directory.check_free(directory)  # before the environment is made
+    spaces = _checked_spaces(spec, quiet)
+    weights = None if init_from is None else Path(init_from)
+    with run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock:
+        run = LocalRun(
+            directory=lock.directory,
+            spec=spec,
+            started=started,
+            lock=lock.inheritable,
+            spaces=spaces,
+            init_from=weights,
+        )
+        end = _run(run, quiet)
     return _result(lock.directory, end)
+
+
+def _checked_spaces(spec: RunSpec, quiet: bool) -> Spaces | None:
+    try:
+        with _records_to(_handler(quiet)):
+            return checked_spaces(spec)
+    except EnvironmentProblemError as error:
+        raise TrainingError(str(error)) from None
 
 
 def _run(run: LocalRun, quiet: bool) -> RunEnd:
@@ -110,10 +134,10 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
         write(line, err)
 
     failure: RunFailedError | None = None
-    log, records = run.directory / run_directory.OUTPUT, logging.NullHandler() if quiet else logging.StreamHandler(out)
+    log = run.directory / run_directory.OUTPUT
     output = ChildOutput(log, lambda line: write(line, out), write_error)
     try:
-        with _records_to(records), output:
+        with _records_to(_handler(quiet)), output:
             return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
@@ -122,6 +146,10 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
     # A restarted process fails with the same message.
     reasons = dict.fromkeys([*errors, *str(failure).splitlines()])
     raise TrainingError("\n".join(filter(None, reasons)) or f"the learner ended with status {failure.status}")
+
+
+def _handler(quiet: bool) -> logging.Handler:
+    return logging.NullHandler() if quiet else logging.StreamHandler(sys.stdout)
 
 
 @contextmanager

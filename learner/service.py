@@ -24,7 +24,10 @@ from daedalus.learner.run.run_directory import SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.training.errors import CheckpointMismatchError
+from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
@@ -64,6 +67,8 @@ class LearnerService:
         *,
         started: float,
         restored: "Checkpoint | None" = None,
+        initial: SavedPolicy | None = None,
+        spaces: Spaces | None = None,
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
@@ -78,11 +83,14 @@ class LearnerService:
           open_writers: functions that open the metrics writers.
           started: start of the run on the monotonic clock, in seconds.
           restored: checkpoint to continue from.
+          initial: policy of another run whose weights to begin with, unless there is a checkpoint to continue from.
+          spaces: spaces that all actors must have, if they are known; those of a checkpoint have precedence.
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
-        self._open_writers, self._restored, self._modules = open_writers, restored, modules
+        self._open_writers, self._modules = open_writers, modules
+        self._restored, self._initial = restored, initial if restored is None else None
         self._counters = RunCounters(spec.training.target_episodes)
         self._annealing = Annealing(budget=spec.training.env_steps)
         if restored is not None:
@@ -102,7 +110,7 @@ class LearnerService:
             self._status,
             learner_epoch=epoch,
             start_version=restored.policy.policy_version if restored else 0,
-            spaces=restored.policy.spaces if restored else None,
+            spaces=restored.policy.spaces if restored else spaces,
         )
         self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
@@ -122,17 +130,18 @@ class LearnerService:
         """Serve actors and train until the target is reached, the budget is used or the stop event is set.
 
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
-        learner serves the run, CheckpointMismatchError if the checkpoint does not fit the settings, NetworkError if
+        learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
         the policy does not support the spaces, SettingsError if the device is not available.
         """
         try:
             self._server.open()
             from daedalus.learner.training.learner import Learner
 
-            spaces = self._server.await_spaces(self._stop, self._heartbeat.beat)
-            if spaces is None:
-                _logger.info("stopped before the first actor joined")
-                return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
+            fleet = self._server.fleet
+            if fleet.spaces is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+                return _stopped_without_actors()
+            spaces = fleet.spaces
+            assert spaces is not None
             learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy
@@ -140,9 +149,16 @@ class LearnerService:
                 if learner.learning_rate(self._annealing.at(self._counters.env_steps)) == 0.0:
                     _logger.warning(
                         "the learning rate has been annealed to 0: the policy changes no more; "
-                        "start a new run with the larger budget"
+                        "start a new run from its weights, with --init-from"
                     )
-            return self._learn(learner, self._checkpointer(learner))
+            if self._initial is not None:
+                _load(learner, self._initial)
+            checkpointer = self._checkpointer(learner)
+            if self._initial is not None:
+                checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
+            if self._restored is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+                return _stopped_without_actors()
+            return self._learn(learner, checkpointer)
         finally:
             self._server.close(_STOPPED)  # unless it is closed
             self._heartbeat.clear()
@@ -177,7 +193,7 @@ class LearnerService:
         finally:
             ended = time.monotonic()
             self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
-            recorder.record(self._reporter.row(learner, ended), self._reporter.details(learner))
+            recorder.record(self._reporter.row(learner, ended, last=True), self._reporter.details(learner))
             recorder.close()
             saved = checkpointer.save()
         solved = seconds_to_target is not None
@@ -251,7 +267,21 @@ class LearnerService:
             _logger.warning("summary not written: %s", error.strerror)
 
 
+def _stopped_without_actors() -> Outcome:
+    _logger.info("stopped before the first actor joined")
+    return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
+
+
 def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:
     """Return the annealing of a run that continues from a checkpoint, perhaps with another budget."""
     saved = restored.counters.get("annealing", {"budget": restored.policy.spec.training.env_steps})
     return Annealing(**saved).resumed(restored.counters["env_steps"], spec.training.env_steps)
+
+
+def _load(learner: "Learner", policy: SavedPolicy) -> None:
+    """Begin with the weights of another run. Raises CheckpointMismatchError."""
+    try:
+        learner.load(policy.weights)
+    except CheckpointMismatchError as error:
+        raise CheckpointMismatchError(f"--init-from {policy.directory}: {error}") from None
+    _logger.info("initial weights: policy version %d of %s", policy.policy_version, policy.directory)

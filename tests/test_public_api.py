@@ -102,7 +102,7 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
     with pytest.raises(daedalus.TrainingError) as failed:
         daedalus.train(env="CartPole-v9", run_dir=tmp_path / "run", quiet=True)
     lines = str(failed.value).splitlines()
-    assert lines[0].startswith("daedalus actor: unknown environment 'CartPole-v9'")
+    assert lines[0].startswith("unknown environment 'CartPole-v9'")
     assert len(lines) == len(set(lines))
     assert not (tmp_path / "run").exists()
 

@@ -61,6 +61,11 @@ class Credentials:
             settings["access_control"] = access_control(**authorised_names(self.directory))
         return settings
 
+    def hosts(self) -> list[str]:
+        """Return the names and addresses of hosts that the certificate is for. Raises CredentialsError."""
+        names = _verified(self.directory, ignore_time=True).get("subjectAltName", ())
+        return [str(value) for kind, value in names if kind in ("DNS", "IP Address")]
+
     def days_left(self) -> float:
         """Return the days until the certificate that is in the folder now expires; negative if it has expired.
 

@@ -2,8 +2,11 @@
 
 import difflib
 import importlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from types import ModuleType
+
+import gymnasium
 
 
 class EnvironmentSetupError(Exception):
@@ -32,3 +35,20 @@ def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
             f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]", '
             "or use another backend (--set environment.backend=gymnasium)"
         ) from None
+
+
+@contextmanager
+def creation_errors(environment: str) -> Iterator[None]:
+    """Raise EnvironmentSetupError for anything that the constructor of an environment raises."""
+    try:
+        yield
+    except EnvironmentSetupError:
+        raise
+    except gymnasium.error.DependencyNotInstalled as error:
+        box2d = "box2d" in str(error).lower()
+        remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
+        raise EnvironmentSetupError(
+            f"environment {environment} needs a package that is not installed: {remedy}"
+        ) from None
+    except Exception as error:  # broad: the constructor of a user's environment may raise anything
+        raise EnvironmentSetupError(f"environment {environment} cannot be created: {first_line(error)}") from error

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
-    first_line,
+    creation_errors,
     import_extra,
     unknown_environment,
 )
@@ -186,28 +186,14 @@ def make_gymnasium(
 
     See make_environments for the arguments; `one_episode` is its `for_evaluation`. Raises EnvironmentSetupError.
     """
-    if spec.backend == "fast" and registration(spec.id, modules).entry_point != _CAR_RACING:
-        raise EnvironmentSetupError(
-            f"environment.backend=fast supports CarRacing-v3 only, not {spec.id}: "
-            "use --set environment.backend=gymnasium"
-        )
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
-    try:
-        environment = _make_vector(
-            EnvironmentFactory(
-                spec=spec, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
-            ),
-            count,
-        )
-    except EnvironmentSetupError:
-        raise
-    except gymnasium.error.DependencyNotInstalled as error:
-        box2d = "box2d" in str(error).lower()
-        remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
-        raise EnvironmentSetupError(f"environment {spec.id} needs a package that is not installed: {remedy}") from None
-    except Exception as error:  # broad: the constructor of a user's environment may raise anything
-        raise EnvironmentSetupError(f"environment {spec.id} cannot be created: {first_line(error)}") from error
+    factory = EnvironmentFactory(
+        spec=spec, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
+    )
+    with creation_errors(spec.id):
+        _check_backend(spec, modules)
+        environment = _make_vector(factory, count)
     if environment.metadata.get("autoreset_mode") is not AutoresetMode.NEXT_STEP:
         environment.close()
         raise EnvironmentSetupError(
@@ -215,6 +201,25 @@ def make_gymnasium(
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     return GymnasiumEnvironments(environment)
+
+
+def make_single(spec: EnvironmentSpec, modules: UserModules) -> gymnasium.Env | None:
+    """Return one environment as training plays it, or None if it is registered with a vector entry point only.
+
+    Raises EnvironmentSetupError.
+    """
+    with creation_errors(spec.id):
+        _check_backend(spec, modules)
+        single = registration(spec.id, modules).entry_point is not None
+        return EnvironmentFactory(spec=spec, modules=modules)() if single else None
+
+
+def _check_backend(spec: EnvironmentSpec, modules: UserModules) -> None:
+    if spec.backend == "fast" and registration(spec.id, modules).entry_point != _CAR_RACING:
+        raise EnvironmentSetupError(
+            f"environment.backend=fast supports CarRacing-v3 only, not {spec.id}: "
+            "use --set environment.backend=gymnasium"
+        )
 
 
 def registration(environment_id: str, modules: UserModules) -> EnvSpec:

@@ -43,7 +43,7 @@ def make_environments(
         raise EnvironmentSetupError(str(error)) from None
     if spec.backend != "gymnasium":
         _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
-    bare, rest = _make_bare(spec, count, modules, render_mode, camera, for_evaluation)
+    bare, rest = make_bare(spec, count, modules, render_mode, camera, for_evaluation)
     try:
         return TransformedEnvironment(bare, rest)
     except EnvironmentSetupError:
@@ -51,15 +51,18 @@ def make_environments(
         raise
 
 
-def _make_bare(
+def make_bare(
     spec: EnvironmentSpec,
     count: int,
     modules: UserModules,
-    render_mode: str | None,
-    camera: Callable[[np.ndarray], None] | None,
-    for_evaluation: bool,
+    render_mode: str | None = None,
+    camera: Callable[[np.ndarray], None] | None = None,
+    for_evaluation: bool = False,
 ) -> tuple[BackendEnvironments, EnvironmentSpec]:
-    """Return the backend's environments, and the specification without the transforms that the backend does itself."""
+    """Return the backend's environments, and the specification without the transforms that the backend does itself.
+
+    See make_environments, which checks the modules and the options. Raises EnvironmentSetupError.
+    """
     match spec.backend:
         case "envpool":
             # A backend is imported when it is used.

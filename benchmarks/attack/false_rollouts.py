@@ -31,12 +31,13 @@ def false_rollouts() -> Verdict:
             hostile.join()
             sent = _sent_until_quarantine(hostile)
         here.wait_for_training("honest")
-        skipped, problems = _settled(here)
-    held = not accepted and sent <= _MOST_SENT and skipped <= _MOST_SKIPPED and not problems
+        here.wait("a learner without problems", lambda: (status := here.status()) and not status.problems)
+        skipped = _skipped(here)
+    held = not accepted and sent <= _MOST_SENT and skipped <= _MOST_SKIPPED
     return Verdict(
         held,
         f"accepted of invented rollouts: {', '.join(accepted) or 'none'}; huge observations: quarantined after {sent} "
-        f"rollouts and {skipped} skipped updates; problems afterwards: {', '.join(problems) or 'none'}",
+        f"rollouts and {skipped} skipped updates; no problems afterwards",
     )
 
 
@@ -72,10 +73,10 @@ def _sent_until_quarantine(hostile: HostileActor) -> int:
     return _MOST_SENT + 1
 
 
-def _settled(here: Scene) -> tuple[int, tuple[str, ...]]:
+def _skipped(here: Scene) -> int:
     status = here.status()
     assert status is not None
-    return status.updates_skipped, status.problems
+    return status.updates_skipped
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from benchmarks.attack.verdict import Verdict
 from benchmarks.chaos.scene import ENDLESS, scene
 from daedalus.cli.certificate_folder import CertificateFolder, Identity
 from daedalus.protocol import keys
-from daedalus.transport.credentials import load
+from daedalus.transport.credentials import Credentials, load
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect
 
@@ -45,6 +45,8 @@ def revoked_certificate() -> Verdict:
             taken = here.wait("the refusal of the thief", lambda: _refusal(thief))
             reason = _refusal(thief)
             folder.issue([arm], _LIFETIME)
+            victim_folder = load(folder.directory / arm.folder, "actor")
+            here.wait("the new certificate to be accepted", lambda: _connects(address, victim_folder))
             victim = here.start("actor", *to, folder.directory / arm.folder)
             victim.expect("joined run")
             again = _refusal(thief) and not _answered(thief)
@@ -54,6 +56,15 @@ def revoked_certificate() -> Verdict:
         f"refused {taken:.1f} s after the revocation ({reason.partition(': ')[2]}); router, learner and the other "
         "actor kept running; a new certificate of the same name works, the stolen one does not",
     )
+
+
+def _connects(address: str, credentials: Credentials) -> bool:
+    """Return whether the router knows a certificate: it reads the list of those in use every second or so."""
+    try:
+        connect([address], credentials).close()
+    except TransportError:
+        return False
+    return True
 
 
 def _answered(thief: Transport) -> bool:

@@ -16,7 +16,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
@@ -70,4 +70,4 @@ def _serve_run(
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main())
+    sys.exit(exit_status(main))

@@ -11,7 +11,7 @@ import sys
 from daedalus.bridge.service import Bridge
 from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, raise_descriptor_limit, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, raise_descriptor_limit, stop_on_signals
 from daedalus.transport.addresses import AddressError, check_listening
 from daedalus.transport.connecting import connect
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -73,4 +73,4 @@ def main() -> int:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main())
+    sys.exit(exit_status(main))

@@ -22,7 +22,7 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
@@ -261,4 +261,5 @@ class _Progress:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main(stop=stop_on_signals(exit_if_stuck=True), output=_reserved_stdout()))
+    stopped, result = stop_on_signals(exit_if_stuck=True), _reserved_stdout()
+    sys.exit(exit_status(lambda: main(stop=stopped, output=result), result))

@@ -20,15 +20,18 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import (
     STOPPED,
     exit_on_thread_exceptions,
+    exit_status,
     exit_with_parent,
     raise_descriptor_limit,
     stop_on_signals,
 )
+from daedalus.cli.quick_check import expected_spaces
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
@@ -37,13 +40,15 @@ from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.saving.saved_policy import checkpoints
+from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.reachable import reachable
 from daedalus.transport.security import (
     SECURITY_ERRORS,
     certificate_days_left,
@@ -78,7 +83,6 @@ def main() -> int:
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
-    Heartbeat(run.directory).clear()  # before a router is waited for
     progress = Progress(sys.stdout, run.spec.training.env_steps)
     configure_logging(arguments.log_level, as_json=arguments.log_json, write=progress.say)
     try:
@@ -101,19 +105,29 @@ def _serve(
     """Run the learner to its end and return the exit status; `stack` closes what is opened. Raises _FAILURES."""
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
-    restored = _newest_checkpoint(run.directory) if arguments.resume and run.exists else None
+    Heartbeat(run.directory).clear()  # before a router is waited for
+    resumed = arguments.resume and run.exists
+    finished = finished_run(run.directory, run.spec) if resumed else None
+    if finished is not None:
+        _logger.info("nothing to do: %s", finished.reason)
+        return NOT_REACHED if finished.missed else REACHED
+    restored = _newest_checkpoint(run.directory) if resumed else None
+    spaces = arguments.spaces
+    if restored is None and arguments.prepared is None:
+        spaces = expected_spaces(run.spec, run.modules, stop)
+    initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
         return stopped
     stack.callback(transport.close)
     if not run.exists:
-        lock = run_directory.create_locked(run.directory, run.spec, numbered=arguments.run_dir is None)
-        stack.enter_context(lock)
+        new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
+        lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         run = replace(run, directory=lock.directory)
     try:
-        _announce(run, arguments)
-        outcome = _train(run, transport, stop, progress, started, restored, credentials)
+        _announce(run, arguments, credentials)
+        outcome = _train(run, transport, stop, progress, started, restored, initial, spaces, credentials)
     except _FAILURES:
         if not run.exists:
             run_directory.remove_failed(run.directory)
@@ -146,13 +160,20 @@ def _open_transport(
     return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
 
 
-def _announce(run: ChosenRun, arguments: argparse.Namespace) -> None:
+def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
+    """Return the command of an actor, with the other addresses that it may use."""
+    address, *others = reachable(listening, credentials.hosts() if credentials else ())
+    tls = ["--tls", "DIR"] if credentials else []
+    command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.environment.user_modules)]
+    return " ".join([*command, *([f"(or at {', '.join(others)})"] if others else [])])
+
+
+def _announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Credentials | None) -> None:
     """Log how actors join."""
     if arguments.prepared is None:
         spec = run.spec
         _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        options = [", ".join(_addresses(arguments)), *allow_settings(spec.environment.user_modules)]
-        _logger.info("actors join with: daedalus actor --connect %s", " ".join(options))
+        _logger.info("actors join with: %s", how_to_join(_addresses(arguments), credentials, spec))
 
 
 def _train(
@@ -162,6 +183,8 @@ def _train(
     progress: Progress,
     started: float,
     restored: "Checkpoint | None",
+    initial: SavedPolicy | None,
+    spaces: Spaces | None,
     credentials: Credentials | None,
 ) -> Outcome:
     """Run the learner to its end."""
@@ -175,6 +198,8 @@ def _train(
         [lambda: CsvWriter(directory / run_directory.METRICS), lambda: TensorBoardWriter(directory)],
         started=started,
         restored=restored,
+        initial=initial,
+        spaces=spaces,
         modules=run.modules,
         certificate_days_left=lambda: certificate_days_left(credentials),
     )
@@ -204,4 +229,4 @@ def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
-    sys.exit(main())
+    sys.exit(exit_status(main))

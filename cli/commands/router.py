@@ -12,6 +12,7 @@ from daedalus.transport.addresses import check_connecting
 from daedalus.transport.connecting import listen
 from daedalus.transport.credentials import CredentialsError
 from daedalus.transport.interface import TransportError
+from daedalus.transport.reachable import reachable
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
@@ -83,13 +84,14 @@ def router(arguments: list[str]) -> int:
     raise_descriptor_limit()
     stop = stop_on_signals()
     try:
+        hosts = credentials.hosts() if credentials else ()
         limit = int(parsed.max_message_megabytes * 2**20)
         transport = listen([parsed.listen], parsed.connect, credentials, max_message_bytes=limit)
     except (TransportError, CredentialsError) as error:
         print(f"daedalus router: {error}", file=sys.stderr)
         return 1
     try:
-        _logger.info("listening on %s", parsed.listen)
+        _logger.info("listening on %s", " and ".join(reachable([parsed.listen], hosts)))
         stop.wait()
     finally:
         transport.close()

@@ -11,16 +11,21 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.processes import process_started, stop_on_signals
-from daedalus.cli.settings_arguments import add_settings, resolve
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
+from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.changes import with_changes
+from daedalus.learner.run.finished import FinishedRun, finished_run
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.saved_policy import checkpoints
 from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
     UserModules,
     allow_settings,
 )
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 
@@ -37,6 +42,7 @@ examples:
   daedalus train cartpole --algorithm a2c --actors 4 --seed 7
   daedalus train --env Acrobot-v1 --env-steps 500000
   daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
+  daedalus train cartpole --init-from runs/cartpole-impala-s1-20261121-101500 --set training.learning_rate=0.0001
   daedalus train cartpole --set training.stop_when_solved=false --env-steps 5000000
 
 exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
@@ -50,38 +56,48 @@ _RESUME_EXAMPLES = """\
 examples:
   daedalus resume runs/cartpole-impala-s1-20261121-101500
   daedalus resume RUN_DIR --env-steps 3000000      (the whole budget, with the steps already done)
+  daedalus resume RUN_DIR --set training.learning_rate=0.0001
   daedalus resume RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
 exit status: as of daedalus train"""
+
+
+_MISSED = 3  # exit status: the budget was used up before the target
 
 
 def train(arguments: list[str]) -> int:
     """Run `daedalus train` and return its exit status."""
     started = process_started()
     parsed = train_parser().parse_args(arguments)
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     try:
         _check_listening(parsed)
         spec, directory = resolve(parsed)
-        lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None)
-    except RunInUseError as error:
+        if parsed.run_dir is not None:
+            run_directory.check_free(directory)  # before the environment is made
+        spaces = checked_spaces(spec, fork=True)
+        lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
+    except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stopped")
         return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
     with lock:
-        return _run(lock, spec, parsed, started, resume=False)
+        return _run(lock, spec, parsed, started, resume=False, spaces=spaces)
 
 
 def resume(arguments: list[str]) -> int:
     """Run `daedalus resume` and return its exit status."""
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     try:
         _check_listening(parsed)
-        spec = run_directory.read_config(parsed.directory)
-        source = str(parsed.directory / run_directory.CONFIG)
-        UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
+        spec = _resumed_spec(parsed)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
         print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
@@ -93,20 +109,33 @@ def resume(arguments: list[str]) -> int:
         print(f"daedalus resume: {error}", file=sys.stderr)
         return 2
     with lock:
+        finished = finished_run(parsed.directory, spec)
+        if finished is not None and not finished.to_evaluate:
+            print(f"nothing to do: {finished.reason}")
+            return _MISSED if finished.missed else 0
         try:
-            if parsed.env_steps is not None:
-                spec = run_directory.with_budget(spec, parsed.env_steps)
-                run_directory.write_config(parsed.directory, spec)
-        except SettingsError as error:
+            spaces = None if checkpoints(parsed.directory) else checked_spaces(spec, fork=True)
+        except EnvironmentProblemError as error:
             print(f"daedalus resume: {error}", file=sys.stderr)
-            return 2
-        return _run(lock, spec, parsed, started, resume=True)
+            return 1
+        run_directory.write_config(parsed.directory, spec)
+        return _run(lock, spec, parsed, started, resume=True, spaces=spaces, finished=finished)
+
+
+def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
+    """Return the specification of a run with the changes of the command line. Raises SettingsError, UserModuleError."""
+    spec = run_directory.read_config(parsed.directory)
+    source = str(parsed.directory / run_directory.CONFIG)
+    UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
+    budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
+    return with_changes(spec, [*parsed.set, *budget], parsed.directory)
 
 
 def train_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus train`."""
     options = command_parser("train", _TRAIN, _TRAIN_EXAMPLES)
     add_settings(options)
+    add_new_run(options)
     _add_machine_options(options)
     return options
 
@@ -116,6 +145,14 @@ def resume_parser() -> argparse.ArgumentParser:
     options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
     options.add_argument("directory", type=Path, metavar="RUN_DIR", help="run to continue")
     options.add_argument("--env-steps", type=int, metavar="N", help="new budget (default: the budget of the run)")
+    options.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change a setting of the run from now on, such as training.learning_rate=0.0001. The environment, the "
+        "network, the algorithm and the seed cannot change",
+    )
     add_allow_module(options, "config.toml of the run")
     _add_machine_options(options)
     return options
@@ -136,22 +173,33 @@ def _check_listening(parsed: argparse.Namespace) -> None:
     credentials_to_listen([parsed.listen] if parsed.listen else [], parsed.tls, "learner", insecure=parsed.insecure)
 
 
-def _run(lock: RunLock, spec: RunSpec, parsed: argparse.Namespace, started: float, *, resume: bool) -> int:
-    """Run to the end, print the result, and return the exit status."""
+def _run(
+    lock: RunLock,
+    spec: RunSpec,
+    parsed: argparse.Namespace,
+    started: float,
+    *,
+    resume: bool,
+    spaces: Spaces | None = None,
+    finished: FinishedRun | None = None,
+) -> int:
+    """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
     directory = lock.directory
     run = LocalRun(
         directory=directory,
         spec=spec,
         started=started,
         lock=lock.inheritable,
+        spaces=spaces,
+        init_from=None if resume else parsed.init_from,
         resume=resume,
+        trained=None if finished is None else _MISSED if finished.missed else 0,
         listen=parsed.listen,
         tls=parsed.tls,
         insecure=parsed.insecure,
         log_level=parsed.log_level,
         log_json=parsed.log_json,
     )
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
     output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
     try:
         with output:

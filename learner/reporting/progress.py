@@ -4,6 +4,7 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TextIO
 
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
@@ -32,24 +33,26 @@ class Progress:
         parts = _parts(row, self._budget, rate)
         if self._terminal:
             line = _fitted(parts, shutil.get_terminal_size().columns - 1)  # the last column would begin a new line
-            self._stream.write(f"\r\x1b[K{line}")
+            self._write(f"\r\x1b[K{line}")
             self._rewriting = True
         else:
-            self._stream.write("  ".join(parts) + "\n")
-        self._stream.flush()
+            self._write("  ".join(parts) + "\n")
 
     def say(self, text: str) -> None:
         """Print a permanent line."""
         self.end()
-        self._stream.write(text + "\n")
-        self._stream.flush()
+        self._write(text + "\n")
 
     def end(self) -> None:
         """End the line that is being rewritten."""
         if self._rewriting:
-            self._stream.write("\n")
-            self._stream.flush()
+            self._write("\n")
             self._rewriting = False
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):  # nobody reads it any more: training goes on
+            self._stream.write(text)
+            self._stream.flush()
 
     def _rate(self, row: Mapping[str, float]) -> float:
         """Return env_steps a second over the newest rows: slow environments make steps in few of the rows."""
@@ -64,22 +67,26 @@ class Progress:
 
 
 def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
-    """Return the parts of a line, the most important first."""
-    mean = f"{row['episode_return_mean']:.1f}" if "episode_return_mean" in row else "-"
+    """Return the parts of a line, the most important first. What is not known yet is a dash."""
+    mean = _number(row.get("episode_return_mean"), ".1f")
     left = _duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",
         f"return {mean:>7}",
         f"env_steps {row['env_steps']:>11,} ({100.0 * row['env_steps'] / budget:.0f} %)",
-        f"{rate:>7,.0f}/s",
+        f"{_number(rate or None, ',.0f'):>7}/s",
         f"left {left:>6}",
-        f"updates {row.get('updates_per_second', 0.0):>5,.0f}/s",
-        f"lag {row.get('policy_lag_mean', 0.0):.1f}",
+        f"updates {_number(row.get('updates_per_second'), ',.0f'):>5}/s",
+        f"lag {_number(row.get('policy_lag_mean'), '.1f')}",
         f"actors {row['actors']}",
     ]
     if "episode_length_mean" in row:
         parts.insert(5, f"length {row['episode_length_mean']:>6,.0f}")
     return parts
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
 def _fitted(parts: list[str], width: int) -> str:

@@ -62,7 +62,7 @@ class RateMeter:
         self.rates: dict[str, float] = {}  # of the last measurement
         self._actors: dict[str, tuple[int, int, int]] = {}  # env_steps, received bytes, answered bytes
         self._pushed_bytes = 0
-        self._begun, self._first_env_steps = now, counters.env_steps
+        self._begun, self._first_env_steps, self._first_rollouts = now, counters.env_steps, counters.rollouts_trained
         self._mark(counters, now)
 
     def overall(self, counters: RunCounters, now: float) -> float:
@@ -73,10 +73,12 @@ class RateMeter:
         self._then, self._env_steps, self._updates = now, counters.env_steps, counters.updates
         self._rollouts, self._lag = counters.rollouts_trained, counters.policy_lag_sum
 
-    def measure(self, counters: RunCounters, fleet: Fleet, now: float) -> dict[str, float]:
+    def measure(self, counters: RunCounters, fleet: Fleet, now: float, *, last: bool = False) -> dict[str, float]:
         """Return env_steps and updates per second and the mean policy lag, since the last measurement.
 
-        Also sets the rates of each actor in `fleet`. `now` is on the monotonic clock, in seconds.
+        What is unknown is absent: all of it before the first batch, and the policy lag of no batch. The `last` interval
+        of a run ends at any moment: without a batch in it, nothing is known. Also sets the rates of each actor in
+        `fleet`. `now` is on the monotonic clock, in seconds.
         """
         seconds = max(now - self._then, 1e-9)
         pushed, self._pushed_bytes = fleet.pushed_bytes - self._pushed_bytes, fleet.pushed_bytes
@@ -89,12 +91,13 @@ class RateMeter:
             actor.bytes_up_per_hour = 3600 * float(received)
             actor.bytes_down_per_hour = 3600 * float(answered + subscribed)
         self._actors = {name: self._actors[name] for name in fleet.actors}  # without evicted actors
-        rollouts = max(counters.rollouts_trained - self._rollouts, 1)
-        self.rates = {
-            "env_steps_per_second": (counters.env_steps - self._env_steps) / seconds,
-            "updates_per_second": (counters.updates - self._updates) / seconds,
-            "policy_lag_mean": (counters.policy_lag_sum - self._lag) / rollouts,
-        }
+        rollouts = counters.rollouts_trained - self._rollouts
+        self.rates = {}
+        if rollouts or (counters.rollouts_trained > self._first_rollouts and not last):
+            self.rates["env_steps_per_second"] = (counters.env_steps - self._env_steps) / seconds
+            self.rates["updates_per_second"] = (counters.updates - self._updates) / seconds
+        if rollouts:
+            self.rates["policy_lag_mean"] = (counters.policy_lag_sum - self._lag) / rollouts
         self._mark(counters, now)
         return self.rates
 

@@ -54,12 +54,12 @@ class RunReporter:
         with self._lock:
             return {**self._counters.state(self.wall_seconds(now)), "annealing": self._annealing.state()}
 
-    def row(self, learner: "Learner", now: float) -> dict[str, float]:
-        """Return a metrics row, with rates and means since the previous row."""
+    def row(self, learner: "Learner", now: float, *, last: bool = False) -> dict[str, float]:
+        """Return a metrics row, with rates and means since the previous row. `last` marks that of a stop."""
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         with self._lock:
             progress = self._annealing.at(self._counters.env_steps)
-            rates = self._meter.measure(self._counters, self._fleet, now)
+            rates = self._meter.measure(self._counters, self._fleet, now, last=last)
             if self._fleet.live:
                 self._health.actor_seen = now
             learning = {

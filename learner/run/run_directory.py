@@ -20,6 +20,7 @@ from typing import Any
 
 import tomli_w
 
+from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.protocol.spec import RunSpec
@@ -60,13 +61,14 @@ def create(directory: Path, spec: RunSpec) -> None:
     create_locked(directory, spec).close()
 
 
-def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False) -> RunLock:
+def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, init_from: Path | None = None) -> RunLock:
     """Create the directory of a new run, with config.toml and versions.json, and return its lock.
 
     Args:
       directory: its path.
       spec: the settings of the run.
       numbered: add a number to the name if the directory exists; the lock has the resulting path.
+      init_from: run whose weights the new run begins with, for versions.json.
 
     Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
@@ -79,7 +81,8 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False) -> 
         try:
             check_free(directory)  # another process may have held the lock before
             write_config(directory, spec)
-            write_json(directory / VERSIONS, _versions())
+            origin = {} if init_from is None else {"init_from": str(init_from)}
+            write_json(directory / VERSIONS, {**_versions(), **origin})
         except BaseException:
             lock.close()
             raise
@@ -102,7 +105,7 @@ def remove_failed(directory: Path) -> None:
     """Remove the files of a run that failed before it had a result, and the directory unless it has other files."""
     if (directory / METRICS).exists() or any((directory / "checkpoints").glob("*")):
         return
-    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, "events.out.*", ".*.partial"):
+    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, HEARTBEAT, "events.out.*", ".*.partial"):
         for file in directory.glob(pattern):
             with suppress(OSError):
                 file.unlink()
@@ -156,10 +159,3 @@ def _versions() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
     return versions
-
-
-def with_budget(spec: RunSpec, env_steps: int) -> RunSpec:
-    """Return the specification with another budget. Raises SettingsError if `env_steps` is out of range."""
-    settings = spec.model_dump(mode="json", exclude_none=True)
-    settings["training"]["env_steps"] = env_steps
-    return run_spec(settings)

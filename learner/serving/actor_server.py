@@ -78,7 +78,8 @@ class ActorServer:
           counters: updated by the server; other threads read them under `lock`.
           status: function that returns the status with the first page of actors; called with the lock held.
           learner_epoch: epoch of this learner process.
-          start_version, spaces: from the checkpoint that the run continues from, else 0 and None.
+          start_version: policy version of the checkpoint that the run continues from, else 0.
+          spaces: spaces that all actors must have; None: those of the first actor.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces)
@@ -176,20 +177,20 @@ class ActorServer:
         with self.lock:
             return bool(self.fleet.live) or self._were_cut_off or now < self._responses.postponed_at + _ASK_SECONDS
 
-    def await_spaces(self, stop: threading.Event, on_wait: Callable[[], None] = lambda: None) -> Spaces | None:
-        """Wait for the first actor with spaces, and return the spaces, or None if `stop` is set first.
+    def await_actor(self, stop: threading.Event, on_wait: Callable[[], None] = lambda: None) -> bool:
+        """Wait until an actor has joined, and return whether one has; False if `stop` is set first.
 
         `on_wait` is called again and again meanwhile.
         """
         hint_at: float | None = time.monotonic() + _HINT_SECONDS
         with self.lock:
-            while self.fleet.spaces is None and not stop.is_set():
+            while not self.fleet.has_had_actors and not stop.is_set():
                 on_wait()
                 self.lock.wait(HEARTBEAT_SECONDS)
                 if hint_at is not None and time.monotonic() > hint_at:
                     _logger.info("waiting for the first actor: start one with `daedalus actor --connect ADDRESS`")
                     hint_at = None
-            return self.fleet.spaces
+            return self.fleet.has_had_actors
 
     def offer_policy(self, program: bytes, state_size: int) -> None:
         """Make the policy program available to actors. `state_size` is the size of the recurrent state in rollouts."""

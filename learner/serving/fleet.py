@@ -32,7 +32,7 @@ class Fleet:
 
     def __init__(self, seed: int, spaces: Spaces | None) -> None:
         self._seed = seed
-        self.spaces = spaces  # from the first actor or the checkpoint
+        self.spaces = spaces  # known before, or from the first actor
         self.actors: dict[str, Actor] = {}  # joined actors, by name
         self.pushed_bytes = 0  # snapshots published so far, as sent to each subscriber
         self.forgotten = 0  # number of actors that were forgotten
@@ -66,7 +66,7 @@ class Fleet:
             return Refusal(
                 code="mismatch",
                 reason=f"the actor's environment has {join.spaces}, but this run has {self.spaces}: "
-                "install the version of the environment that the other actors use",
+                "install the version of the environment that the run uses",
             )
         if join.actor not in self.actors:
             reason = self._make_room(keys.owner(join.actor))
@@ -203,6 +203,11 @@ class Fleet:
         """Count `size` bytes received from an actor."""
         if name in self.actors:
             self.actors[name].received_bytes += size
+
+    @property
+    def has_had_actors(self) -> bool:
+        """Whether an actor has joined, now or before."""
+        return bool(self.actors) or self.forgotten > 0
 
     def find(self, identity: RolloutIdentity) -> Actor | None:
         """Return the actor of a rollout, or None if its incarnation is not the newest that has joined."""

@@ -135,20 +135,34 @@ class Learner:
         statistics = {f"{kind}/{name}": value for name, value in self._optimizer.statistics.items()}
         return {"torch_random_state": torch.get_rng_state(), **statistics}
 
+    def load(self, parameters: dict[str, np.ndarray]) -> None:
+        """Replace all parameters by the result of `weights` of another learner.
+
+        Raises CheckpointMismatchError, which names a difference, if they belong to another network.
+        """
+        for name, parameter in self._parameters.items():
+            if name not in parameters:
+                raise CheckpointMismatchError(f"the checkpoint has no weights {name!r}, which this run's network has")
+            if parameters[name].shape != tuple(parameter.shape):
+                raise CheckpointMismatchError(
+                    f"the weights {name!r} are {parameters[name].shape} in the checkpoint and {tuple(parameter.shape)} "
+                    "in this run's network: use the same environment and [policy] settings"
+                )
+        unknown = parameters.keys() - self._parameters.keys()
+        if unknown:
+            raise CheckpointMismatchError(
+                f"the checkpoint has weights {min(unknown)!r}, which this run's network lacks"
+            )
+        with torch.no_grad():
+            for name, parameter in self._parameters.items():
+                parameter.copy_(torch.from_numpy(parameters[name].copy()))
+
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
         """Restore a version from the results of `weights` and `state`; training then continues exactly as before.
 
         Raises CheckpointMismatchError if they belong to another network or optimiser.
         """
-        shapes = {name: tuple(array.shape) for name, array in parameters.items()}
-        expected = {name: tuple(parameter.shape) for name, parameter in self._parameters.items()}
-        if shapes != expected:
-            raise CheckpointMismatchError(
-                "the parameters of the checkpoint are of another network: restore the [policy] settings of the run"
-            )
-        with torch.no_grad():
-            for name, parameter in self._parameters.items():
-                parameter.copy_(torch.from_numpy(parameters[name].copy()))
+        self.load(parameters)
         for name, statistic in self._optimizer.statistics.items():
             saved = state.get(f"{self._spec.optimizer}/{name}")
             if saved is None or saved.shape != statistic.shape:

@@ -55,7 +55,7 @@ def build_encoder(spec: PolicySpec, space: ArraySpace, modules: UserModules = NO
     Raises NetworkError if a custom encoder may not or cannot be imported, or the encoder does not accept the
     observations.
     """
-    name = _chosen(space) if spec.encoder == "auto" else spec.encoder
+    name = encoder_name(spec, space)
     match name:
         case "mlp":
             return MultilayerPerceptron(space, spec.hidden, spec.activation)
@@ -71,8 +71,10 @@ def build_encoder(spec: PolicySpec, space: ArraySpace, modules: UserModules = NO
             return CustomEncoder(name, space, modules)
 
 
-def _chosen(space: ArraySpace) -> str:
-    """Return the encoder for a space: convolutions for images of bytes."""
+def encoder_name(spec: PolicySpec, space: ArraySpace) -> str:
+    """Return the name of the encoder for a space; `auto` chooses convolutions for images of bytes."""
+    if spec.encoder != "auto":
+        return spec.encoder
     sides = sorted(space.shape)[-2:]  # colours first or last: the longest sides are those of the image
     if space.dtype != "uint8" or len(space.shape) not in (2, 3) or min(sides) < _SMALLEST_IMAGE:
         return "mlp"

@@ -28,7 +28,7 @@ Start = Callable[..., Running]
         (["train", "nothing.toml"], 2, r"nothing.toml: No such file"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
         (["evaluate", "nowhere"], 1, r"nowhere has no checkpoints"),
-        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere/metrics.csv"),
+        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere is not a run directory: it has neither"),
         (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
         (
             ["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"],
@@ -50,10 +50,25 @@ def test_a_mistake_is_reported_in_one_line(
     assert not list(tmp_path.iterdir())  # no run was started
 
 
-def test_an_unknown_environment_ends_training_with_similar_names(start: Start) -> None:
-    running = start("train", "--env", "CartPoll-v1", "--run-dir", "run")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["CartPoll-v1"], "unknown environment 'CartPoll-v1': did you mean CartPole-v1"),
+        (
+            ["faulty_environments:Faulty-v0", "--set", "environment.kwargs.fault=shape"],
+            r"Faulty-v0: reset returns an observation of shape \(3,\), but observation_space has shape \(2,\)",
+        ),
+    ],
+)
+def test_a_fault_of_the_environment_is_reported_once_before_anything_starts(
+    start: Start, tmp_path: Path, words: list[str], message: str
+) -> None:
+    run = tmp_path / "run"
+    running = start("train", "--env", *words, "--run-dir", run, directory=Path(__file__).parent.parent)
     assert running.wait() == 1
-    running.expect("unknown environment 'CartPoll-v1': did you mean CartPole-v1")
+    running.expect(message)
+    assert len(running.lines) == 1, running.output
+    assert not run.exists()
 
 
 def test_a_missing_cuda_device_is_reported_in_one_line(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from processes import Running, until
@@ -51,14 +52,15 @@ def test_another_protocol_version_is_refused_and_both_versions_are_named(client:
     assert f"this one {PROTOCOL_VERSION}" in answer.reason
 
 
-def test_mismatching_spaces_are_refused_and_both_are_named(client: Transport) -> None:
-    first = ask(client, keys.join("*", "client"), join(spaces=CARTPOLE, environments=2))
-    assert isinstance(first, Welcome)
+def test_a_foreign_join_that_comes_first_does_not_decide_the_spaces(client: Transport) -> None:
+    """The learner's host can make the environment."""
     other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
     answer = ask(client, keys.join("run", "client"), join(spaces=other, environments=2))
     assert isinstance(answer, Refusal)
+    assert answer.code == "mismatch"
     assert "3 choices" in answer.reason
     assert "2 choices" in answer.reason
+    assert isinstance(ask(client, keys.join("*", "client"), join(spaces=CARTPOLE, environments=2)), Welcome)
 
 
 def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) -> None:
@@ -111,9 +113,21 @@ def test_a_second_learner_of_the_same_run_is_refused(start: Start, address: str)
         router.close()
 
 
-def test_a_refused_actor_prints_the_reason_and_ends(start: Start, client: Transport, address: str) -> None:
-    other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
-    ask(client, keys.join("run", "client"), join(spaces=other, environments=2))
-    actor = start("actor", "--connect", address)
-    assert actor.wait() == 1
-    actor.expect("learner refused this actor: the actor's environment has .*2 choices, but this run has .*3 choices")
+def test_where_the_learner_cannot_make_the_environment_a_refused_actor_prints_the_reason(
+    start: Start, address: str
+) -> None:
+    """The module is not in the learner's folder: the first actor decides the spaces."""
+    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run")
+    learner.expect("the first actor decides the spaces of the run, because .* cannot import slow_environment")
+    learner.expect("actors join with")
+    transport = connect([address])
+    try:
+        until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
+        other = CARTPOLE.model_copy(update={"action": DiscreteSpace(count=3)})
+        assert isinstance(ask(transport, keys.join("run", "client"), join(spaces=other, environments=2)), Welcome)
+        options = "--connect", address, "--allow-module", "slow_environment"
+        actor = start("actor", *options, directory=Path(__file__).parent.parent)
+        assert actor.wait() == 1
+        actor.expect("refused.*2 choices.*but this run has.*3 choices")
+    finally:
+        transport.close()

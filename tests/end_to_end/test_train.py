@@ -126,28 +126,30 @@ def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: 
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_resume_restores_the_exact_state_and_continues(solved: tuple[Path, str], start: Start, tmp_path: Path) -> None:
-    """Resume with a used-up budget: the loaded state is saved again and must be equal."""
+def test_resume_has_nothing_to_do_or_continues_with_new_settings(start: Start, tmp_path: Path) -> None:
     first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run")
     assert first.wait() == 3, first.output  # the budget ended without the target
     before = newest_checkpoint(tmp_path / "run")
-    files = {name: (before / name).read_bytes() for name in ("learner.safetensors", "parameters.safetensors")}
-    steps = summary(tmp_path / "run")["env_steps"]
+    rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
 
-    idle = start("resume", "run")
+    idle = start("resume", "run", "--set", "service.log_seconds=0.1")
     assert idle.wait() == 3, idle.output
-    again = newest_checkpoint(tmp_path / "run")
-    assert again.name == before.name
-    assert {name: (again / name).read_bytes() for name in files} == files
-    assert summary(tmp_path / "run")["env_steps"] == steps
+    assert idle.lines == [
+        f"nothing to do: {end['env_steps']:,} env_steps are done, and the budget is 20,000: raise it with --env-steps"
+    ]
+    assert newest_checkpoint(tmp_path / "run") == before
+    assert (metrics(tmp_path / "run"), summary(tmp_path / "run")) == (rows, end)
 
-    further = start("resume", "run", "--env-steps", 60000)
+    changed = ("--set", "training.learning_rate_final=0.0001", "--set", "evaluation.final_episodes=3")
+    further = start("resume", "run", "--env-steps", 60000, *changed)
     assert further.wait() == 3, further.output
     result = summary(tmp_path / "run")
     assert result["env_steps"] >= 60000
+    assert result["evaluation"]["episodes"] == 3
     assert int(newest_checkpoint(tmp_path / "run").name) == result["updates"] > int(before.name)
     rows = metrics(tmp_path / "run")
     assert [int(row["env_steps"]) for row in rows] == sorted(int(row["env_steps"]) for row in rows)
+    assert float(rows[-1]["learning_rate"]) == 0.0001
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -375,9 +375,16 @@ def test_random_state_is_restored(tmp_path: Path) -> None:
 
 def test_restore_refuses_parameters_of_another_network(tmp_path: Path) -> None:
     checkpoint = saved(make_learner(), tmp_path)
-    for other in (PolicySpec(hidden=(9,)), PolicySpec(hidden=(8, 8)), RECURRENT):
-        with pytest.raises(CheckpointMismatchError, match="another network"):
+    for other, difference in (
+        (PolicySpec(hidden=(9,)), r"the weights 'encoder.layers.0.weight' are \(8, 3\) in the checkpoint and \(9, 3\)"),
+        (RECURRENT, r"the checkpoint has no weights 'memory.+', which this run's network has"),
+        (PolicySpec(hidden=(8, 8)), "the checkpoint has no weights 'encoder.layers.2.weight'"),
+    ):
+        with pytest.raises(CheckpointMismatchError, match=difference):
             restored(make_learner(other), checkpoint)
+    recurrent = saved(make_learner(RECURRENT.model_copy(update={"hidden": (8,)})), tmp_path)
+    with pytest.raises(CheckpointMismatchError, match=r"has weights 'memory.+', which this run's network lacks|are \("):
+        restored(make_learner(), recurrent)
 
 
 @pytest.mark.parametrize(("wrote", "reads"), [("rmsprop", "adam"), ("adam", "rmsprop")])

@@ -22,9 +22,10 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.service import LearnerService
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
+from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
-from daedalus.policy.saving.saved_policy import checkpoints, read_policy
+from daedalus.policy.saving.saved_policy import SavedPolicy, checkpoints, read_policy
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
@@ -40,10 +41,17 @@ FAST = {"log_seconds": 0.05, "checkpoint_seconds": 1e6, "keep_checkpoints": 1}
 class TrainingRun:
     """Learner, actor and evaluator of one run, each on its own thread."""
 
-    def __init__(self, directory: Path, *, restored: Checkpoint | None = None, **sections: Any) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        restored: Checkpoint | None = None,
+        initial: SavedPolicy | None = None,
+        **sections: Any,
+    ) -> None:
         self.directory = directory / "run"
         self.directory.mkdir(exist_ok=restored is not None)
-        self._restored = restored
+        self._restored, self._initial = restored, initial
         self.spec = RunSpec.model_validate(
             {
                 "environment": {"id": "CartPole-v1", "frame_stack": 2},
@@ -88,6 +96,7 @@ class TrainingRun:
                 writers,
                 started=time.monotonic(),
                 restored=self._restored,
+                initial=self._initial,
             ).run()
         finally:
             transport.close()
@@ -109,7 +118,8 @@ class TrainingRun:
         for thread in self._threads:
             thread.join(60.0)
             assert not thread.is_alive()
-        assert not self._errors
+        for error in self._errors:
+            raise error
 
     def finish(self) -> None:
         """Wait for the learner to use up its budget, then for the threads."""
@@ -354,3 +364,50 @@ def test_resuming_with_a_learning_rate_of_0_is_reported(tmp_path: Path) -> None:
     settings["training"]["env_steps"] = 200
     TrainingRun(tmp_path, restored=load_newest(tmp_path / "run"), **settings).finish()
     assert sum("the learning rate has been annealed to 0" in line for line in LINES) == 1
+
+
+def budget(env_steps: int) -> dict[str, Any]:
+    training = {"env_steps": env_steps, "stop_when_solved": False, "algorithm": "appo", **FEW_UPDATES}
+    return {"training": training, "service": {**FAST, "keep_checkpoints": 99}}
+
+
+def test_the_restored_state_is_exact(tmp_path: Path) -> None:
+    """Nothing is left to train: the state that was loaded is saved again, and the row has no rates."""
+    TrainingRun(tmp_path, **budget(200)).finish()
+    (before,) = checkpoints(tmp_path / "run")[:1]
+    files = {name: (before / name).read_bytes() for name in ("learner.safetensors", "parameters.safetensors")}
+    again = TrainingRun(tmp_path, restored=load_newest(tmp_path / "run"), **budget(200))
+    again.finish()
+    assert checkpoints(tmp_path / "run")[0] == before
+    assert {name: (before / name).read_bytes() for name in files} == files
+    rates = ("env_steps_per_second", "updates_per_second", "policy_lag_mean")
+    assert [again.rows()[-1][name] for name in rates] == ["", "", ""]
+
+
+def test_a_run_begins_with_the_weights_of_another(tmp_path: Path) -> None:
+    """They are in its first checkpoint, so that a learner which is killed early continues from them."""
+    (tmp_path / "first").mkdir()
+    first = TrainingRun(tmp_path / "first", **budget(200))
+    first.finish()
+    initial = read_policy(checkpoints(first.directory)[0])
+    second = TrainingRun(tmp_path, initial=initial, **budget(300))
+    second.finish()
+    newest, *_, oldest = [read_policy(each) for each in checkpoints(second.directory)]
+    assert (oldest.policy_version, newest.policy_version > 0) == (0, True)
+    for name, array in initial.weights.items():
+        np.testing.assert_array_equal(oldest.weights[name], array)
+    assert any((newest.weights[name] != array).any() for name, array in initial.weights.items())
+    assert any(f"initial weights: policy version {initial.policy_version} of" in line for line in LINES)
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "first").mkdir()
+    first = TrainingRun(tmp_path / "first", **budget(100), policy={"hidden": [8]})
+    first.finish()
+    initial = read_policy(checkpoints(first.directory)[0])
+    with pytest.raises(CheckpointMismatchError) as refused:
+        TrainingRun(tmp_path, initial=initial, **budget(100), policy={"hidden": [9]}).finish()
+    assert str(refused.value) == (
+        f"--init-from {initial.directory}: the weights 'encoder.layers.0.weight' are (8, 8) in the checkpoint and "
+        "(9, 8) in this run's network: use the same environment and [policy] settings"
+    )

@@ -116,6 +116,14 @@ def test_line_shows_the_return_after_the_first_episode(monkeypatch: pytest.Monke
         assert part in line
 
 
+def test_rates_are_unknown_before_the_first_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    screen = Screen()
+    Progress(screen, 1000).show({"wall_seconds": 2.0, "env_steps": 0, "actors": 2})
+    for part in ("       -/s  left      -  updates     -/s", "lag -  actors 2"):
+        assert part in screen.getvalue()
+
+
 @pytest.mark.parametrize("columns", [20, 60, 80, 100, 200])
 def test_line_fits_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))

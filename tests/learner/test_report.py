@@ -50,12 +50,23 @@ def test_rates_are_since_the_last_measurement() -> None:
     expected = {"env_steps_per_second": 18.0, "updates_per_second": 0.5, "policy_lag_mean": 1.5}
     assert meter.measure(counters, joined_fleet(), 12.0) == expected
     assert meter.rates == expected
-    assert set(meter.measure(counters, joined_fleet(), 13.0).values()) == {0.0}
+    stalled = {"env_steps_per_second": 0.0, "updates_per_second": 0.0}  # no rollout, so no policy lag
+    assert meter.measure(counters, joined_fleet(), 13.0) == stalled
+
+
+def test_rates_before_the_first_batch_and_after_the_last_are_unknown() -> None:
+    counters = trained_counters()  # of the process before a resume
+    meter = RateMeter(counters, 10.0)
+    assert meter.measure(counters, joined_fleet(), 12.0) == {}
+    counters.trained([make_rollout(version=1, valid=EVERYTHING)], 4, 1)
+    everything = {"env_steps_per_second", "updates_per_second", "policy_lag_mean"}
+    assert set(meter.measure(counters, joined_fleet(), 13.0, last=True)) == everything
+    assert meter.measure(counters, joined_fleet(), 13.1, last=True) == {}
 
 
 def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
-    meter = RateMeter(trained_counters(), 10.0)
-    assert meter.measure(trained_counters(), joined_fleet(), 10.0)["env_steps_per_second"] == 0.0
+    meter = RateMeter(RunCounters(100), 10.0)
+    assert meter.measure(trained_counters(), joined_fleet(), 10.0)["updates_per_second"] > 1e6
 
 
 def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
@@ -91,7 +102,7 @@ def test_row_has_every_column_when_all_values_are_known() -> None:
     counters, fleet = trained_counters(4.0), joined_fleet("a", "b")
     counters.rollouts_rejected.update({"stale": 2, "malformed": 1})
     fleet.set_present("b", 1, False, 0.0)
-    rates = RateMeter(counters, 0.0).measure(counters, fleet, 1.0)
+    rates = RateMeter(RunCounters(100), 0.0).measure(counters, fleet, 1.0)
     learning = {**dict.fromkeys((*METRICS, *DIAGNOSTICS), 0.5), "learning_rate": 0.1, "entropy_bonus": 0.2}
     learning |= {name: 1.0 for name in COLUMNS if name.startswith("evaluation_")}
     row = metrics_row(counters, fleet, rates, learning, 9.5)

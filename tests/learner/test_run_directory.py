@@ -136,12 +136,3 @@ def test_default_directory_is_named_after_the_run() -> None:
     directory = run_directory.default_directory("ALE/Pong-v5", run_spec(algorithm="a3c", seed=4))
     assert directory.parent == Path("runs")
     assert directory.name.startswith("ALE-Pong-v5-a3c-s4-")
-
-
-def test_with_budget_changes_only_the_budget() -> None:
-    spec = run_spec(algorithm="a3c", target_return=2.0)
-    longer = run_directory.with_budget(spec, 5_000_000)
-    assert longer.training.env_steps == 5_000_000
-    assert run_directory.with_budget(longer, spec.training.env_steps) == spec
-    with pytest.raises(SettingsError, match=r"training\.env_steps"):
-        run_directory.with_budget(spec, 0)

@@ -98,7 +98,9 @@ class LearnerProcess:
         observe(server, self.ledger, self.life)
         try:
             server.open()
-            disk.spaces = server.await_spaces(self.stop)  # type: ignore[arg-type] - a simulated Event
+            if disk.spaces is None:
+                server.await_actor(self.stop)  # type: ignore[arg-type] - a simulated Event
+            disk.spaces = server.fleet.spaces
             if disk.spaces is not None:
                 self._train(server, counters, before)
                 server.close("finished" if self.is_finished else "stopped", finished=self.is_finished)

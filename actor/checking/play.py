@@ -1,0 +1,162 @@
+"""Plays one environment with random actions and reports what it does. No threads."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.checking.report import EnvironmentReport
+from daedalus.actor.checking.single import make_one
+from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import EnvironmentSpec
+
+
+class _ProblemError(Exception):
+    """Error of an environment that cannot be played on."""
+
+
+def check_environment(
+    spec: EnvironmentSpec, modules: UserModules, *, seconds: float, env_steps: int, seed: int = 0
+) -> EnvironmentReport:
+    """Make one environment, play it with random actions, and close it.
+
+    Args:
+      spec: the environment and its transforms.
+      modules: the modules that may be imported for it.
+      seconds: how long to play, unless `env_steps` are done before; 0 only makes the environment.
+      env_steps: the most steps.
+      seed: of the environment and the actions.
+    """
+    try:
+        environment, rest = make_one(spec, modules)
+    except EnvironmentSetupError as error:
+        return EnvironmentReport(problems=(f"{error}{_place(error.__cause__)}",))
+    try:
+        spaces = Transforms(rest, environment.observation_space, environment.action_space).spaces
+        play = _Play(spec.id, environment, _actions(spec, environment.action_space, seed))
+        if seconds > 0.0:
+            play.run(seconds, env_steps, seed)
+        return play.report(spaces)
+    except EnvironmentSetupError as error:
+        return EnvironmentReport(problems=(str(error),))
+    finally:
+        with suppress(Exception):  # of the user's code
+            environment.close()
+
+
+def _actions(spec: EnvironmentSpec, space: gymnasium.Space, seed: int) -> Callable[[], Any]:
+    """Return a function that returns a random action of those that a run can take."""
+    if spec.action_table is None:
+        space.seed(seed)
+        return space.sample
+    rows = np.asarray(spec.action_table, space.dtype).reshape(len(spec.action_table), *(space.shape or ()))
+    random = np.random.default_rng(seed)
+    return lambda: rows[random.integers(len(rows))]
+
+
+class _Play:
+    """One environment in play, and what was found so far."""
+
+    def __init__(self, name: str, environment: gymnasium.Env, action: Callable[[], Any]) -> None:
+        self._name, self._environment, self._action = name, environment, action
+        self._problems: list[str] = []
+        self._warnings: dict[str, str] = {}  # the first of each kind
+        self._env_steps, self._resets = 0, 0
+        self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
+        self._lengths: list[int] = []
+        self._returns: list[float] = []
+
+    def run(self, seconds: float, env_steps: int, seed: int) -> None:
+        """Play until the time or the steps are used up, or a problem is found."""
+        until = time.monotonic() + seconds
+        try:
+            self._reset(seed)
+            length, episode_return = 0, 0.0
+            while not self._env_steps or (self._env_steps < env_steps and time.monotonic() < until):
+                reward, over = self._step()
+                length, episode_return = length + 1, episode_return + reward
+                if over:
+                    self._lengths.append(length)
+                    self._returns.append(episode_return)
+                    self._reset(None)
+                    length, episode_return = 0, 0.0
+        except _ProblemError as error:
+            self._problems.append(str(error))
+
+    def report(self, spaces: Any) -> EnvironmentReport:
+        """Return what was found."""
+        return EnvironmentReport(
+            spaces=spaces,
+            problems=tuple(f"environment {self._name}: {problem}" for problem in self._problems),
+            warnings=tuple(f"environment {self._name}: {warning}" for warning in self._warnings.values()),
+            env_steps=self._env_steps,
+            step_seconds=self._step_seconds / max(self._env_steps, 1),
+            busy_share=min(self._busy_seconds / max(self._step_seconds, 1e-9), 1.0),
+            reset_seconds=self._reset_seconds / max(self._resets, 1),
+            time_limit=getattr(self._environment.spec, "max_episode_steps", None),
+            lengths=tuple(self._lengths),
+            returns=tuple(self._returns),
+        )
+
+    def _reset(self, seed: int | None) -> None:
+        began = time.monotonic()
+        result = self._call("reset", seed=seed)
+        self._reset_seconds += time.monotonic() - began
+        self._resets += 1
+        self._add(reset_violations(self._environment.observation_space, result))
+
+    def _step(self) -> tuple[float, bool]:
+        """Take one random step, and return its reward and whether the episode is over."""
+        action = self._action()
+        began, busy = time.monotonic(), time.process_time()
+        result = self._call("step", action)
+        self._busy_seconds += time.process_time() - busy
+        self._step_seconds += time.monotonic() - began
+        self._env_steps += 1
+        self._add(step_violations(self._environment.observation_space, result))
+        _, reward, terminated, truncated, _ = result
+        return float(reward), bool(terminated or truncated)
+
+    def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
+        try:
+            return getattr(self._environment, method)(*arguments, **keywords)
+        except (Exception, SystemExit) as error:  # of the user's code
+            wrong = self._structure_of(method, arguments, keywords) if isinstance(error, TypeError | ValueError) else ""
+            raise _ProblemError(wrong or f"{method} raises {first_line(error)}{_place(error)}") from None
+
+    def _structure_of(self, method: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> str:
+        """Return the problem if a wrapper failed because the environment returns the wrong number of values."""
+        unwrapped = self._environment.unwrapped
+        violations = reset_violations if method == "reset" else step_violations
+        with suppress(Exception, SystemExit):
+            result = getattr(unwrapped, method)(*arguments, **keywords)
+            found = next(violations(unwrapped.observation_space, result), ("", ""))
+            return found[1] if "a tuple" in found[1] else ""
+        return ""
+
+    def _add(self, violations: Iterator[Violation]) -> None:
+        """Record warnings. Raise _ProblemError for the first problem."""
+        for kind, text in violations:
+            when = f"after {self._env_steps:,} env_steps" if self._env_steps else "at first"
+            if kind == "problem":
+                raise _ProblemError(f"{text} ({when})")
+            without_numbers = re.sub(r"-?\d[\d.e+-]*", "", text)
+            self._warnings.setdefault(without_numbers, f"{text} ({when})")
+
+
+def _place(error: BaseException | None) -> str:
+    """Return the line of the user's code where an error was raised, or an empty string."""
+    place, traceback = "", error.__traceback__ if error is not None else None
+    while traceback is not None:
+        module = traceback.tb_frame.f_globals.get("__name__", "")
+        if module.partition(".")[0] not in ("daedalus", "gymnasium", "importlib", "numpy"):
+            place = f" ({traceback.tb_frame.f_code.co_filename}, line {traceback.tb_lineno})"
+        traceback = traceback.tb_next
+    return place

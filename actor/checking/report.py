@@ -1,0 +1,57 @@
+"""What a check of an environment found, and what follows from it for a run."""
+
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.specification import Specification
+
+_SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchange with another process
+_BUSY = 0.2  # share of processor time below which a step mostly waits, even on a busy machine
+
+
+class EnvironmentReport(Specification):
+    """Result of a check. It crosses a pipe as JSON."""
+
+    spaces: Spaces | None = None  # as a run has them; None if the environment cannot be made or is not supported
+    problems: tuple[str, ...] = ()  # training would fail
+    warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
+    notes: tuple[str, ...] = ()  # advice of gymnasium's own checker
+    env_steps: int = 0  # played
+    step_seconds: float = 0.0  # mean
+    busy_share: float = 1.0  # processor time of the steps, as a share of their duration
+    reset_seconds: float = 0.0  # mean
+    time_limit: int | None = None  # at which gymnasium truncates episodes
+    lengths: tuple[int, ...] = ()  # of the episodes that ended
+    returns: tuple[float, ...] = ()
+
+
+def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str:
+    """Return advice if each actor's environments should have processes of their own, else an empty string.
+
+    Processes help where steps wait for something else, or where processors would be idle.
+    """
+    environment, environments = spec.environment, spec.collection.envs_per_actor
+    if environment.processes or environment.backend != "gymnasium" or environments == 1:
+        return ""
+    idle = report.busy_share < _BUSY or processors > spec.collection.actors
+    if report.step_seconds < _SLOW_SECONDS or not idle:
+        return ""
+    row = report.step_seconds * environments
+    first = row * spec.collection.rollout_length
+    return (
+        f"a step takes {_duration(report.step_seconds)}, and an actor steps its {environments} environments in turn: "
+        f"{_duration(row)} a row, {_duration(first)} a rollout; use --set environment.processes=true"
+    )
+
+
+def never_ends(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if no episode ended and nothing limits episodes, else an empty string."""
+    if report.lengths or report.time_limit is not None or spec.environment.max_episode_steps is not None:
+        return ""
+    return (
+        f"no episode ended within {report.env_steps:,} env_steps of random actions: "
+        "if the environment never ends them, set environment.max_episode_steps"
+    )
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds * 1000:.3g} ms" if seconds < 1.0 else f"{seconds:.3g} s"

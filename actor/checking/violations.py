@@ -1,0 +1,119 @@
+"""Where the results of an environment break gymnasium's interface. Pure functions.
+
+A problem makes training fail; a warning does not. Both are clauses without the name of the environment.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+Violation = tuple[str, str]  # "problem" or "warning", and the text
+
+
+def observation_violations(space: gymnasium.Space, value: Any, call: str) -> Iterator[Violation]:
+    """Yield what makes an observation, returned by `call`, differ from its space."""
+    yield from _violations(space, value, f"{call} returns an observation", "observation_space")
+
+
+def _violations(space: gymnasium.Space, value: Any, what: str, where: str) -> Iterator[Violation]:
+    match space:
+        case gymnasium.spaces.Dict():
+            yield from _parts(dict(space.spaces), value, what, where)
+        case gymnasium.spaces.Tuple():
+            parts = dict(enumerate(space.spaces))
+            items = dict(enumerate(value)) if isinstance(value, tuple | list) else value
+            yield from _parts(parts, items, what, where)
+        case gymnasium.spaces.Box():
+            yield from _array_violations(space, value, what, where)
+        case _ if not space.contains(value):
+            yield "problem", f"{what} {_shown(value)}, which is not in {where} {space}"
+
+
+def _parts(spaces: Mapping[Any, gymnasium.Space], value: Any, what: str, where: str) -> Iterator[Violation]:
+    if not isinstance(value, Mapping):
+        yield "problem", f"{what} of type {type(value).__name__}, but {where} has the parts {sorted(spaces, key=str)}"
+        return
+    if set(value) != set(spaces):
+        parts = sorted(value, key=str)
+        yield "problem", f"{what} with the parts {parts}, but {where} has the parts {sorted(spaces, key=str)}"
+        return
+    for name, space in spaces.items():
+        yield from _violations(space, value[name], f"{what} whose part {name!r} is", f"{where}[{name!r}]")
+
+
+def _array_violations(space: gymnasium.spaces.Box, value: Any, what: str, where: str) -> Iterator[Violation]:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.array(None)
+    if array.dtype.kind not in "biuf":
+        yield "problem", f"{what} of type {type(value).__name__}, which is not an array of numbers; {where} is {space}"
+    elif array.shape != space.shape:
+        yield "problem", f"{what} of shape {array.shape}, but {where} has shape {space.shape}"
+    elif not np.can_cast(array.dtype, space.dtype, "same_kind"):
+        yield "problem", f"{what} of dtype {array.dtype}, but {where} has dtype {space.dtype}"
+    elif array.dtype.kind == "f" and not np.isfinite(array).all():
+        index = _first(~np.isfinite(array))
+        yield "problem", f"{what} with the value {array[index]} at index {_index(index)}: it must be finite"
+    elif (outside := (array < space.low) | (array > space.high)).any():
+        index = _first(outside)
+        bounds = f"from {space.low[index]:g} to {space.high[index]:g}"
+        yield "warning", f"{what} with the value {array[index]:g} at index {_index(index)}, but {where} goes {bounds}"
+
+
+def _first(mask: np.ndarray) -> tuple[int, ...]:
+    return tuple(int(each) for each in np.argwhere(mask)[0])
+
+
+def _index(index: tuple[int, ...]) -> str:
+    return str(index[0] if len(index) == 1 else index)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"of type {type(value).__name__}"
+
+
+def reset_violations(space: gymnasium.Space, result: Any) -> Iterator[Violation]:
+    """Yield what is wrong with the result of `reset`."""
+    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+        yield "problem", f"reset returns {_structure(result)}; it must return a tuple (observation, info), info a dict"
+        return
+    yield from observation_violations(space, result[0], "reset")
+
+
+def step_violations(space: gymnasium.Space, result: Any) -> Iterator[Violation]:
+    """Yield what is wrong with the result of `step`."""
+    if not isinstance(result, tuple) or len(result) != 5:
+        expected = "(observation, reward, terminated, truncated, info)"
+        yield "problem", f"step returns {_structure(result)}; it must return a tuple {expected}"
+        return
+    observation, reward, terminated, truncated, info = result
+    yield from observation_violations(space, observation, "step")
+    yield from _reward_violations(reward)
+    for name, flag in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(flag, bool | np.bool_):
+            yield "warning", f"step returns {name}={_shown(flag)}, of type {type(flag).__name__}: it must be a bool"
+    if not isinstance(info, dict):
+        yield "problem", f"step returns info of type {type(info).__name__}: it must be a dict"
+
+
+def _reward_violations(reward: Any) -> Iterator[Violation]:
+    try:
+        number = float(reward)
+    except (TypeError, ValueError):
+        yield "problem", f"step returns the reward {_shown(reward)}: it must be a number"
+        return
+    if np.ndim(reward):
+        yield "warning", f"step returns a reward of shape {np.shape(reward)}: it must be a number"
+    if not math.isfinite(number):
+        yield "problem", f"step returns the reward {number}: it must be finite"
+
+
+def _structure(result: Any) -> str:
+    if isinstance(result, tuple):
+        return f"a tuple of {len(result)} ({', '.join(type(each).__name__ for each in result)})"
+    return f"one value of type {type(result).__name__}"

@@ -1,0 +1,135 @@
+"""`daedalus check`: play an environment with random actions; report its faults, its speed and what train chooses."""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+
+import numpy as np
+
+from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.checking.play import check_environment
+from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.cli.arguments import command_parser
+from daedalus.cli.settings_arguments import add_settings, resolve_spec
+from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.user_modules import UserModules, modules_of
+from daedalus.protocol.spec import RunSpec
+
+_DESCRIPTION = """\
+Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
+observations have the shape, the dtype and the bounds of their space, whether all numbers are finite, whether episodes
+end, and how long a step takes. Then prints what `daedalus train` with the same options would choose, and builds the
+network. `daedalus train` itself makes the first steps of this check before it starts."""
+
+_EXAMPLES = """\
+examples:
+  daedalus check --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
+  daedalus check --env my_module:MyEnv-v0 --set environment.kwargs.size=8
+  daedalus check mine.toml --seconds 60
+
+exit status: 0 it can be trained on, 1 it cannot, 2 bad usage"""
+
+_SECONDS, _ENV_STEPS = 10.0, 20_000
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus check`."""
+    options = command_parser("check", _DESCRIPTION, _EXAMPLES)
+    add_settings(options)
+    options.add_argument(
+        "--seconds",
+        type=float,
+        default=_SECONDS,
+        metavar="S",
+        help=f"play for so long, or for {_ENV_STEPS:,} env_steps (default: %(default)g)",
+    )
+    return options
+
+
+def check(arguments: list[str]) -> int:
+    """Run `daedalus check` and return its exit status."""
+    parsed = parser().parse_args(arguments)
+    try:
+        spec = resolve_spec(parsed)
+    except SettingsError as error:
+        print(f"daedalus check: {error}", file=sys.stderr)
+        return 2
+    if not parsed.seconds > 0.0:
+        print(f"daedalus check: --seconds is {parsed.seconds:g}: choose a number above 0", file=sys.stderr)
+        return 2
+    modules = UserModules(frozenset(modules_of(spec.user_modules)))
+    try:
+        with redirect_stdout(sys.stderr):  # the environment may print
+            seed = spec.training.seed
+            environment = spec.environment
+            report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
+            notes = () if report.problems else gymnasium_notes(environment, modules)
+            network = _network(spec, report, modules)
+    except KeyboardInterrupt:
+        print("daedalus check: stopped", file=sys.stderr)
+        return 1
+    problems = [*report.problems, *([network[1]] if network[1] else [])]
+    lines = [*_description(spec, report), *_choices(spec, network[0])]
+    lines += [("warning", text) for text in report.warnings]
+    lines += [("note", text) for text in (*notes, *_advice(spec, report))]
+    lines += [("problem", text) for text in problems] or [("result", "no problem found")]
+    print("\n".join(f"{name:<14}{text}" for name, text in lines))
+    return 1 if problems else 0
+
+
+def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str, str]]:
+    environment = spec.environment
+    yield "environment", f"{environment.id} of {environment.backend}"
+    if report.spaces is not None:
+        yield "spaces", str(report.spaces)
+    if report.lengths:
+        lengths, returns = np.array(report.lengths), np.array(report.returns)
+        yield (
+            "episodes",
+            f"{len(lengths):,} ended, after {lengths.min()} to {lengths.max()} env_steps; "
+            f"return {returns.min():.4g} to {returns.max():.4g}, mean {returns.mean():.4g}",
+        )
+    if report.env_steps:
+        yield (
+            "speed",
+            f"{report.step_seconds * 1000:.3g} ms a step, {report.reset_seconds * 1000:.3g} ms a reset, "
+            f"over {report.env_steps:,} env_steps",
+        )
+
+
+def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
+    collection, training = spec.collection, spec.training
+    target = "no target" if training.target_return is None else f"target return {training.target_return:g}"
+    yield (
+        "train",
+        f"{training.algorithm}, {collection.actors} actors x {collection.envs_per_actor} environments, rollouts of "
+        f"{collection.rollout_length} rows, {training.env_steps:,} env_steps, {target}",
+    )
+    if network:
+        yield "network", network
+
+
+def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
+    if report.problems:
+        return []
+    return [text for text in (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1)) if text]
+
+
+def _network(spec: RunSpec, report: EnvironmentReport, modules: UserModules) -> tuple[str, str]:
+    """Return a description of the network and an empty string, or an empty string and why it cannot be built."""
+    if report.spaces is None:
+        return "", ""
+    from daedalus.policy.network.actor_critic import ActorCritic
+    from daedalus.policy.network.encoders import encoder_name
+    from daedalus.policy.network.errors import NetworkError
+
+    try:
+        network = ActorCritic(spec.policy, report.spaces, modules)
+    except NetworkError as error:
+        return "", str(error)
+    memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"
+    parameters = sum(parameter.numel() for parameter in network.parameters())
+    encoder = encoder_name(spec.policy, report.spaces.observation)
+    return f"encoder {encoder}{memory}, {parameters:,} parameters", ""

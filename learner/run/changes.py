@@ -1,0 +1,46 @@
+"""Changes of settings when a run is resumed."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from daedalus.learner.run.settings import SettingsError, override, run_spec
+from daedalus.protocol.spec import RunSpec
+
+# They define what is learned, and by what: the weights, the statistics of the optimiser and the results so far belong
+# to them.
+_FIXED_SECTIONS = ("environment.", "policy.")
+_FIXED = {"training.algorithm", "training.optimizer", "training.seed"}
+_CHANGEABLE = {"environment.max_episode_steps", "environment.processes"}
+
+
+def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> RunSpec:
+    """Return the specification of a run with `section.key=value` assignments applied.
+
+    Raises SettingsError for an invalid assignment, and for settings that cannot change when the run in `directory` is
+    resumed.
+    """
+    settings = spec.model_dump(mode="json", exclude_none=True)
+    override(settings, assignments)
+    changed = run_spec(settings)
+    before, after = _values(spec), _values(changed)
+    fixed = [name for name in after if after[name] != before[name] and _is_fixed(name)]
+    if fixed:
+        again = " ".join(f"--set {assignment}" for assignment in assignments)
+        raise SettingsError(
+            f"{' and '.join(fixed)} cannot change when a run is resumed: start a new run from the weights of this one, "
+            f"such as with: daedalus train {directory}/config.toml --init-from {directory} {again}"
+        )
+    return changed
+
+
+def _is_fixed(name: str) -> bool:
+    return name not in _CHANGEABLE and (name in _FIXED or name.startswith(_FIXED_SECTIONS))
+
+
+def _values(spec: RunSpec) -> dict[str, Any]:
+    return {
+        f"{section}.{key}": value
+        for section, values in spec.model_dump(mode="json").items()
+        for key, value in values.items()
+    }

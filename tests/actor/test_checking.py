@@ -1,0 +1,161 @@
+"""actor/checking: what is found in environments with faults, and in good ones."""
+
+import gymnasium
+import numpy as np
+import pytest
+from building import run_spec
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+
+from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.checking.play import check_environment
+from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.actor.checking.violations import observation_violations
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+FAULTY = "faulty_environments:Faulty-v0"
+MODULES = UserModules(frozenset({"faulty_environments"}))
+
+
+def check(fault: str = "", seconds: float = 60.0, **settings: object) -> EnvironmentReport:
+    spec = EnvironmentSpec.model_validate({"id": FAULTY, "kwargs": {"fault": fault}, **settings})
+    return check_environment(spec, MODULES, seconds=seconds, env_steps=25)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("shape", "reset returns an observation of shape (3,), but observation_space has shape (2,) (at first)"),
+        ("dtype", "reset returns an observation of type ndarray, which is not an array of numbers"),
+        ("nan", "reset returns an observation with the value nan at index 1: it must be finite"),
+        ("none", "reset returns an observation of type NoneType, which is not an array of numbers"),
+        ("reset", "reset returns one value of type ndarray; it must return a tuple (observation, info)"),
+        ("values", "step returns a tuple of 4 (ndarray, float, bool, bool); it must return a tuple (observation, rew"),
+        ("reward", "step returns the reward nan: it must be finite (after 3 env_steps)"),
+        ("error", "step raises KeyError: 'missing' ("),
+    ],
+)
+@pytest.mark.parametrize("settings", [{}, {"max_episode_steps": 5}, {"action_repeat": 2}])
+def test_a_fault_is_one_problem_of_one_line(fault: str, message: str, settings: dict[str, int]) -> None:
+    if settings and fault in ("reward", "reset"):
+        pytest.skip("a wrapper changes the count or the call")
+    (problem,) = check(fault, **settings).problems
+    assert problem.startswith(f"environment {FAULTY}: {message}")
+    assert "\n" not in problem
+
+
+def test_an_error_of_the_users_code_names_its_line() -> None:
+    for fault in ("error", "constructor"):
+        (problem,) = check(fault).problems
+        assert "faulty_environments.py, line " in problem
+    assert (
+        check("constructor")
+        .problems[0]
+        .startswith(f"environment {FAULTY} cannot be created: FileNotFoundError: level.txt (")
+    )
+
+
+def test_what_does_not_stop_training_is_a_warning_given_once() -> None:
+    report = check("bounds")
+    assert report.warnings == (
+        f"environment {FAULTY}: reset returns an observation with the value 731.5 at index 1, "
+        "but observation_space goes from -1 to 1 (at first)",
+        f"environment {FAULTY}: step returns an observation with the value 731.5 at index 1, "
+        "but observation_space goes from -1 to 1 (after 1 env_steps)",
+    )
+    assert not report.problems
+    (flag,) = check("flag").warnings
+    assert "step returns terminated=0, of type int: it must be a bool" in flag
+
+
+def test_a_good_environment_is_measured() -> None:
+    report = check()
+    assert (report.problems, report.warnings) == ((), ())
+    assert (report.env_steps, report.lengths, report.returns) == (25, (10, 10), (10.0, 10.0))
+    assert report.step_seconds > 0.0
+    assert report == EnvironmentReport.model_validate_json(report.model_dump_json())
+
+
+def test_without_play_only_the_spaces_are_read() -> None:
+    report = check("nan", seconds=0.0)
+    assert report.spaces is not None
+    assert (report.problems, report.env_steps) == ((), 0)
+
+
+def test_a_module_that_is_not_allowed_is_not_imported() -> None:
+    report = check_environment(EnvironmentSpec(id="os:Nothing-v0"), MODULES, seconds=1.0, env_steps=1)
+    assert report.spaces is None
+    assert "may not be imported here" in report.problems[0]
+
+
+@pytest.mark.parametrize("backend", ["envpool", "gymnasium"])
+def test_environments_that_exist_as_vectors_only_are_played(backend: str) -> None:
+    if backend == "envpool":
+        pytest.importorskip("envpool")
+        spec = EnvironmentSpec(id="CartPole-v1", backend="envpool")
+    else:
+        spec = EnvironmentSpec(id="phys2d/CartPole-v1") if "phys2d/CartPole-v1" in gymnasium.registry else None
+        pytest.importorskip("jax")
+    assert spec is not None
+    report = check_environment(spec, MODULES, seconds=60.0, env_steps=200)
+    assert not report.problems
+    assert report.env_steps == 200
+    assert report.lengths
+
+
+def test_random_actions_are_rows_of_the_action_table() -> None:
+    settings = {"id": "Pendulum-v1", "action_table": ((-2.0,), (2.0,))}
+    report = check_environment(EnvironmentSpec.model_validate(settings), MODULES, seconds=60.0, env_steps=10)
+    assert (report.problems, report.env_steps, report.time_limit) == ((), 10, 200)
+
+
+def test_observations_of_several_parts_are_checked_part_by_part() -> None:
+    space = Dict({"camera": Box(0, 255, (2, 2), np.uint8), "joints": Tuple([Discrete(3), Box(-1, 1, (1,))])})
+    good = {"camera": np.zeros((2, 2), np.uint8), "joints": (2, np.zeros(1, np.float32))}
+    assert not list(observation_violations(space, good, "step"))
+    bad = [
+        ({**good, "joints": (3, np.zeros(1, np.float32))}, "whose part 'joints' is whose part 0 is 3, which is not in"),
+        ({"camera": good["camera"]}, "with the parts ['camera'], but observation_space has the parts"),
+        ({**good, "camera": np.zeros((3, 2), np.uint8)}, "whose part 'camera' is of shape (3, 2), but observation_"),
+        ({**good, "camera": np.zeros((2, 2), np.float32)}, "of dtype float32, but observation_space['camera'] has"),
+        (np.zeros(2), "of type ndarray, but observation_space has the parts"),
+    ]
+    for value, message in bad:
+        ((kind, text),) = observation_violations(space, value, "step")
+        assert kind == "problem"
+        assert message in text
+
+
+def test_gymnasiums_own_checker_adds_notes() -> None:
+    notes = gymnasium_notes(EnvironmentSpec(id=FAULTY, kwargs={"fault": "bounds"}), MODULES)
+    assert notes
+    assert all(note.startswith("gymnasium's checker: ") and "\x1b" not in note for note in notes)
+
+
+def spec(**collection: object) -> RunSpec:
+    return run_spec().model_copy(
+        update={"collection": run_spec().collection.model_copy(update={"envs_per_actor": 16, **collection})}
+    )
+
+
+def test_slow_steps_suggest_processes_where_they_help() -> None:
+    waiting = EnvironmentReport(step_seconds=0.2, busy_share=0.0)
+    busy = EnvironmentReport(step_seconds=0.2, busy_share=1.0)
+    advice = slow_steps(waiting, spec(rollout_length=16), processors=2)
+    assert advice == (
+        "a step takes 200 ms, and an actor steps its 16 environments in turn: 3.2 s a row, 51.2 s a rollout; "
+        "use --set environment.processes=true"
+    )
+    assert slow_steps(busy, spec(), processors=16)
+    assert not slow_steps(busy, spec(), processors=2)  # its actors use both processors
+    assert not slow_steps(waiting, spec(envs_per_actor=1), processors=2)
+    assert not slow_steps(EnvironmentReport(step_seconds=0.001, busy_share=0.0), spec(), processors=2)
+    own = spec().model_copy(update={"environment": EnvironmentSpec(id="Any-v0", processes=True)})
+    assert not slow_steps(waiting, own, processors=2)
+
+
+def test_an_environment_without_an_end_is_noted() -> None:
+    endless = check("", kwargs={"never_ends": True})
+    assert "no episode ended within 25 env_steps of random actions" in never_ends(endless, spec())
+    assert not never_ends(check(), spec())
+    assert not never_ends(endless.model_copy(update={"time_limit": 500}), spec())
