@@ -7,24 +7,18 @@ is a small multilayer perceptron for CartPole. Each case runs with a learner of 
 """
 
 import argparse
-import shutil
 import statistics
 import sys
-import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.chaos.scene import ENDLESS, Scene, say, scene
 from benchmarks.running import machine, table
-from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
-from daedalus.cli.processes import stop_on_signals
-from daedalus.policy.user_modules import UserModules
+from benchmarks.slow_actors import MODULE, provide_environment
+from daedalus.actor.session.service import LinkChoice
 from daedalus.protocol.status import RunStatus
-from daedalus.transport.zenoh_transport import connect
 
-_ENVIRONMENT = Path(__file__).parents[1] / "tests" / "slow_environment.py"
-_MODULES = UserModules(frozenset({_ENVIRONMENT.stem}), "the learner")
 _UNLIMITED = 1e12  # bytes per second
 
 
@@ -41,26 +35,12 @@ class Measured:
     learner_cpu: float  # cores
 
 
-def play(address: str, count: int, link: LinkChoice) -> int:
-    """Run the process of the actors."""
-    stop, threads = stop_on_signals(), []
-    for number in range(count):
-        transport = connect([address])
-        config = ActorConfig(name=f"actor-{number}", incarnation=time.monotonic_ns(), link=link, modules=_MODULES)
-        threads.append(threading.Thread(target=ActorService(config, transport, stop).run, daemon=True))
-        threads[-1].start()
-    stop.wait()
-    for thread in threads:
-        thread.join(10.0)
-    return 0
-
-
 def measure(arguments: argparse.Namespace, link: LinkChoice) -> Measured:
     """Measure one case."""
     from faults import SlowProxy  # a module of the tests: benchmarks.chaos adds its folder to the path
 
     with scene() as here:
-        shutil.copy(_ENVIRONMENT, here.folder)
+        provide_environment(here.folder)
         settings = [
             f"environment.kwargs={{seconds={arguments.step_milliseconds / 1000}}}",
             f"collection.envs_per_actor={arguments.envs}",
@@ -71,7 +51,7 @@ def measure(arguments: argparse.Namespace, link: LinkChoice) -> Measured:
         learner = here.start(
             "learner",
             "--env",
-            "slow_environment:Slow-v0",
+            f"{MODULE}:Slow-v0",
             "--listen",
             here.address,
             "--run-dir",
@@ -82,8 +62,8 @@ def measure(arguments: argparse.Namespace, link: LinkChoice) -> Measured:
         here.wait("the learner", here.status)
         proxy = SlowProxy(here.address, up=_UNLIMITED, down=_UNLIMITED, delay=0.0)
         try:
-            playing = ["--play", proxy.address, "--actors", str(arguments.actors), "--link", link]
-            here.run([sys.executable, "-m", "benchmarks.snapshot_traffic", *playing])
+            playing = ["benchmarks.slow_actors", proxy.address, str(arguments.actors), "--link", link, "--stagger", "1"]
+            here.run([sys.executable, "-m", *playing])
             here.wait("all actors", lambda: _trained(here) == arguments.actors)
             time.sleep(arguments.warm_up)
             first, carried, cpu, began = _status(here), dict(proxy.carried), _cpu(learner.process.pid), time.monotonic()
@@ -137,11 +117,7 @@ def main() -> int:
     options.add_argument("--links", nargs="+", default=["auto", "wan"], help="cases to measure (default: auto wan)")
     options.add_argument("--seconds", type=float, default=60.0, help="duration of each case (default: %(default)g)")
     options.add_argument("--warm-up", type=float, default=10.0, help="seconds before each case (default: %(default)g)")
-    options.add_argument("--play", metavar="ADDRESS", help=argparse.SUPPRESS)
-    options.add_argument("--link", default="auto", help=argparse.SUPPRESS)
     parsed = options.parse_args()
-    if parsed.play:
-        return play(parsed.play, parsed.actors, parsed.link)
     rows = []
     for link in parsed.links:
         found = measure(parsed, link)

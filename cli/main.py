@@ -21,6 +21,7 @@ on several machines, one process at a time:
   actor      play environments for a learner; needs only its address
   router     connect learner and actors at a fixed address
   status     show the state of a learner and its actors
+  drain      ask actors to leave after their current rollout
   bridge     connect actors that are written in other languages
   exporter   export the status as Prometheus metrics
   certs      create certificates for encrypted connections
@@ -87,6 +88,12 @@ def _status(arguments: list[str]) -> int:
     return status(arguments)
 
 
+def _drain(arguments: list[str]) -> int:
+    from daedalus.cli.commands.drain import drain
+
+    return drain(arguments)
+
+
 def _router(arguments: list[str]) -> int:
     from daedalus.cli.commands.router import router
 
@@ -123,6 +130,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "check": _check,
     "router": _router,
     "status": _status,
+    "drain": _drain,
     "exporter": _exporter,
     "plot": _plot,
     "certs": _certs,

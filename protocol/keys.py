@@ -53,6 +53,11 @@ def run_end(run: str) -> str:
     return f"daedalus/{run}/end"
 
 
+def drain(run: str, actor: str) -> str:
+    """Return the key of an operator's requests to drain an actor (`*` for all actors)."""
+    return f"daedalus/{run}/drain/{actor}"
+
+
 def presence(run: str, actor: str, incarnation: int | str) -> str:
     """Return the liveliness token of one incarnation of an actor (`*` for all)."""
     return f"daedalus/{run}/actors/{actor}/{incarnation}"
@@ -88,7 +93,7 @@ def intersection(served: str, queried: str) -> str:
 
 
 def last_chunk(key: str) -> str:
-    """Return the last chunk: the actor's name in a join or rollouts key, the evaluator's in an evaluations key."""
+    """Return the last chunk of a key: the name of the actor or evaluator."""
     return key.rsplit("/", 1)[-1]
 
 

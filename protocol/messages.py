@@ -61,7 +61,9 @@ class Welcome:
 class Refusal:
     """Negative answer to any query, with a code."""
 
-    code: Literal["mismatch", "malformed", "not_ready", "unknown", "finished", "full", "name_taken", "failed"]
+    code: Literal[
+        "mismatch", "malformed", "not_ready", "unknown", "finished", "drained", "full", "name_taken", "failed"
+    ]
     reason: str
 
 
@@ -179,7 +181,7 @@ class Rollout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """Verdict on a rollout or an evaluation report. Learner -> sender.
+    """Verdict on a rollout, an evaluation report or a request on `drain/{actor}`. Learner -> sender.
 
     accepted: it will be trained on, unless the learner ends first or its policy lag exceeds the bound.
     busy: the learner's queue is full; send it again later.
@@ -187,9 +189,10 @@ class Acknowledgement:
     fenced: the rollout belongs to another epoch of the learner or another incarnation of the actor; join again.
     quarantined: no rollout of this incarnation is accepted any more, since several were invalid; `reason` says why.
     finished: the run is over.
+    drained: an operator asked this actor to leave; the rollout was judged like any other.
     """
 
-    verdict: Literal["accepted", "busy", "rejected", "fenced", "quarantined", "finished"]
+    verdict: Literal["accepted", "busy", "rejected", "fenced", "quarantined", "finished", "drained"]
     reason: str = ""
     policy_version: int = 0  # of the newest published snapshot
 

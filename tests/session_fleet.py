@@ -66,16 +66,15 @@ class GatedCollector(EnvironmentCollector):
 class GatedActor(Worker):
     """Actor with a gate."""
 
-    def __init__(self, network: MemoryNetwork, name: str) -> None:
+    def __init__(self, network: MemoryNetwork, name: str, incarnation: int = 1) -> None:
         self.collector, self.stop = GatedCollector(), threading.Event()
-        self._name, self._network = name, network
+        self._config, self._network = ActorConfig(name=name, incarnation=incarnation), network
         super().__init__(self._play)
 
     def _play(self) -> Any:
         transport = MemoryTransport(self._network)
         try:
-            config = ActorConfig(name=self._name, incarnation=1)
-            return ActorService(config, transport, self.stop, self.collector).run()
+            return ActorService(self._config, transport, self.stop, self.collector).run()
         finally:
             transport.close()
 

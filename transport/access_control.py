@@ -112,19 +112,20 @@ def _own_rules(actor: str) -> list[dict[str, Any]]:
 
 
 def _operators_rules() -> list[dict[str, Any]]:
-    """Return the rules of operators: query the status, and watch the presence of actors and learner."""
+    """Return the rules of operators: query the status, drain actors, and watch the presence of actors and learner."""
     present = [keys.presence(_RUN, "*", "*"), keys.learner(_RUN)]
+    queried = [keys.status(_RUN), keys.drain(_RUN, "*")]
     return [
         _rule(
             "operators query",
             ["ingress"],
             ["query", "declare_liveliness_subscriber", "liveliness_query"],
-            [keys.status(_RUN), *present],
+            [*queried, *present],
         ),
         _rule(
             "operators receive",
             ["egress"],
             ["reply", "declare_queryable", "liveliness_token"],
-            [keys.status(_RUN), *present],
+            [*queried, *present],
         ),
     ]

@@ -97,6 +97,7 @@ def _small_queries() -> list[dict[str, Any]]:
             keys.program("*", "*"),
             keys.snapshots("*"),
             keys.status("*"),
+            keys.drain("*", "*"),
         ),
         rule("evaluations", EVALUATION_LIMITS.message_bytes, keys.evaluations("*", "*")),
     ]

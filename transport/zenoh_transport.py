@@ -18,6 +18,7 @@ from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.credentials_watch import CredentialsWatch
 from daedalus.transport.interface import Inbox, OnAnswer, Request, Transport, TransportError
+from daedalus.transport.linger import linger_removal
 from daedalus.transport.zenoh_callbacks import Callbacks
 from daedalus.transport.zenoh_messages import ZenohInbox, ZenohRequest
 from daedalus.transport.zenoh_session import OpenSession, session_opener
@@ -101,6 +102,11 @@ class ZenohTransport:
         self._lock = threading.Lock()
         self._callbacks = Callbacks()
         self._watch: CredentialsWatch | None = None
+        self._declare(self._listener_of_connections)
+
+    def _listener_of_connections(self, session: zenoh.Session) -> object:
+        callback = self._callbacks.hold(linger_removal().connections_changed)
+        return session.info.declare_link_events_listener(callback, history=True)
 
     @property
     def local_address(self) -> str:

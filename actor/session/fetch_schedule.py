@@ -4,7 +4,7 @@ An actor uses one snapshot for each rollout. If it fetched that snapshot when th
 answer; if it fetched the snapshot much earlier, the policy would be older than necessary.
 """
 
-_PATIENCE = 0.1  # the longest wait for an answer, relative to the duration of a rollout
+_LEAST_PATIENCE, _MOST_PATIENCE = 0.1, 0.25  # of a wait for an answer, relative to the duration of a rollout
 _FIRST_SECONDS = 1.0  # the expected duration of the first rollout
 
 
@@ -14,13 +14,15 @@ class FetchSchedule:
     def __init__(self) -> None:
         self._began, self._rollout_seconds = 0.0, 0.0  # of the last rollout
         self._due_at = 0.0
+        self._fetch_seconds = 0.0  # of the last fetch
         self._lead = 0.0  # how long before the end of a rollout the fetch is due
         self._asked_at, self._interval = 0.0, 0.0  # of calls of `is_due`
 
     def begin_rollout(self, now: float, fetch_seconds: float) -> None:
         """Note that a rollout begins, and how long the last fetch took."""
         self._began = self._asked_at = now
-        self._lead = 2.0 * (fetch_seconds + self._interval)
+        self._fetch_seconds = fetch_seconds
+        self._lead = fetch_seconds + self._interval
         expected = self._rollout_seconds or _FIRST_SECONDS
         self._due_at = now + max(expected - self._lead, 0.0)
 
@@ -46,4 +48,5 @@ class FetchSchedule:
     @property
     def patience(self) -> float:
         """The longest time for a rollout that is about to begin to wait for its snapshot."""
-        return _PATIENCE * self._rollout_seconds
+        least, most = _LEAST_PATIENCE * self._rollout_seconds, _MOST_PATIENCE * self._rollout_seconds
+        return min(max(2.0 * self._fetch_seconds, least), most)

@@ -36,7 +36,7 @@ class InFlightRollouts:
     fastest_answer: float = math.inf  # seconds: the link's own latency; slower answers also waited at the learner
     last_was_rejected: bool = False  # whether the last final acknowledgement was a rejection
     rejections_in_a_row: int = 0  # among the last final acknowledgements
-    ended_by: str = ""  # the verdict that ended the session: "fenced", "quarantined" or "finished"
+    ended_by: str = ""  # the verdict that ended the session: "fenced", "quarantined", "finished" or "drained"
     reason: str = ""  # in the last final acknowledgement
 
     @property
@@ -102,7 +102,7 @@ class InFlightRollouts:
         self.last_was_rejected = answer.verdict == "rejected"
         self.rejections_in_a_row = self.rejections_in_a_row + 1 if self.last_was_rejected else 0
         self.reason = answer.reason
-        if answer.verdict in ("fenced", "quarantined", "finished"):
+        if answer.verdict in ("fenced", "quarantined", "finished", "drained"):
             self.ended_by = answer.verdict
 
 

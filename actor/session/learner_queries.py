@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, VersionMismatchError, decode, encode
@@ -139,10 +139,9 @@ class LearnerQueries:
             raise ActorError(f"several learners answer here ({names}): choose one with --run")
         if welcomes:
             return welcomes[0]
+        _raise_if_over(answers)
         for refusal in answers:
             if isinstance(refusal, Refusal):
-                if refusal.code == "finished":
-                    raise RunOverError("the run is over", finished=True)
                 if refusal.code == "not_ready":  # the learner is stopping; another process may continue the run
                     return None
                 kind = NameInUseError if refusal.code == "name_taken" else ActorRefusedError
@@ -160,8 +159,10 @@ class LearnerQueries:
             self._transport.query(keys.join(run, join.actor), encode(failed), timeout=_REPORT_SECONDS)
 
     def learner_responds(self, run: str, join: Join) -> bool:
-        """Return whether any learner of `run` answers a request to join, with whatever answer."""
-        return bool(self._ask(keys.join(run, join.actor), encode(join)))
+        """Return whether any learner of `run` answers a request to join. Raises RunOverError if the answer says so."""
+        answers = self._ask(keys.join(run, join.actor), encode(join))
+        _raise_if_over(answers)
+        return bool(answers)
 
     def program(self, run: str, name: str = "*") -> tuple[str, bytes] | None:
         """Return hash and bytes of the program with that hash (`*`: the current one), or None if nobody has it."""
@@ -230,3 +231,12 @@ class LearnerQueries:
         except TransportError:
             return []
         return [message for message in map(self.decode, answers) if message is not None]
+
+
+def _raise_if_over(answers: list[Message]) -> None:
+    """Raise RunOverError if an answer says that the run is over, or that an operator drained this actor."""
+    for answer in answers:
+        if isinstance(answer, Refusal) and answer.code == "finished":
+            raise RunOverError("the run is over", finished=True)
+        if isinstance(answer, Refusal) and answer.code == "drained":
+            raise RunOverError(DRAINED)

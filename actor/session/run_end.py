@@ -9,6 +9,8 @@ from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import RunEnded
 from daedalus.transport.interface import Inbox, Transport
 
+DRAINED = "an operator drained this actor: it leaves the run"
+
 
 class RunOverError(Exception):
     """The session ends for good: the run finished, or the actor was asked to stop; the message says which."""

@@ -252,7 +252,7 @@ class ActorService:
         return rollout
 
     def _on_row(self) -> None:
-        self._end.check()
+        self._monitor.check_over()
         self._snapshots.fetch_if_due()
 
     def _warn_of_rejections(self) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import ActorRefusedError, LearnerLostError, LearnerQueries
-from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol.messages import Join
@@ -65,23 +65,33 @@ class SessionMonitor:
     def check(self) -> None:
         """Raise if there is a reason to stop collecting.
 
-        Raises RunOverError if the run or the actor is over, ActorRefusedError in quarantine, LearnerLostError if the
-        learner left or does not accept rollouts of this learner epoch any more.
+        Raises as `check_over` does, and LearnerLostError if the learner left or does not accept rollouts of this
+        learner epoch any more.
         """
         with self._lock:
-            ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
             left = self._presence.left
-        self._end.check()  # after the presence was read: a learner that finished says so before it leaves
+        self.check_over()  # after the presence was read: a learner that finished says so before it leaves
+        if self._end.learner_stopped:
+            raise LearnerLostError("the learner was stopped; waiting for it to return")
+        if left or self._uploads.in_flight.ended_by == "fenced":
+            raise LearnerLostError
+
+    def check_over(self) -> None:
+        """Raise if the session is over for good: its rollout need not be completed.
+
+        Raises RunOverError if the run or the actor is over, ActorError in quarantine.
+        """
+        self._end.check()
+        with self._lock:
+            ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
         if ended_by == "quarantined":
             raise ActorRefusedError(
                 f"the learner quarantined this actor: {reason}; fix the cause and restart the actor"
             )
         if ended_by == "finished":
             raise RunOverError("the run is over", finished=True)
-        if self._end.learner_stopped:
-            raise LearnerLostError("the learner was stopped; waiting for it to return")
-        if left or ended_by == "fenced":
-            raise LearnerLostError
+        if ended_by == "drained":
+            raise RunOverError(DRAINED)
 
     def _probe_if_silent(self) -> None:
         """After a long silence ask whether the learner is there: a dead session can look alive.

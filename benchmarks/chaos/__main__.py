@@ -9,7 +9,7 @@ import argparse
 import sys
 import time
 
-from benchmarks.chaos import actors, clocks, learners, network, wire
+from benchmarks.chaos import actors, clocks, endings, learners, network, orders, wire
 from benchmarks.chaos.scene import FailedError, say
 from benchmarks.running import machine, table
 
@@ -29,9 +29,12 @@ def main() -> int:
         "freezes": lambda: actors.freezes(scaled(20)),
         "accounting": lambda: actors.accounting(scaled(30)),
         "learners": lambda: learners.kills(scaled(50)),
+        "ends": lambda: endings.run_ends(scaled(100)),
+        "restarts": lambda: endings.restarts(scaled(100)),
         "stops": lambda: learners.stops(scaled(8)),
         "routers": lambda: network.routers(scaled(20)),
         "cuts": lambda: network.cuts(30.0 if arguments.scale >= 1.0 else 8.0, scaled(2)),
+        "orders": lambda: orders.orders(scaled(12)),
         "checkpoints": lambda: learners.damaged(scaled(1000)),
         "overload": lambda: wire.overload(max(60.0 * arguments.scale, 10.0)),
         "subscriber": lambda: wire.slow_subscriber(max(20.0 * arguments.scale, 5.0)),

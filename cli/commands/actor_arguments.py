@@ -24,8 +24,9 @@ examples:
   daedalus actor --connect tls/gpu-box:7447 --tls actor-arm-3
   daedalus actor --connect tcp/gpu-box:7447 --allow-module corridor      (the run plays corridor:Corridor-v0)
   daedalus actor --connect tcp/127.0.0.1:7447 --evaluator
+  daedalus actor --connect tcp/router:7447 --stay      (serves one run after another)
 
-exit status: 0 the run is over or the actor was stopped, 1 failed, 2 bad usage"""
+exit status: 0 the run is over, the actor was stopped or an operator drained it; 1 failed; 2 bad usage"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,6 +51,11 @@ def parser() -> argparse.ArgumentParser:
         "--evaluator",
         action="store_true",
         help="play greedily on the schedule of the run and report the returns, instead of sending rollouts",
+    )
+    options.add_argument(
+        "--stay",
+        action="store_true",
+        help="wait for the next run when a run is over, instead of ending. `daedalus drain` or a signal ends the actor",
     )
     add_tls(options)
     add_logging(options)

@@ -27,6 +27,7 @@ _PARSERS = {
     "actor": ("commands.actor_arguments", "parser"),
     "router": ("commands.router", "parser"),
     "status": ("commands.status", "parser"),
+    "drain": ("commands.drain", "parser"),
     "bridge": ("commands.bridge", "parser"),
     "exporter": ("commands.exporter", "parser"),
     "certs": ("commands.certs", "parser"),

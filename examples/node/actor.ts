@@ -159,6 +159,7 @@ export class Actor {
       this.#publishedVersion = Math.max(this.#publishedVersion, answer.policy_version);
       this.#rejected = answer.verdict === "rejected";
       if (answer.verdict === "finished") this.#stopCollecting(new RunOverError("the run is over"));
+      if (answer.verdict === "drained") this.#stopCollecting(new RunOverError("an operator drained this actor"));
       if (answer.verdict === "fenced") this.#stopCollecting(new LearnerLostError("the learner fenced a rollout"));
       if (answer.verdict === "quarantined") {
         const cause = `${answer.reason}; fix the cause and restart the actor`;

@@ -57,6 +57,7 @@ export async function join(bridge: Bridge, run: string, fields: Message["fields"
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
   const refusal = answers.find((answer) => answer.kind === "Refusal")?.fields;
   if (refusal?.code === "finished") throw new RunOverError("the run is over");
+  if (refusal?.code === "drained") throw new RunOverError("an operator drained this actor");
   if (refusal?.code === "not_ready") throw new LearnerLostError(String(refusal.reason));
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);

@@ -7,7 +7,7 @@ const NO_ANSWER_MILLISECONDS = 100; // delay after the first attempt without an 
 const MAX_DELAY_MILLISECONDS = 500;
 
 export interface Acknowledgement {
-  verdict: "accepted" | "busy" | "rejected" | "fenced" | "quarantined" | "finished";
+  verdict: "accepted" | "busy" | "rejected" | "fenced" | "quarantined" | "finished" | "drained";
   reason: string;
   policy_version: number; // the newest published version
 }

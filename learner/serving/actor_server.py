@@ -33,6 +33,7 @@ from daedalus.protocol.limits import (
     Limits,
 )
 from daedalus.protocol.messages import (
+    Acknowledgement,
     ActorsReport,
     ActorsRequest,
     EventsReport,
@@ -115,6 +116,7 @@ class ActorServer:
         self._serve(keys.snapshots(run), self.publisher.answer, SNAPSHOT_REQUEST_LIMITS)
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
         self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
+        self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
@@ -219,6 +221,14 @@ class ActorServer:
     def _on_join(self, request: Request) -> None:
         name = keys.last_chunk(request.key)
         request.reply(self._responses.join(name, request.payload, time.monotonic()))
+
+    def _on_drain(self, request: Request) -> None:
+        name = keys.last_chunk(request.key)
+        with self.lock:
+            refusal = self.fleet.drain(name)
+        if refusal is None:
+            _logger.info("actor %s is drained: it leaves after its current rollout", name)
+        request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
 
     def _on_status(self, request: Request) -> None:
         request.reply(encode(self._status_answer(request)))

@@ -32,6 +32,7 @@ class Actor:
     non_finite: int = 0  # rollouts without a finite gradient
     finite_in_a_row: int = 0  # rollouts that were trained on since
     quarantined: str = ""  # the reason, if the newest incarnation is quarantined
+    drained: bool = False  # whether an operator asked the newest incarnation to leave
     env_steps: int = 0
     env_steps_per_second: float = 0.0
     policy_lag: int = 0  # of the newest rollout
@@ -87,4 +88,5 @@ class Actor:
         self.incarnations += 1
         self.consecutive_unfit = self.non_finite = self.finite_in_a_row = 0
         self.left = False
-        self.quarantined, self.fetches, self.compact_snapshots = "", False, False
+        self.quarantined, self.drained = "", False
+        self.fetches = self.compact_snapshots = False

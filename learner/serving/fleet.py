@@ -86,6 +86,14 @@ class Fleet:
         self.changed()
         return None
 
+    def drain(self, name: str) -> Refusal | None:
+        """Ask an actor to leave after its current rollout. Return None, or a Refusal if it does not take part."""
+        actor = self.actors.get(name)
+        if actor is None or not self.is_present(actor):
+            return Refusal(code="unknown", reason=f"no actor {name[:64]!r} takes part: `daedalus status` lists them")
+        actor.drained = True
+        return None
+
     def _check_identity(self, join: Join) -> Refusal | None:
         """Return the Refusal if this incarnation of the actor cannot take part."""
         try:
@@ -94,7 +102,7 @@ class Fleet:
             return Refusal(code="malformed", reason=str(error))
         known, former = self.actors.get(join.actor), self._former[join.actor, join.incarnation]
         if known is not None and known.incarnation == join.incarnation:
-            return None
+            return Refusal(code="drained", reason="an operator drained this actor") if known.drained else None
         if former.quarantined:
             return Refusal(code="malformed", reason=f"this process was quarantined: {former.quarantined}; restart it")
         if former.replaced:

@@ -17,6 +17,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Set
+from dataclasses import replace
 
 import numpy as np
 
@@ -267,7 +268,10 @@ class RolloutIntake:
             self._store(verdict, size)
         else:
             self._count_rejection(sender, verdict)
-        return acknowledgement(verdict, self._published_version())
+        answer = acknowledgement(verdict, self._published_version())
+        actor = self._fleet.actors.get(sender)
+        is_final = answer.verdict in ("accepted", "rejected")
+        return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer
 
     def _count_rejection(self, sender: str, rejected: Rejected) -> None:
         self._counters.rollouts_rejected[rejected.cause] += 1

@@ -60,6 +60,24 @@ def test_actor_ends_when_the_run_is_over(network: MemoryNetwork, actor: RunningA
     assert LINES[-1].startswith("the run is over")
 
 
+@pytest.mark.parametrize("how", ["verdict", "refused join"])
+def test_drained_actor_ends(
+    network: MemoryNetwork, actor: RunningActor, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The join is refused if the actor sends nothing, because it waits for the other actors of a2c."""
+    monkeypatch.setattr(session_monitor, "_SILENCE_SECONDS", 1e6 if how == "verdict" else 0.1)
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    _, request = learner.receive()
+    if how == "verdict":
+        acknowledge(request, "drained")
+    else:
+        learner.refusal = Refusal(code="drained", reason="why")
+    actor.join()
+    assert actor.error is None
+    assert LINES[-1] == "an operator drained this actor: it leaves the run"
+
+
 def test_damaged_message_is_logged_and_ignored(network: MemoryNetwork, actor: RunningActor) -> None:
     learner = ScriptedLearner(network)
     learner.publish(0)

@@ -15,6 +15,7 @@ from daedalus.cli.commands.certs import certs
 
 TESTS = Path(__file__).parent.parent
 PORT = 7447
+LOST_CONNECTIONS = 48  # at the same time; if closing one took 10 s, the learner would receive nothing for minutes
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 
@@ -104,6 +105,8 @@ def test_actors_are_noticed_as_gone_when_their_link_fails_and_return_when_it_wor
     learner = EndlessLearner(central, "--listen", address_of(central), ask=address_of(central))
     actors = [play(host, address_of(central)) for host in (steady, unplugged, deaf)]
     learner.wait_for_training_on("steady", "unplugged", "lost")
+    others = unplugged.run(sys.executable, TESTS / "idle_sessions.py", address_of(central), LOST_CONNECTIONS)
+    others.expect("connected")
     unplugged.unplug()
     deaf.lose(central)
     until(lambda: learner.actor("unplugged").get("alive") is False and learner.actor("lost").get("alive") is False)

@@ -17,9 +17,9 @@ def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(
     sizes = ("collection.envs_per_actor=2", "collection.rollout_length=32", "service.log_seconds=0.1")
     settings = [word for each in sizes for word in ("--set", each)]
     words = ("learner", "--env", "slow_environment:Slow-v0", "--env-steps", 900, "--listen", address, *settings)
+    allowing = ("--allow-module", "slow_environment")
     learner = start(*words, "--run-dir", "run", "--resume")
-    allow = ("--allow-module", "slow_environment")
-    actors = [start("actor", "--connect", address, "--name", name, *allow) for name in ("a", "b")]
+    actors = [start("actor", "--connect", address, "--name", name, *allowing) for name in ("a", "b")]
     learner.expect(r"updates .*/s")
     learner.process.terminate()
     assert learner.wait() == 0, learner.output

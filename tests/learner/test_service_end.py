@@ -5,12 +5,16 @@ from pathlib import Path
 
 import pytest
 from log_lines import LINES
-from processes import until
+from processes import LIMIT, until
 from session_fleet import GatedActor, LearnerProcess
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig
 from daedalus.learner.serving import actor_server
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import Acknowledgement, Message, Refusal
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ACTORS = 15
@@ -117,6 +121,37 @@ def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(
     assert fast.join()
     slow.open_gate()
     assert slow.join()
+
+
+def test_drained_actor_leaves_after_its_rollout_and_the_others_play_on(network: MemoryNetwork, tmp_path: Path) -> None:
+    learner = LearnerProcess(network, tmp_path / "run")
+    leaving, staying = GatedActor(network, "leaving"), GatedActor(network, "staying")
+    leaving.await_rollout()
+    staying.await_rollout()
+    operator = MemoryTransport(network)
+
+    def drain(name: str) -> Message:
+        return decode(operator.query(keys.drain("run", name), timeout=LIMIT)[0], Limits())
+
+    assert drain("leaving") == Acknowledgement(verdict="accepted")
+    unknown = drain("other")
+    assert isinstance(unknown, Refusal)
+    assert "no actor 'other' takes part" in unknown.reason
+    leaving.open_gate()
+    assert leaving.join() is False
+    staying.collector.waiting.clear()
+    staying.open_gate()
+    for _ in range(2):
+        staying.await_rollout()
+        staying.collector.waiting.clear()
+    again = GatedActor(network, "leaving", incarnation=2)  # another process of that name may take part
+    again.await_rollout()
+    learner.stop.set()
+    learner.join()
+    for actor in (staying, again):
+        actor.stop.set()
+        actor.open_gate()
+        actor.join()
 
 
 def test_evaluator_leaves_between_two_evaluations(network: MemoryNetwork, tmp_path: Path) -> None:

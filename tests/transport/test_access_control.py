@@ -53,6 +53,7 @@ def address(certificates: Path) -> Iterator[str]:
             keys.program("r", "*"),
             keys.snapshots("r"),
             keys.status("r"),
+            keys.drain("r", "*"),
         ):
             learner.serve(key, lambda request: request.reply(b"the learner's"))
         yield where
@@ -92,6 +93,12 @@ class Scene:
         self.until_heard(lambda: self.learner.publish(key, b"third"), lambda: b"third" in news)
         return b"second" in news
 
+    def until_received(self, key: str) -> None:
+        """Subscribe to a key on which the learner publishes, and wait for a value."""
+        news: list[bytes] = []
+        inbox = self.own.subscribe(key, lambda: news.append(inbox.take() or b""))
+        self.until_heard(lambda: self.learner.publish(key, b"new"), lambda: bool(news))
+
     @staticmethod
     def until_heard(say: Callable[[], None], heard: Callable[[], bool]) -> None:
         deadline = time.monotonic() + LIMIT
@@ -126,17 +133,16 @@ def uploads_as_another(scene: Scene) -> bool:
     return any(scene.answered(key) for key in queried)
 
 
-def reads_snapshots(scene: Scene) -> bool:
+def reads_publications(scene: Scene) -> bool:
     if not scene.answered(keys.snapshots("r")):
         return False
-    news: list[bytes] = []
-    inbox = scene.own.subscribe(keys.snapshots("r"), lambda: news.append(inbox.take() or b""))
-    scene.until_heard(lambda: scene.learner.publish(keys.snapshots("r"), b"new"), lambda: bool(news))
+    for key in (keys.snapshots("r"), keys.run_end("r")):
+        scene.until_received(key)
     return True
 
 
-def publishes_snapshots(scene: Scene) -> bool:
-    return scene.arrives(scene.own, scene.actor, keys.snapshots("r"))
+def publishes(scene: Scene) -> bool:
+    return any(scene.arrives(scene.own, scene.actor, key) for key in (keys.snapshots("r"), keys.run_end("r")))
 
 
 def answers_joins(scene: Scene) -> bool:
@@ -161,24 +167,29 @@ def reads_the_status(scene: Scene) -> bool:
     return scene.answered(keys.status("r"))
 
 
+def drains(scene: Scene) -> bool:
+    return scene.answered(keys.drain("r", scene.name)) or scene.answered(keys.drain("r", "box"))
+
+
 OPERATIONS = (
     joins,
     joins_as_another,
     uploads_as_itself,
     uploads_as_another,
-    reads_snapshots,
-    publishes_snapshots,
+    reads_publications,
+    publishes,
     answers_joins,
     watches_presence,
     reads_the_status,
+    drains,
 )
-PLAYS = {joins, uploads_as_itself, reads_snapshots}
+PLAYS = {joins, uploads_as_itself, reads_publications}
 ALLOWED = {
     "learner": set(OPERATIONS),
     "actor": PLAYS,
     "one of an actor's host": PLAYS,
     "another actor": PLAYS,
-    "operator": {watches_presence, reads_the_status},
+    "operator": {watches_presence, reads_the_status, drains},
 }
 
 

@@ -1,0 +1,37 @@
+"""Test that Zenoh does not wait for the other end when it closes a connection."""
+
+import os
+import socket
+import struct
+
+from processes import until
+
+from daedalus.transport.zenoh_transport import connect, listen
+
+PAIR = struct.Struct("ii")
+
+
+def lingering() -> int:
+    """Return the number of sockets of this process whose close() waits for the other end."""
+    count = 0
+    for entry in os.listdir("/dev/fd"):
+        try:
+            found = socket.socket(fileno=int(entry))
+        except OSError:  # not a socket, or the descriptor of the folder itself
+            continue
+        count += PAIR.unpack(found.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, PAIR.size))[0]
+        found.detach()
+    return count
+
+
+def test_both_ends_close_a_connection_without_waiting(address: str) -> None:
+    router = listen([address])
+    clients = [connect([address])]
+    try:
+        until(lambda: not lingering())
+        clients += [connect([address]), connect([address])]  # later than the router's own declarations
+        until(lambda: not lingering())
+    finally:
+        for transport in (*clients, router):
+            transport.close()
+    assert lingering() == 0
