@@ -15,15 +15,14 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from running import machine, table, train
 
-_PEER_ENVIRONMENTS = 8
-_EPISODES = 100
+_PEER = Path(__file__).parent / "peer_ppo.py"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,44 +77,12 @@ def ours(task: Task, seed: int) -> Run:
 
 def theirs(task: Task, seed: int) -> Run:
     """Train with stable-baselines3's PPO, in a process of its own."""
-    words = json.dumps({"id": task.id, "kwargs": dict(task.kwargs), "env_steps": task.env_steps, "seed": seed})
-    finished = subprocess.run([sys.executable, __file__, "--peer", words], capture_output=True, text=True, check=False)
+    command = [sys.executable, str(_PEER), "--env", task.id, "--env-steps", str(task.env_steps), "--seed", str(seed)]
+    command += ["--kwargs", json.dumps(dict(task.kwargs))]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
     if finished.returncode:
         raise SystemExit(f"PPO on {task.name} failed:\n{finished.stderr}")
     return Run(**json.loads(finished.stdout.splitlines()[-1]))
-
-
-def peer(id: str, kwargs: dict[str, Any], env_steps: int, seed: int) -> Run:
-    """Train PPO in this process."""
-    import gymnasium
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.env_util import make_vec_env
-
-    class Returns(BaseCallback):
-        """Collects the returns of all episodes."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.returns: list[float] = []
-
-        def _on_step(self) -> bool:
-            self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-            return True
-
-    module, _, name = id.rpartition(":")
-    if module:
-        __import__(module)
-    environments = make_vec_env(name, n_envs=_PEER_ENVIRONMENTS, seed=seed, env_kwargs=kwargs)
-    space = environments.observation_space
-    is_image = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 3 and min(space.shape[:2]) >= 36
-    policy = (
-        "MultiInputPolicy" if isinstance(space, gymnasium.spaces.Dict) else "CnnPolicy" if is_image else "MlpPolicy"
-    )
-    model, returns = PPO(policy, environments, seed=seed, device="cpu"), Returns()
-    began = time.monotonic()
-    model.learn(env_steps, callback=returns)
-    return Run(score=statistics.fmean(returns.returns[-_EPISODES:]), seconds=time.monotonic() - began)
 
 
 def _interval(values: Sequence[float]) -> str:
@@ -129,12 +96,7 @@ def main() -> None:
     options.add_argument("--only", nargs="+", metavar="ID", help="environments of the basket, by id (default: all)")
     options.add_argument("--seeds", nargs="+", type=int, default=[11, 12, 13, 14, 15])
     options.add_argument("--without-peer", action="store_true", help="train with ours only")
-    options.add_argument("--peer", help=argparse.SUPPRESS)
     parsed = options.parse_args()
-    if parsed.peer:
-        run = peer(**json.loads(parsed.peer))
-        print(json.dumps({"score": run.score, "seconds": run.seconds}))
-        return
     unknown = set(parsed.only or ()) - {task.id for task in BASKET}
     if unknown:
         options.error(f"not in the basket: {', '.join(sorted(unknown))}")

@@ -17,10 +17,12 @@ from daedalus.protocol.messages import Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.zenoh_transport import connect
 
-_FOREIGN = (
-    Spaces(observation=ArraySpace(shape=(5,), dtype="float32"), action=DiscreteSpace(count=2)),
-    Spaces(observation=ArraySpace(shape=(4,), dtype="float32"), action=DiscreteSpace(count=65_536)),
-    Spaces(observation=ArraySpace(shape=(4096, 4096), dtype="float32"), action=DiscreteSpace(count=2)),
+_FOREIGN = tuple(
+    Spaces(
+        observations={"observation": ArraySpace(shape=shape, dtype="float32")},
+        actions={"action": DiscreteSpace(counts=(choices,))},
+    )
+    for shape, choices in (((5,), 2), ((4,), 65_536), ((2048, 4096), 2))
 )
 _TIMEOUT = 30.0
 

@@ -1,0 +1,65 @@
+"""Train PPO of stable-baselines3 with all its defaults and 8 environments in one process, and print the result as JSON.
+
+    pip install -e ".[benchmark]"
+    python benchmarks/peer_ppo.py --env LunarLander-v3 --env-steps 500000 --seed 11
+
+It has MultiInputPolicy for Dict observations, CnnPolicy for images, else MlpPolicy. The score is the mean return of the
+last 100 training episodes.
+"""
+
+import argparse
+import importlib
+import json
+import statistics
+import time
+
+import gymnasium
+from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
+
+_ENVIRONMENTS, _EPISODES = 8, 100
+_SMALLEST_IMAGE = 36  # pixels of the shorter side that its CnnPolicy takes
+
+
+class Returns(BaseCallback):
+    """Collects the returns of all episodes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.returns: list[float] = []
+
+    def _on_step(self) -> bool:
+        self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
+        return True
+
+
+def policy_for(space: gymnasium.Space) -> str:
+    """Return the name of the policy for observations of a space."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return "MultiInputPolicy"
+    is_image = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 3
+    return "CnnPolicy" if is_image and min(space.shape[:2]) >= _SMALLEST_IMAGE else "MlpPolicy"
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--env", required=True)
+    options.add_argument("--env-steps", type=int, required=True)
+    options.add_argument("--seed", type=int, required=True)
+    options.add_argument("--kwargs", type=json.loads, default={}, help="of gymnasium.make, as JSON")
+    parsed = options.parse_args()
+    module, _, name = parsed.env.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    environments = make_vec_env(name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs)
+    model = PPO(policy_for(environments.observation_space), environments, seed=parsed.seed, device="cpu")
+    returns = Returns()
+    began = time.monotonic()
+    model.learn(parsed.env_steps, callback=returns)
+    seconds = time.monotonic() - began
+    print(json.dumps({"score": statistics.fmean(returns.returns[-_EPISODES:]), "seconds": seconds}))
+
+
+if __name__ == "__main__":
+    main()
