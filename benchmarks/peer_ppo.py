@@ -38,8 +38,8 @@ def policy_for(space: gymnasium.Space) -> str:
     """Return the name of the policy for observations of a space."""
     if isinstance(space, gymnasium.spaces.Dict):
         return "MultiInputPolicy"
-    is_image = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 3
-    return "CnnPolicy" if is_image and min(space.shape[:2]) >= _SMALLEST_IMAGE else "MlpPolicy"
+    shape = space.shape or ()
+    return "CnnPolicy" if len(shape) == 3 and min(shape[:2]) >= _SMALLEST_IMAGE else "MlpPolicy"
 
 
 def main() -> None:
