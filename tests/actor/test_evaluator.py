@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,15 @@ def test_evaluator_does_not_join_as_an_actor(learner: ScriptedLearner, evaluator
     assert learner.joins.get(timeout=LIMIT) == JOIN
     assert learner.joins.empty()  # once, and without spaces: it is no actor
     assert learner.present == []
+
+
+def test_failure_of_an_evaluator_is_reported_to_its_learner(network: MemoryNetwork) -> None:
+    learner = ScriptedLearner(network, run_spec(id="corridor:Corridor-v0"))
+    evaluator = RunningEvaluator(network)
+    evaluator.join()
+    *_, failed = learner.joins.queue
+    assert "corridor" in failed.failure
+    assert failed == replace(JOIN, failure=str(evaluator.error))
 
 
 def test_evaluator_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:

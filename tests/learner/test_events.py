@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 from log_lines import LINES
 
+from daedalus.cli.logs import EVENTS
 from daedalus.learner.serving import events
 from daedalus.learner.serving.events import EventLog
 
@@ -50,6 +51,10 @@ def test_event_is_logged_and_reported_with_time_kind_and_actor(clock: Clock, cap
     (record,) = caplog.records
     assert (record.levelname, record.getMessage()) == ("WARNING", "refused: other spaces")
     assert (record.actor, record.event) == ("arm", "refused")  # type: ignore[attr-defined] - of this record
+
+
+def test_the_filter_of_the_log_knows_the_logger() -> None:
+    assert events._logger.name == EVENTS
 
 
 def test_equal_events_of_a_minute_are_one_with_a_count(clock: Clock) -> None:
