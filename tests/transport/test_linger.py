@@ -3,9 +3,13 @@
 import os
 import socket
 import struct
+from pathlib import Path
 
+import pytest
+from certificates import make_certificates
 from processes import until
 
+from daedalus.transport.credentials import load
 from daedalus.transport.zenoh_transport import connect, listen
 
 PAIR = struct.Struct("ii")
@@ -24,12 +28,17 @@ def lingering() -> int:
     return count
 
 
-def test_both_ends_close_a_connection_without_waiting(address: str) -> None:
-    router = listen([address])
-    clients = [connect([address])]
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_both_ends_close_a_connection_without_waiting(address: str, protocol: str, tmp_path: Path) -> None:
+    server = client = None
+    if protocol == "tls":
+        folder, address = make_certificates(tmp_path / "certs"), address.replace("tcp/", "tls/")
+        server, client = load(folder / "router", "router"), load(folder / "learner", "learner")
+    router = listen([address], credentials=server)
+    clients = [connect([address], client)]
     try:
         until(lambda: not lingering())
-        clients += [connect([address]), connect([address])]  # later than the router's own declarations
+        clients += [connect([address], client), connect([address], client)]  # after the router's own declarations
         until(lambda: not lingering())
     finally:
         for transport in (*clients, router):
