@@ -30,6 +30,18 @@ Camera = Callable[[np.ndarray], None]
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
+class _Shutter:
+    """A camera that films only while it is open."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera, self.is_open = camera, False
+
+    def __call__(self, picture: np.ndarray) -> None:
+        """Pass a picture on."""
+        if self.is_open:
+            self._camera(picture)
+
+
 class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
@@ -217,8 +229,9 @@ def make_gymnasium(
     """
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")
+    shutter = None if camera is None else _Shutter(camera)
     factory = EnvironmentFactory(
-        spec=spec, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
+        spec=spec, modules=modules, render_mode=render_mode, camera=shutter, one_episode=one_episode
     )
     with creation_errors(spec.id):
         _check_backend(spec, modules)
@@ -230,7 +243,10 @@ def make_gymnasium(
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     try:
-        return GymnasiumEnvironments(environment)
+        environments = GymnasiumEnvironments(environment)
+        if shutter is not None:
+            shutter.is_open = True  # after the reset that shows whether there are masks
+        return environments
     except EnvironmentSetupError:
         environment.close()
         raise
