@@ -148,6 +148,7 @@ def test_bounded_distributions_stay_within_their_bounds_in_the_program(distribut
     runtime.load(weights)
     random = np.random.default_rng(1)
     seen = {"a": random.normal(0, 3, (ROWS, 3)).astype(np.float32)}
+    noise = draw_noise(runtime.noise_size, ROWS, random)
     for _ in range(50):
         noise = draw_noise(runtime.noise_size, ROWS, random)
         choice = runtime.act(seen, np.zeros((ROWS, 0), np.float32), noise, {})
