@@ -81,7 +81,6 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("tensorboard_writer.py", "time.time"),
         ("logs.py", "time.strftime"),  # dates log records
         ("events.py", "time.time"),  # dates events
-        ("events.py", "time.strftime"),
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are valid between two dates
         ("credentials.py", "time.time"),

@@ -4,6 +4,7 @@ Peers cause most events. Therefore equal ones are one event with a count, events
 the list is full, the oldest event of the owner with the most makes room.
 """
 
+import datetime
 import logging
 import threading
 import time
@@ -97,5 +98,4 @@ class EventLog:
 
 def utc(seconds: float) -> str:
     """Return a time of the wall clock as text in ISO 8601, in UTC with milliseconds."""
-    whole, part = divmod(int(seconds * 1000), 1000)
-    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(whole)) + f".{part:03d}Z"
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="milliseconds")[:-6] + "Z"

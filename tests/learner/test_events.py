@@ -23,12 +23,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     def read() -> float:
         return clock.now
 
-    fake = SimpleNamespace(
-        monotonic=read,
-        time=lambda: 1_800_000_000.25 + clock.now,
-        strftime=events.time.strftime,
-        gmtime=events.time.gmtime,
-    )
+    fake = SimpleNamespace(monotonic=read, time=lambda: 1_800_000_000.25 + clock.now)
     monkeypatch.setattr(events, "time", fake)
     return clock
 

@@ -49,7 +49,7 @@ def test_end_of_the_run_reaches_actors_whose_rollouts_outlive_the_learner(
         actor.open_gate()
     assert [actor.join() for actor in actors] == [True] * ACTORS
     assert count("the run is over") == ACTORS
-    assert count("joined") == ACTORS
+    assert count("joined run") == ACTORS
 
 
 def test_learner_answers_that_the_run_is_over_until_all_actors_have_left(
@@ -88,7 +88,7 @@ def test_actors_wait_for_a_learner_that_was_stopped_and_join_it_again(network: M
     actors = fleet_inside_rollouts(network)
     for actor in actors[::2]:
         actor.open_gate()
-    until(lambda: count("joined") == ACTORS)
+    until(lambda: count("joined run") == ACTORS)
     stopped.stop.set()
     outcome = stopped.join()
     assert (outcome.finished, outcome.saved) == (False, True)
@@ -98,7 +98,7 @@ def test_actors_wait_for_a_learner_that_was_stopped_and_join_it_again(network: M
     until(lambda: count("the learner was stopped; waiting for it to return") == ACTORS)
     assert not any(actor.ended for actor in actors)
     resumed = LearnerProcess(network, tmp_path / "run", resume=True)
-    until(lambda: count("joined") == 2 * ACTORS)
+    until(lambda: count("joined run") == 2 * ACTORS)
     resumed.stop.set()
     resumed.join()
     for actor in actors:
@@ -114,7 +114,7 @@ def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(
     slow, fast = GatedActor(network, "slow"), GatedActor(network, "fast")
     slow.await_rollout()
     fast.open_gate()
-    until(lambda: count("joined") == 2)
+    until(lambda: count("joined run") == 2)
     stopped.stop.set()
     stopped.join()
     assert LearnerProcess(network, tmp_path / "run", env_steps=1, resume=True).join().finished

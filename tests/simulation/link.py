@@ -110,6 +110,10 @@ class Link:
         if not self.passes() and self.network.chance(self.network.weather.refused):
             raise TransportError(f"cannot {operation}: the session is being replaced")
 
+    @property
+    def local_address(self) -> str:
+        return "simulation"
+
     def serve(self, key: str, handler: Callable[[Request], None]) -> None:
         self.handlers[key] = handler, Channel(self.process, "query")
 
