@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from daedalus.protocol import keys
+from daedalus.protocol.timestamps import utc
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tab and newline
 EVENTS = "daedalus.learner.serving.events"  # logger of the events of a run
@@ -137,7 +138,7 @@ class _ServiceFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""
         fields = "".join(f" {name}={_word(value)}" for name, value in _fields(record, self._context).items())
-        prefix = f"{_utc(record.created)} {record.levelname.lower()} {self._process}{fields}: "
+        prefix = f"{utc(record.created)} {record.levelname.lower()} {self._process}{fields}: "
         # Each line of a longer text has the prefix: a text of a peer cannot imitate another record.
         return "\n".join(prefix + line for line in super().format(record).split("\n"))
 
@@ -152,7 +153,7 @@ class _JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""
         fields = {
-            "time": _utc(record.created),
+            "time": utc(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
             "process": record.process,
@@ -182,8 +183,3 @@ def _about(record: logging.LogRecord) -> str:
 def _word(value: str) -> str:
     """Return a value that is one word, in quotes if it is none."""
     return value if keys.is_name(value) else json.dumps(value)
-
-
-def _utc(seconds: float) -> str:
-    whole, part = divmod(int(seconds * 1000), 1000)
-    return time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(whole)) + f".{part:03d}Z"

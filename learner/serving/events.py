@@ -4,7 +4,6 @@ Peers cause most events. Therefore equal ones are one event with a count, events
 the list is full, the oldest event of the owner with the most makes room.
 """
 
-import datetime
 import logging
 import threading
 import time
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 
 from daedalus.protocol import keys
 from daedalus.protocol.status import MAX_EVENTS, Event, EventKind
+from daedalus.protocol.timestamps import utc
 
 _EQUAL_SECONDS = 60.0  # an equal event within this time is counted, not added
 _AT_ONCE, _PER_SECOND = 100.0, 1.0  # events of actors
@@ -94,8 +94,3 @@ class EventLog:
         self._entries.remove(oldest)
         if self._equal.get(oldest.key) is oldest:
             del self._equal[oldest.key]
-
-
-def utc(seconds: float) -> str:
-    """Return a time of the wall clock as text in ISO 8601, in UTC with milliseconds."""
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="milliseconds")[:-6] + "Z"

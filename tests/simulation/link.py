@@ -29,11 +29,6 @@ class Link:
         self._sent_until = 0.0  # when the last message will have arrived
         network.links.append(self)
 
-    @property
-    def local_address(self) -> str:
-        """See Transport."""
-        return "simulated"
-
     def passes(self) -> bool:
         """Return whether messages pass this link now."""
         return self.alive and not (self.cut or self.dead or self.network.cut)
