@@ -25,7 +25,12 @@ OBSERVATION = gym.Dict(
 ACTION = gym.Dict(
     {
         "grip": gym.Discrete(3, start=1),
-        "move": gym.Tuple((gym.Box(np.float32([-2, 0]), np.float32([2, np.inf])), gym.MultiDiscrete([[2, 3]]))),
+        "move": gym.Tuple(
+            (
+                gym.Box(np.array([-2, 0], np.float32), np.array([2, np.inf], np.float32)),
+                gym.MultiDiscrete(np.array([[2, 3]])),
+            )
+        ),
     }
 )
 

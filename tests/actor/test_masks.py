@@ -54,7 +54,7 @@ class Narrowing(gymnasium.Env):
 
 @pytest.fixture(autouse=True)
 def _registered() -> Any:
-    gymnasium.register("Narrowing-v0", Narrowing)
+    gymnasium.register("Narrowing-v0", lambda **kwargs: Narrowing(**kwargs))
     yield
     del gymnasium.registry["Narrowing-v0"]
 
