@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from plain import vector_spaces
+from plain import ACTION, NAME, vector_spaces
 
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch
@@ -177,9 +177,10 @@ class Sender:
         random = np.random.default_rng(sequence)
         shape = (self.welcome.spec.collection.rollout_length, self.environments)
         content: dict[str, Any] = {
-            "frames": random.normal(0, 0.05, (shape[0] + 1, self.environments, 4)).astype(np.float32),
+            "frames": {NAME: random.normal(0, 0.05, (shape[0] + 1, self.environments, 4)).astype(np.float32)},
             "initial_state": np.zeros((self.environments, 0), np.float32),
-            "actions": random.integers(0, 2, shape).astype(np.uint8),
+            "actions": {ACTION: random.integers(0, 2, (*shape, 1)).astype(np.uint8)},
+            "masks": {},
             "behaviour_log_probs": np.full(shape, np.log(0.5), np.float32),
             "rewards": np.ones(shape, np.float32),
             "terminated": np.zeros(shape, np.bool_),

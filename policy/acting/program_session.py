@@ -50,7 +50,7 @@ class ProgramSession:
         """Return the program's outputs. Raises PolicyError if it fails or does not end in time."""
         self._watchdog.begin(self._terminate)
         try:
-            return self.onnx.run(None, feed, self._run_options)
+            return list(self.onnx.run(None, feed, self._run_options))
         except Exception as error:  # onnxruntime's exceptions share no base of their own
             late = "it took too long: " if self._run_options.terminate else ""
             raise PolicyError(f"the program failed: {late}{_first_line(error)}") from None

@@ -148,13 +148,10 @@ def test_bounded_distributions_stay_within_their_bounds_in_the_program(distribut
     runtime.load(weights)
     random = np.random.default_rng(1)
     seen = {"a": random.normal(0, 3, (ROWS, 3)).astype(np.float32)}
-    noise = draw_noise(runtime.noise_size, ROWS, random)
-    for _ in range(50):
-        noise = draw_noise(runtime.noise_size, ROWS, random)
+    drawn = [draw_noise(runtime.noise_size, ROWS, random) for _ in range(50)]
+    uniform, normal = runtime.noise_size
+    largest = np.full((ROWS, uniform), 1 - 2**-24, np.float32), np.full((ROWS, normal), 8.0, np.float32)
+    for noise in [*drawn, Noise(uniform=largest[0], normal=largest[1])]:
         choice = runtime.act(seen, np.zeros((ROWS, 0), np.float32), noise, {})
         assert np.abs(choice.actions["b"]).max() <= 1.0
         assert np.isfinite(choice.log_probs).all()
-    largest = Noise(uniform=np.full_like(noise.uniform, 1 - 2**-24), normal=np.full_like(noise.normal, 8.0))
-    choice = runtime.act(seen, np.zeros((ROWS, 0), np.float32), largest, {})
-    assert np.abs(choice.actions["b"]).max() <= 1.0
-    assert np.isfinite(choice.log_probs).all()
