@@ -3,6 +3,7 @@
 import threading
 from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.reporting.learning_hint import LearningHint
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.report import EpisodeHint, Health, RateMeter, metrics_row, run_status, summary
 from daedalus.learner.reporting.user_metrics import UserMetrics
@@ -40,7 +41,7 @@ class RunReporter:
         self._counters, self._annealing, self._fleet, self._lock = counters, annealing, fleet, lock
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
-        self._hint = EpisodeHint()
+        self._episode_hint, self._learning_hint = EpisodeHint(), LearningHint(spec.training.env_steps)
         self._user_metrics = user_metrics
 
     def begin(self, now: float) -> None:
@@ -72,12 +73,15 @@ class RunReporter:
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),
             }
-            return metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
+            row = metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
+        self._learning_hint.add(row)
+        return row
 
     def hint(self) -> str:
         """Return a hint for the user if one is due, else an empty string."""
         with self._lock:
-            return self._hint.take(self._counters, self._fleet)
+            hint = self._episode_hint.take(self._counters, self._fleet)
+        return hint or self._learning_hint.take()
 
     def details(self, learner: "Learner") -> Details:
         """Return the distributions and the picture that belong to a metrics row."""

@@ -1,0 +1,68 @@
+"""A hint for the user where a run does not learn. State; no I/O."""
+
+from collections.abc import Mapping
+
+_BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
+_BASELINE_PROGRESS = 0.05  # unless they took more than this share of the budget
+_JUDGED_PROGRESS, _WATCHED_PROGRESS = 0.2, 0.1  # shares of the budget: of the judgement, and of the rows that count
+_LEAST_ROWS = 5
+_COLLAPSED = 0.1  # of the first entropy
+
+
+class LearningHint:
+    """Judge of a run after a fifth of its budget, by its metrics rows.
+
+    A run does not learn where the mean return is still that of its first episodes and the entropy has collapsed, or
+    where the explained variance stayed below 0. Runs that were resumed after the first episodes are not judged.
+    """
+
+    def __init__(self, budget: int) -> None:
+        """`budget` is in env_steps."""
+        self._budget = budget
+        self._first_return: tuple[float, float] | None = None  # mean and standard deviation
+        self._first_entropy: float | None = None
+        self._explained: list[float] = []
+        self._judged = False
+        self._due = ""
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Add a metrics row."""
+        progress = row["env_steps"] / self._budget
+        if self._judged:
+            return
+        if self._first_entropy is None:
+            self._first_entropy = row.get("entropy")
+        if self._first_return is None and row["episodes"] >= _BASELINE_EPISODES:
+            if progress > _BASELINE_PROGRESS:
+                self._judged = True
+                return
+            self._first_return = row["episode_return_mean"], row["episode_return_std"]
+        if progress >= _WATCHED_PROGRESS and "explained_variance" in row:
+            self._explained.append(row["explained_variance"])
+        if progress >= _JUDGED_PROGRESS:
+            self._judged = True
+            self._due = self._judgement(row)
+
+    def take(self) -> str:
+        """Return the hint if it is due, once, else an empty string."""
+        due, self._due = self._due, ""
+        return due
+
+    def _judgement(self, row: Mapping[str, float]) -> str:
+        if self._first_return is None:
+            return ""
+        mean, deviation = self._first_return
+        first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
+        no_better = row["episode_return_mean"] <= mean + 0.25 * deviation
+        if no_better and first > 0.0 and entropy < _COLLAPSED * first:
+            return (
+                f"this run does not learn: after a fifth of the budget the mean return is {mean:.4g} as at the start, "
+                f"and the entropy fell from {first:.3g} to {entropy:.3g}, so the policy explores no more; try a larger "
+                "training.entropy_bonus or a smaller training.learning_rate"
+            )
+        if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
+            return (
+                "this run does not learn: the explained variance of the value stays below 0; "
+                "try training.normalize_rewards=true or a smaller training.learning_rate"
+            )
+        return ""

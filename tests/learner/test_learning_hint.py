@@ -1,0 +1,60 @@
+"""learner/reporting/learning_hint.py: a run that does not learn says so, once."""
+
+import pytest
+
+from daedalus.learner.reporting.learning_hint import LearningHint
+
+
+def row(
+    share: float, returned: float, entropy: float, explained: float = 0.5, episodes: float = 20
+) -> dict[str, float]:
+    return {
+        "env_steps": share * 1000,
+        "episodes": episodes,
+        "episode_return_mean": returned,
+        "episode_return_std": 2.0,
+        "entropy": entropy,
+        "explained_variance": explained,
+    }
+
+
+def hints(*rows: dict[str, float]) -> list[str]:
+    hint, taken = LearningHint(1000), []
+    for each in rows:
+        hint.add(each)
+        taken.append(hint.take())
+    return taken
+
+
+def test_run_with_a_collapsed_entropy_and_the_first_return_gets_one_hint() -> None:
+    first, second, third = hints(row(0.01, -200.0, 1.4), row(0.2, -199.6, 0.1), row(0.3, -200.0, 0.1))
+    assert (first, third) == ("", "")
+    assert second.startswith("this run does not learn: after a fifth of the budget the mean return is -200 as at the")
+    assert "the entropy fell from 1.4 to 0.1" in second
+    assert "training.entropy_bonus" in second
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        row(0.2, -199.0, 0.1),  # it became better
+        row(0.2, -200.0, 0.2),  # it still explores
+        row(0.19, -200.0, 0.1),  # too early
+    ],
+)
+def test_run_that_learns_or_explores_gets_no_hint(last: dict[str, float]) -> None:
+    assert hints(row(0.01, -200.0, 1.4), last) == ["", ""]
+
+
+def test_run_whose_critic_explains_nothing_gets_a_hint() -> None:
+    watched = [row(0.1 + 0.02 * index, 0.0, 1.0, -0.1) for index in range(6)]
+    *before, last = hints(row(0.01, 0.0, 1.0, -5.0), *watched)
+    assert set(before) == {""}
+    assert "the explained variance of the value stays below 0; try training.normalize_rewards=true" in last
+    watched[3]["explained_variance"] = 0.1
+    assert set(hints(row(0.01, 0.0, 1.0), *watched)) == {""}
+
+
+def test_run_is_not_judged_without_its_first_episodes() -> None:
+    assert hints(row(0.06, -200.0, 1.4), row(0.2, -200.0, 0.1)) == ["", ""]  # resumed, or very long episodes
+    assert hints(row(0.01, -200.0, 1.4, episodes=19), row(0.2, -200.0, 0.1, episodes=19)) == ["", ""]
