@@ -132,10 +132,19 @@ class Choice:
         if (self.preset is None) == (self.env is None):
             raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
         if self.preset is not None:
-            settings = read_preset(self.preset)
-        else:
-            settings = default_settings(None) if defaults is None else copy.deepcopy(defaults)
-            settings.setdefault("environment", {})["id"] = self.env
+            return run_spec(self._applied(read_preset(self.preset), change))
+        base = default_settings(None) if defaults is None else copy.deepcopy(defaults)
+        with_memory = base.pop("with_memory", {})
+        base.setdefault("environment", {})["id"] = self.env
+        settings = self._applied(copy.deepcopy(base), change)
+        if settings.get("policy", {}).get("memory", "none") != "none":
+            for section, values in with_memory.items():
+                base.setdefault(section, {}).update(values)
+            settings = self._applied(base, change)
+        return run_spec(settings)
+
+    def _applied(self, settings: dict[str, Any], change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        """Return settings after the choices, which change them in place. Raises SettingsError."""
         choose_algorithm(settings, self.algorithm)
         shortcuts = {
             ("training", "seed"): self.seed,
@@ -148,7 +157,7 @@ class Choice:
                 settings.setdefault(section, {})[key] = value
         change(settings)
         check_environment(self.env, settings)
-        return run_spec(settings)
+        return settings
 
 
 def check_environment(env: str | None, settings: dict[str, Any]) -> None:

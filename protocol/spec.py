@@ -110,17 +110,12 @@ class PolicySpec(Specification):
     mixture_components: Annotated[int, Field(ge=1, le=16)] = 3
     """Gaussians in each mixture; `gaussian_mixture` only."""
     separate_value_encoder: bool = False
-    """Give the value head an encoder of its own: the losses of policy and value then share no layer. Without memory."""
+    """Give the value head an encoder of its own: the losses of policy and value then share no layer. Has no effect
+    with a memory, which both heads share."""
     memory: Literal["none", "gru"] = "none"
     """Recurrent layer between the encoder and the heads."""
     memory_units: Annotated[int, Field(ge=1, le=4096)] = 256
     """Size of the recurrent state."""
-
-    @model_validator(mode="after")
-    def _memory_is_shared(self) -> "PolicySpec":
-        if self.separate_value_encoder and self.memory != "none":
-            raise ValueError("policy.separate_value_encoder needs policy.memory=none: the memory is shared")
-        return self
 
     @property
     def user_modules(self) -> dict[str, str]:

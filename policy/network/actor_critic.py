@@ -35,7 +35,8 @@ class ActorCritic(nn.Module):
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1))
         # Whether the network has convolutions, which then take most of its time.
         self.convolutional = any(isinstance(module, nn.Conv2d) for module in self.modules())
-        self.value_encoder = build_encoder(spec, spaces.observations, modules) if spec.separate_value_encoder else None
+        separate = spec.separate_value_encoder and spec.memory == "none"
+        self.value_encoder = build_encoder(spec, spaces.observations, modules) if separate else None
 
     @property
     def state_size(self) -> int:

@@ -26,3 +26,13 @@ def test_a_repeated_config_is_named_after_its_environment(
     again, directory = resolve(learner_parser().parse_args([str(folder / name)]))
     assert again == spec
     assert directory.name.startswith(f"{named}-appo-s5-")
+
+
+def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they_are_chosen() -> None:
+    words = ["--env", "CartPole-v1", "--set", "policy.memory=gru"]
+    spec, _ = resolve(learner_parser().parse_args(words))
+    assert (spec.training.passes, spec.training.minibatches, spec.collection.rollout_length) == (4, 4, 32)
+    spec, _ = resolve(learner_parser().parse_args([*words, "--set", "training.passes=2"]))
+    assert (spec.training.passes, spec.training.minibatches) == (2, 4)
+    spec, _ = resolve(learner_parser().parse_args(words[:2]))
+    assert (spec.training.passes, spec.collection.rollout_length) == (10, 128)

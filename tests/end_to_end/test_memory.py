@@ -28,7 +28,8 @@ SETTINGS = (
 def test_only_a_policy_with_memory_solves_the_cue_task(start: Start, tmp_path: Path, memory: str, status: int) -> None:
     shutil.copy(cue_environment.__file__, tmp_path)
     options = [word for setting in (f"policy.memory={memory}", *SETTINGS) for word in ("--set", setting)]
-    running = start("train", "--env", "cue_environment:Cue-v0", "--env-steps", 200_000, "--run-dir", "run", *options)
+    run = ("--env", "cue_environment:Cue-v0", "--algorithm", "impala", "--env-steps", 200_000, "--run-dir", "run")
+    running = start("train", *run, *options)
     assert running.wait() == status, running.output
     evaluation = json.loads((tmp_path / "run" / "summary.json").read_text())["evaluation_return_mean"]
     assert evaluation > 0.9 if memory == "gru" else abs(evaluation) < 0.5

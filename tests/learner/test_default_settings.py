@@ -49,6 +49,7 @@ def test_a_discrete_and_a_continuous_component_make_a_continuous_action() -> Non
 def test_default_settings_are_valid_for_each_algorithm(where: Spaces | None, algorithm: str | None) -> None:
     settings: dict[str, Any] = default_settings(where)
     settings.setdefault("environment", {})["id"] = "Any-v0"
+    settings.pop("with_memory")
     choose_algorithm(settings, algorithm)
     spec = run_spec(settings)
     assert spec.training.normalize_rewards
