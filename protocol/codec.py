@@ -266,9 +266,9 @@ class _Zstd(threading.local):
     """zstd contexts of one thread: they are expensive to create and must not be shared between threads."""
 
     def __init__(self) -> None:
-        self.compressor = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)
-        self.bytes_compressor = zstandard.ZstdCompressor(level=_BYTES_LEVEL, write_content_size=True)
-        self.decompressor = zstandard.ZstdDecompressor(max_window_size=64 << 20)
+        self.compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        self.bytes_compressor = zstandard.ZstdCompressor(level=_BYTES_LEVEL)
+        self.decompressor = zstandard.ZstdDecompressor()
 
 
 _zstd = _Zstd()

@@ -16,7 +16,7 @@ from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
 
@@ -323,7 +323,18 @@ def test_message_as_large_as_the_queue_is_not_refused() -> None:
     assert intake.refuse_size("a", 1 << 17) is None
     refused = intake.refuse_size("a", (1 << 17) + 1)
     assert refused is not None
+    assert (refused.verdict, refused.cause) == ("rejected", "unfit")
     assert "service.queue_megabytes allows 131,072" in refused.reason
+
+
+@pytest.mark.parametrize("spaces", [SPACES, None])
+def test_large_message_of_a_sender_that_has_not_joined_is_fenced(spaces: Spaces | None) -> None:
+    """Up to 64 KiB may be a rollout of anybody: reading it tells more."""
+    intake = Intake(run_spec(), EPOCH, Fleet(seed=1, spaces=spaces))
+    assert intake.refuse_size("b", 64 << 10) is None
+    assert intake.refuse_size("b", (64 << 10) + 1) == Rejected(
+        verdict="fenced", cause="unknown_actor", reason="actor 'b' has not joined"
+    )
 
 
 def test_size_limit_is_the_documented_one() -> None:
@@ -334,6 +345,7 @@ def test_size_limit_is_the_documented_one() -> None:
     assert harness.intake.refuse_size("a", message) is None
     refused = harness.intake.refuse_size("a", message + 1)
     assert refused is not None
+    assert (refused.verdict, refused.cause) == ("rejected", "malformed")
     assert refused.reason == f"the message has {message + 1:,} bytes, and a rollout of this actor at most {message:,}"
 
 

@@ -211,3 +211,11 @@ def test_incompressible_body_is_sent_uncompressed() -> None:
     noise = np.frombuffer(np.random.default_rng(0).bytes(1000), "|u1")
     assert unwire(encode(Program(hash="h", model=noise)))[0] == 0
     assert unwire(encode(Program(hash="h", model=np.zeros(1000, "|u1"))))[0] == 1
+
+
+@pytest.mark.parametrize(("frames", "level"), [(np.zeros((9, 4, 8, 8), np.uint8), 1), (None, -1)])
+def test_body_is_compressed_at_the_level_of_its_kind(frames: np.ndarray | None, level: int) -> None:
+    flags, _, body = unwire(encode(some_rollout(frames)))
+    plain = zstandard.ZstdDecompressor().decompress(body)
+    assert flags == 1
+    assert body == zstandard.ZstdCompressor(level=level).compress(plain)
