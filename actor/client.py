@@ -93,8 +93,8 @@ class Client:
           observation: of the observation space.
           action_mask: the legal choices, if the client was constructed with a mask: of the same form.
 
-        Raises ValueError if the observation does not fit the space, ActorError if the learner quarantined this actor,
-        and whatever else ended the client's thread.
+        Raises ValueError if the observation or the mask does not fit the spaces, ActorError if the learner quarantined
+        this actor, and whatever else ended the client's thread.
         """
         if self._error is not None:
             raise self._error

@@ -3,5 +3,14 @@
 from daedalus.policy.user_modules import UserModules
 
 TEST_MODULES = UserModules(
-    frozenset({"counting_environment", "picture_environment", "corridor", "corridor_wrappers", "test_car_racing"})
+    frozenset(
+        {
+            "corridor",
+            "corridor_wrappers",
+            "counting_environment",
+            "nested_environment",
+            "picture_environment",
+            "test_car_racing",
+        }
+    )
 )

@@ -2,13 +2,14 @@
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.report import EnvironmentReport
 from daedalus.actor.checking.single import make_one
 from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
@@ -41,11 +42,11 @@ def check_environment(
         return EnvironmentReport(problems=(f"{error}{_place(error.__cause__)}",))
     try:
         mask = _first_mask(environment, seed)
-        spaces = Transforms(rest, environment.observation_space, environment.action_space, mask).spaces
-        play = _Play(spec.id, environment, _actions(spec, environment.action_space, seed))
+        transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
+        play = _Play(spec.id, environment, transforms, RandomActions(transforms.spaces.actions, seed))
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
-        return play.report(spaces)
+        return play.report()
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:
@@ -63,29 +64,16 @@ def _first_mask(environment: gymnasium.Env, seed: int) -> Any:
     return None
 
 
-def _actions(spec: EnvironmentSpec, space: gymnasium.Space, seed: int) -> Callable[[Any], Any]:
-    """Return a function from a mask, or None, to a random action of those that a run can take."""
-    if spec.action_table is None:
-        space.seed(seed)
-        return lambda mask: space.sample(_legal(space, mask))
-    rows = np.asarray(spec.action_table, space.dtype).reshape(len(spec.action_table), *(space.shape or ()))
-    random = np.random.default_rng(seed)
-    return lambda _mask: rows[random.integers(len(rows))]
-
-
-def _legal(space: gymnasium.Space, mask: Any) -> np.ndarray | None:
-    """Return the mask as gymnasium's `sample` takes it, where it has one: for a single discrete action."""
-    fits = isinstance(space, gymnasium.spaces.Discrete) and np.shape(mask) == (space.n,)
-    return np.asarray(mask, np.int8) if fits and np.any(mask) else None
-
-
 class _Play:
     """One environment in play, and what was found so far."""
 
-    def __init__(self, name: str, environment: gymnasium.Env, action: Callable[[Any], Any]) -> None:
-        self._name, self._environment, self._action = name, environment, action
+    def __init__(
+        self, name: str, environment: gymnasium.Env, transforms: Transforms, random_actions: RandomActions
+    ) -> None:
+        self._name, self._environment = name, environment
+        self._transforms, self._random_actions = transforms, random_actions
         self._problems: list[str] = []
-        self._mask: Any = None  # of the next action
+        self._masks: dict[str, np.ndarray] = {}  # of the next action
         self._warnings: dict[str, str] = {}  # the first of each kind
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
@@ -109,10 +97,10 @@ class _Play:
         except _ProblemError as error:
             self._problems.append(str(error))
 
-    def report(self, spaces: Any) -> EnvironmentReport:
+    def report(self) -> EnvironmentReport:
         """Return what was found."""
         return EnvironmentReport(
-            spaces=spaces,
+            spaces=self._transforms.spaces,
             problems=tuple(f"environment {self._name}: {problem}" for problem in self._problems),
             warnings=tuple(f"environment {self._name}: {warning}" for warning in self._warnings.values()),
             env_steps=self._env_steps,
@@ -130,20 +118,28 @@ class _Play:
         self._reset_seconds += time.monotonic() - began
         self._resets += 1
         self._add(reset_violations(self._environment.observation_space, result))
-        self._mask = result[1].get(MASK_KEY)
+        self._observe(result[0], result[1], over=False)
 
     def _step(self) -> tuple[float, bool]:
         """Take one random step, and return its reward and whether the episode is over."""
-        action = self._action(self._mask)
+        action = self._transforms.env_action(self._random_actions.choose(self._masks))
         began, busy = time.monotonic(), time.process_time()
         result = self._call("step", action)
         self._busy_seconds += time.process_time() - busy
         self._step_seconds += time.monotonic() - began
         self._env_steps += 1
         self._add(step_violations(self._environment.observation_space, result))
-        _, reward, terminated, truncated, info = result
-        self._mask = info.get(MASK_KEY)
-        return float(reward), bool(terminated or truncated)
+        observation, reward, terminated, truncated, info = result
+        over = bool(terminated or truncated)
+        self._observe(observation, info, over=over)
+        return float(reward), over
+
+    def _observe(self, observation: Any, info: dict[str, Any], *, over: bool) -> None:
+        """Take the masks of the next action. Raise _ProblemError if the run could not use the observation or them."""
+        try:
+            self._masks = self._transforms.observe_one(observation, info.get(MASK_KEY), needed=not over).masks
+        except ValueError as error:
+            raise _ProblemError(str(error)) from None
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:

@@ -106,6 +106,13 @@ class ClientCollector:
 
     def act(self, observation: Any, action_mask: Any = None) -> Any:
         """Return the action for an observation, which the last action, or the last episode's end, led to."""
+        if action_mask is None and self._example_mask is not None:
+            raise ValueError("this client was constructed with an action_mask: pass one to every act()")
+        if action_mask is not None and self._example_mask is None:
+            raise ValueError(
+                "this client was constructed without an action_mask: construct it with an example of one, or act() "
+                "would choose illegal actions"
+            )
         observed = self._observe(observation, action_mask, needed=True)
         self._switch_policy(observed)
         assert self._policy is not None

@@ -5,11 +5,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from gymnasium import spaces as gym
 
+from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -74,6 +77,30 @@ def test_masks_accompany_their_observations(convention: str) -> None:
         assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
     finally:
         environments.close()
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation"])
+def test_the_check_plays_legal_actions(convention: str) -> None:
+    """Narrowing fails for any other action."""
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
+    report = check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20)
+    assert (report.problems, report.env_steps) == ((), 20)
+
+
+def test_the_check_plays_legal_actions_of_several_components() -> None:
+    spec = EnvironmentSpec(id="nested_environment:NestedMasked-v0")
+    report = check_environment(spec, TEST_MODULES, seconds=60.0, env_steps=100)
+    assert (report.problems, report.env_steps) == ((), 100)
+    assert max(report.returns) < 6.0  # tests/end_to_end/test_nested_spaces.py expects more of a policy that has learned
+
+
+def test_the_check_reports_a_mask_without_any_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Narrowing, "mask", lambda self: np.zeros(3, np.bool_))
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "info"})
+    (problem,) = check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20).problems
+    assert problem.startswith(
+        "environment Narrowing-v0: the action_mask of 'action' forbids every choice of variable 0"
+    )
 
 
 def test_environments_without_masks_have_none() -> None:

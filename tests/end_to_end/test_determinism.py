@@ -1,10 +1,13 @@
 """Test that a2c with several processes computes the same as a2c in one process."""
 
 import io
+import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+import safetensors.numpy
 from processes import LIMIT, Running
 
 from daedalus.actor.session.service import ActorConfig, ActorService
@@ -16,6 +19,13 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
+NORMALIZATION = (
+    "training.env_steps=40000",
+    "evaluation.final_episodes=10",
+    "policy.normalize_observations=true",
+    "training.normalize_rewards=true",
+    "training.normalize_advantages=true",
+)
 
 
 def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
@@ -50,19 +60,24 @@ def checkpoint_files(directory: Path) -> dict[str, bytes]:
     return {entry.name: entry.read_bytes() for entry in checkpoint.iterdir() if entry.suffix == ".safetensors"}
 
 
+@pytest.mark.parametrize("normalization", [(), NORMALIZATION], ids=["plain", "normalised"])
 def test_a2c_gives_bit_for_bit_equal_weights_in_one_process_and_in_several(
-    start: Callable[..., Running], tmp_path: Path
+    start: Callable[..., Running], tmp_path: Path, normalization: tuple[str, ...]
 ) -> None:
     settings = read_preset("cartpole")
     choose_algorithm(settings, "a2c")
-    override(settings, SETTINGS)
+    override(settings, (*SETTINGS, *normalization))
     assert train_in_one_process(run_spec(settings), tmp_path / "one").finished
-    words = [word for setting in SETTINGS for word in ("--set", setting)]
+    words = [word for setting in (*SETTINGS, *normalization) for word in ("--set", setting)]
     running = start("train", "cartpole", "--algorithm", "a2c", *words, "--run-dir", "many")
     assert running.wait() == 0, running.output
     one, many = checkpoint_files(tmp_path / "one"), checkpoint_files(tmp_path / "many")
     assert one.keys() == {"parameters.safetensors", "learner.safetensors"}
     assert one == many
+    state = safetensors.numpy.load(one["learner.safetensors"])
+    counts = [float(state[name]) for name in ("observations/observation/count", "returns/count") if name in state]
+    env_steps = json.loads((tmp_path / "many" / "summary.json").read_text())["env_steps"]
+    assert counts == ([env_steps] * 2 if normalization else [])  # each env_step counts once; reset rows do not
 
 
 def test_another_seed_gives_other_weights(tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""Test that nested observations and actions, with and without masks, are learned over a real router."""
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import nested_environment
+import pytest
+from processes import LIMIT, Running
+
+from daedalus import Client
+
+Start = Callable[..., Running]
+TARGET = 6.4  # of 8; a policy that ignores a part of the observation has at most 6.3
+SETTINGS = (
+    f"training.target_return={TARGET}",
+    "environment.frame_stack=1",
+    "policy.encoder=small",
+    "policy.initial_std=0.3",
+    "training.discount_factor=0.0",
+    "training.entropy_bonus=0.0",
+    "training.learning_rate=0.002",
+    "training.minibatches=8",
+)
+
+
+def options(name: str, directory: Path, *settings: str) -> list[object]:
+    shutil.copy(nested_environment.__file__, directory)
+    words = [word for setting in (*SETTINGS, *settings) for word in ("--set", setting)]
+    return ["--env", f"nested_environment:{name}", "--env-steps", 200_000, "--run-dir", "run", *words]
+
+
+def summary(directory: Path) -> dict:
+    return json.loads((directory / "run" / "summary.json").read_text())
+
+
+@pytest.mark.parametrize("name", ["Nested-v0", "NestedMasked-v0"])
+def test_actors_learn_nested_spaces(start: Start, tmp_path: Path, name: str) -> None:
+    many = ("collection.envs_per_actor=32", "collection.rollout_length=16", "evaluation.final_episodes=20")
+    running = start("train", *options(name, tmp_path, *many))
+    assert running.wait() == 0, running.output
+    result = summary(tmp_path)
+    assert result["solved"] is True
+    assert result["rollouts_rejected"].keys() <= {"stale"}
+    assert result["evaluation_return_mean"] > TARGET - 0.5  # greedy actions of the learned policy
+
+
+def test_a_client_learns_nested_spaces_with_masks(start: Start, address: str, tmp_path: Path) -> None:
+    few = ("collection.rollout_length=256", "training.batch_rollouts=2")
+    learner = start("learner", *options("NestedMasked-v0", tmp_path, *few), "--listen", address, "--actors", 1)
+    robot = gymnasium.make("NestedMasked-v0")
+    observation, info = robot.reset(seed=1)
+    deadline = time.monotonic() + LIMIT
+    with Client(
+        address,
+        observation_space=robot.observation_space,
+        action_space=robot.action_space,
+        action_mask=info["action_mask"],
+    ) as client:
+        while not client.is_over:
+            assert time.monotonic() < deadline, learner.output
+            observation, reward, terminated, _, info = robot.step(client.act(observation, info["action_mask"]))
+            client.reward(float(reward))
+            if terminated:
+                client.end_episode(terminated=True)
+                observation, info = robot.reset()
+    assert learner.wait() == 0, learner.output
+    assert summary(tmp_path)["solved"] is True
