@@ -94,7 +94,7 @@ def test_train_prints_its_log_records_unless_quiet(tmp_path: Path, quiet: bool) 
     output = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = output.stdout.splitlines()
     assert lines[-1] == "[]"
-    assert any(line.startswith("CartPole-v1: impala, seed 1, 2 actors") for line in lines) != quiet
+    assert any(line.startswith("CartPole-v1: appo, seed 1, 2 actors") for line in lines) != quiet
     assert len(lines) == 1 or not quiet
     assert not output.stderr or not quiet
 

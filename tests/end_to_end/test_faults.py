@@ -320,7 +320,7 @@ def test_arbitrary_bytes_on_any_key_change_nothing(
 def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
     start: Start, address: str, status: Status, learner: Callable[..., Running]
 ) -> None:
-    """Send two hundred rollouts at once to a queue that holds a few, while an actor plays."""
+    """Send a thousand rollouts at once to a queue that holds some hundred, while an actor plays."""
     learner("--set", "service.queue_megabytes=0.2", "--set", "training.max_policy_lag=1000000")
     start("actor", "--connect", address, "--name", "good")
     wait_for_training(status, "good")
@@ -328,14 +328,14 @@ def test_a_flooded_learner_answers_busy_and_trains_on_every_accepted_rollout(
     verdicts: list[bytes | None] = []
     try:
         version = sender.version()
-        for sequence in range(200):
+        for sequence in range(1000):
             payload = sender.rollout(sequence, version)
             sender.transport.query_async(sender.key, payload, timeout=LIMIT, on_answer=verdicts.append)
-        until(lambda: len(verdicts) == 200)
+        until(lambda: len(verdicts) == 1000)
         assert None not in verdicts
         report = actor_status(status(), "flood")
         assert report["busy_answers"] > 0
-        assert report["rollouts_accepted"] + report["busy_answers"] == 200
+        assert report["rollouts_accepted"] + report["busy_answers"] == 1000
         assert report["rollouts_rejected"] == {}
         rows = sender.welcome.spec.collection.rollout_length * sender.environments
         until(lambda: env_steps(status(), "flood") == actor_status(status(), "flood")["rollouts_accepted"] * rows)
