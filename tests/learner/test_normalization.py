@@ -13,10 +13,10 @@ from daedalus.learner.training.normalization import ObservationStatistics, Rewar
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
 
 DISCOUNT = 0.9
-ACTIONS = {"action": DiscreteSpace(counts=(4,))}
+ACTIONS: dict[str, ActionSpace] = {"action": DiscreteSpace(counts=(4,))}
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
