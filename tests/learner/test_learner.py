@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from building import POLICY, RECURRENT, SPACES, join, make_rollout, make_rollouts, run_spec
+from building import EPOCH, POLICY, RECURRENT, SPACES, identity, join, make_rollout, make_rollouts, run_spec
 from plain import ACTION, plain, plain_spaces
 from plain_learner import PlainLearner
 from torch import Tensor
@@ -24,6 +24,7 @@ from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 STEPS = 5
+NORMALIZED = PolicySpec(hidden=(8,), normalize_observations=True)
 
 
 def learner_spec(**training: Any) -> TrainingSpec:
@@ -366,6 +367,60 @@ def test_restored_learner_continues_identically(
     assert second.state().keys() == state.keys()
     for name, value in second.state().items():  # including the random state, which shuffles the next batch
         assert torch.equal(value, state[name])
+
+
+def consecutive_rollouts(batch: int, epoch: int = EPOCH, first: int = 0) -> list[Rollout]:
+    """Return the rollouts of a batch, which continue those of the batch before: one rollout of each of two actors."""
+    return [
+        make_rollout(identity(actor, batch - first, epoch=epoch), seed=batch * 100 + number)
+        for number, actor in enumerate(("a", "b"))
+    ]
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "appo"])
+def test_restored_learner_continues_its_normalisation_identically(algorithm: str, tmp_path: Path) -> None:
+    """Actors begin a new learner epoch with sequence number 0: the first return of each then starts from 0."""
+    settings = {"algorithm": algorithm, "normalize_rewards": True, "normalize_advantages": True}
+
+    def learn(learner: Learner, batches: range, epoch: int) -> None:
+        for batch in batches:
+            learner.step(consecutive_rollouts(batch, epoch, batches.start), 0.0)
+
+    through = make_learner(NORMALIZED, **settings)
+    learn(through, range(5), EPOCH)
+    learn(through, range(5, 10), EPOCH + 1)
+    state = {name: value.clone() for name, value in through.state().items()}
+
+    first = make_learner(NORMALIZED, **settings)
+    learn(first, range(5), EPOCH)
+    checkpoint = saved(first, tmp_path)
+    learn(first, range(5, 6), EPOCH)  # the checkpoint must not share memory with the learner
+    second = restored(make_learner(NORMALIZED, **settings, seed=99), checkpoint)
+    learn(second, range(5, 10), EPOCH + 1)
+
+    assert_same(weights(through), weights(second))
+    assert {"observations/observation/mean", "returns/squares"} <= state.keys()
+    assert second.state().keys() == state.keys()
+    for name, value in second.state().items():
+        assert torch.equal(value, state[name]), name
+    rows = sum(int(rollout.valid.sum()) for batch in range(10) for rollout in consecutive_rollouts(batch))
+    assert state["observations/observation/count"] == state["returns/count"] == rows
+
+
+def test_checkpoint_counts_the_observations_of_its_batch_in_the_weights(tmp_path: Path) -> None:
+    """The mean and the scale that actors use are those of all observations so far, also after a restart."""
+    learner = make_learner(NORMALIZED, algorithm="a2c")
+    learner.step(consecutive_rollouts(0), 0.0)
+    again = restored(make_learner(NORMALIZED, algorithm="a2c", seed=9), saved(learner, tmp_path))
+    seen = np.concatenate([plain(each.frames)[:-1][each.valid] for each in consecutive_rollouts(0)])
+    np.testing.assert_allclose(again.weights()["normalizer.means.0"], seen.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(again.weights()["normalizer.scales.0"], 1.0 / seen.std(0), rtol=1e-5)
+
+
+def test_restore_refuses_a_checkpoint_without_the_statistics_of_rewards(tmp_path: Path) -> None:
+    checkpoint = saved(make_learner(), tmp_path)
+    with pytest.raises(CheckpointMismatchError, match=r"lacks the statistics 'returns/.*training.normalize_rewards"):
+        restored(make_learner(normalize_rewards=True), checkpoint)
 
 
 def test_random_state_is_restored(tmp_path: Path) -> None:

@@ -1,0 +1,141 @@
+"""learner/training/normalization.py: the statistics equal those of all values together, however they arrive."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from building import POLICY, identity, join, make_rollout
+from plain import NAME, plain
+
+from daedalus.learner.training import normalization
+from daedalus.learner.training.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
+
+DISCOUNT = 0.9
+ACTIONS: dict[str, ActionSpace] = {"action": DiscreteSpace(counts=(4,))}
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_moments_of_batches_equal_those_of_all_values(offset: float) -> None:
+    values = offset + np.random.default_rng(1).standard_normal((100, 2, 3))
+    moments = RunningMoments((2, 3))
+    assert moments.variance.eq(1.0).all()
+    for part in np.split(values, [1, 2, 30, 30, 77]):  # one is empty
+        moments.add(torch.from_numpy(part))
+    assert moments.count == 100
+    np.testing.assert_allclose(moments.mean, values.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(moments.variance, values.var(0), rtol=1e-6)
+
+
+def discounted_sums(rollouts: list[Rollout]) -> list[float]:
+    """Return G of every valid row of consecutive rollouts of one actor, one environment after another."""
+    found = []
+    for environment in range(rollouts[0].environments):
+        rewards_so_far: list[float] = []
+        for rollout in rollouts:
+            for row in range(rollout.rows):
+                rewards_so_far.append(float(rollout.rewards[row, environment]))
+                if rollout.valid[row, environment]:
+                    found.append(sum(reward * DISCOUNT**age for age, reward in enumerate(reversed(rewards_so_far))))
+                if rollout.terminated[row, environment] or rollout.truncated[row, environment]:
+                    rewards_so_far.clear()
+    return found
+
+
+def sent(sequence: int, actor: str = "a", incarnation: int = 1, environments: int = 3) -> Rollout:
+    rollout = make_rollout(
+        identity(actor, sequence, incarnation), seed=10 * sequence + ord(actor), environments=environments
+    )
+    first = np.ones((1, environments), np.bool_) if not sequence else rollout.valid[:1]
+    valid = np.concatenate([first, rollout.valid[1:]])
+    # Rewards of reset rows are 0, as actors send them, and such a row ends no episode.
+    terminated, truncated = rollout.terminated & valid, rollout.truncated & valid
+    return replace(rollout, valid=valid, terminated=terminated, truncated=truncated, rewards=rollout.rewards * valid)
+
+
+STREAMS = {
+    "one stream": [[sent(0), sent(1), sent(2)]],
+    "two actors": [[sent(0), sent(1)], [sent(0, "b"), sent(1, "b")]],
+    "a gap": [[sent(0), sent(1)], [sent(3), sent(4)]],
+    "a new incarnation": [[sent(0), sent(1)], [sent(2, incarnation=2)]],
+    "a new epoch": [[sent(0), sent(1)], [sent(0), sent(1)]],
+    "other environments": [[sent(0), sent(1)], [sent(2, environments=2)]],
+}
+
+
+@pytest.mark.parametrize("streams", STREAMS.values(), ids=STREAMS)
+@pytest.mark.parametrize("size", [1, 2, 9])
+def test_returns_run_on_over_the_rollouts_of_a_stream(streams: list[list[Rollout]], size: int) -> None:
+    normalizer = RewardNormalizer(DISCOUNT)
+    rollouts = [rollout for stream in streams for rollout in stream]
+    if len({each.identity.actor for each in rollouts}) > 1:
+        rollouts.sort(key=lambda rollout: rollout.identity.sequence)  # the actors take turns
+    for start in range(0, len(rollouts), size):
+        normalizer.add(rollouts[start : start + size])
+    expected = [value for stream in streams for value in discounted_sums(stream)]
+    assert normalizer.moments.count == len(expected)
+    assert float(normalizer.moments.mean) == pytest.approx(np.mean(expected), rel=1e-5)
+    assert float(normalizer.moments.variance) == pytest.approx(np.var(expected), rel=1e-5)
+
+
+def test_rewards_are_divided_by_the_deviation_and_clipped() -> None:
+    normalizer = RewardNormalizer(DISCOUNT)
+    normalizer.add([sent(0)])
+    batch = join([sent(1)])
+    batch.rewards[0, 0] = 1e6
+    rewards = batch.rewards.clone()
+    normalizer.scale(batch)
+    deviation = float(normalizer.moments.variance) ** 0.5
+    np.testing.assert_allclose(batch.rewards, (rewards / deviation).clip(-10.0, 10.0), rtol=1e-5)
+    assert batch.rewards[0, 0] == 10.0
+
+
+def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(normalization, "_MAX_STREAMS", 2)
+    normalizer = RewardNormalizer(DISCOUNT)
+    normalizer.add([sent(0, actor) for actor in "abc"])
+    assert list(normalizer._running) == ["b", "c"]
+
+
+def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:
+    spaces = {
+        NAME: ArraySpace(shape=(3,), dtype="float32"),
+        "bytes": ArraySpace(shape=(2,), dtype="uint8"),
+        "image": ArraySpace(shape=(16, 16), dtype="uint8"),
+        "choice": DiscreteSpace(counts=(3,)),
+    }
+    normalizer = ObservationNormalizer(spaces)
+    assert normalizer.names == (NAME, "bytes")
+    statistics = ObservationStatistics(normalizer)
+    random, seen = np.random.default_rng(2), {NAME: [], "bytes": []}
+    for seed in range(3):
+        rollout = make_rollout(seed=seed)
+        more = {
+            "bytes": random.integers(0, 256, (7, 3, 2), np.uint8),
+            "image": random.integers(0, 256, (7, 3, 16, 16), np.uint8),
+            "choice": random.integers(0, 3, (7, 3, 1), np.uint8),
+        }
+        rollout = replace(rollout, frames={NAME: plain(rollout.frames), **more})
+        statistics.add(join([rollout], Spaces(observations=spaces, actions=ACTIONS)))
+        for name, values in seen.items():
+            values.append(rollout.frames[name][:-1][rollout.valid])
+    for name, values in seen.items():
+        mean, variance = normalizer.statistics(name)
+        np.testing.assert_allclose(mean, np.concatenate(values).astype(np.float64).mean(0), rtol=1e-4)
+        np.testing.assert_allclose(variance, np.concatenate(values).astype(np.float64).var(0), rtol=1e-4)
+
+
+def test_statistics_that_came_with_weights_change_slowly() -> None:
+    spaces = Spaces(observations={NAME: ArraySpace(shape=(3,), dtype="float32")}, actions=ACTIONS)
+    network = ActorCritic(POLICY.model_copy(update={"normalize_observations": True}), spaces)
+    network.normalizer.set_statistics(NAME, torch.full((3,), 50.0), torch.full((3,), 4.0))
+    statistics = ObservationStatistics(network.normalizer)
+    statistics.take_from_network()
+    statistics.add(join([make_rollout()]))
+    mean, variance = network.normalizer.statistics(NAME)
+    assert ((mean - 50.0).abs() < 0.1).all()
+    assert ((variance - 4.0).abs() < 0.5).all()
