@@ -88,6 +88,7 @@ class LearnerQueries:
                 raise ActorError(f"no learner answered within {timeout:g} s: {self._remedy(run, join)}")
             if pause >= _MAX_RETRY_SECONDS and time.monotonic() >= log_at:
                 log_at = time.monotonic() + _LOOK_AROUND_SECONDS
+                end.check()  # the request may have taken 5 s, and the next one may too
                 text = f"waiting for {awaited or self._awaited(run, join)}"
                 if text != logged:
                     _logger.info("%s", text)
