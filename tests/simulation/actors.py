@@ -138,6 +138,7 @@ class ActorProcess:
     stop: Event = field(init=False)
     service: ActorService = field(init=False)
     hang_seconds: float = 0.0  # how much longer the next rollout takes
+    hangs_until: float = 0.0  # when its environment goes on
     is_disturbed: bool = False  # whether it was frozen or hung, so that it may end late
     outcome: str = ""  # why the process ended
 
@@ -165,7 +166,10 @@ class ActorProcess:
     def pass_time(self, seconds: float) -> None:
         """Let an environment take its time."""
         hang, self.hang_seconds = self.hang_seconds, 0.0
-        self.kernel.sleep(seconds * self.kernel.random.uniform(0.5, 1.5) + hang)
+        lasts = seconds * self.kernel.random.uniform(0.5, 1.5) + hang
+        if hang:
+            self.hangs_until = self.kernel.now + lasts
+        self.kernel.sleep(lasts)
 
     def _main(self) -> None:
         """Do what `daedalus actor` does."""

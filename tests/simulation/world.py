@@ -114,6 +114,9 @@ class World:
             self.kernel.after(0.1, self._time_stop, actor, since)
 
     def _require_end(self, actor: ActorProcess, seconds: float) -> None:
+        if self.kernel.now < actor.hangs_until and not actor.outcome:
+            self.kernel.after(actor.hangs_until - self.kernel.now + seconds, self._require_end, actor, seconds)
+            return
         excused = actor.process.frozen or actor.is_disturbed
         ended = bool(actor.outcome) or excused
         self.ledger.require(ended, actor.process.name, f"did not end {seconds:g} s after its stop")
