@@ -54,8 +54,8 @@ class ObservationStatistics:
     def __init__(self, normalizer: ObservationNormalizer) -> None:
         self._normalizer = normalizer
         self.moments = {
-            name: RunningMoments(tuple(mean.shape))
-            for name, mean in zip(normalizer.names, normalizer.means, strict=True)
+            name: RunningMoments(tuple(scale.shape))
+            for name, scale in zip(normalizer.names, normalizer.scales, strict=True)
         }
 
     def take_from_network(self) -> None:

@@ -7,13 +7,16 @@ from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 
 _LARGEST = 10.0  # normalised values are clipped to +- this value
 _SMALLEST_VARIANCE = 1e-8
+_PARTS = 3  # bfloat16 numbers, of 8 bits each, that make a float32
 
 
 class ObservationNormalizer(nn.Module):
     """Shift and scale of every array that is not an image: (x - mean) / std, clipped to +-10.
 
     The statistics are parameters without gradients: they travel in snapshots and are saved in checkpoints like
-    weights, so that actors and evaluations use exactly those that their snapshot was made with.
+    weights, so that actors and evaluations use exactly those that their snapshot was made with. Compact snapshots have
+    the precision of bfloat16, which is too little for a mean that is large beside the deviation: every number here is
+    one that bfloat16 can represent, and a mean is the sum of three.
     """
 
     def __init__(self, spaces: dict[str, ArraySpace | DiscreteSpace]) -> None:
@@ -22,7 +25,7 @@ class ObservationNormalizer(nn.Module):
             name for name, space in spaces.items() if isinstance(space, ArraySpace) and not space.is_image
         )
         shapes = [spaces[name].stacked_shape for name in self._names]
-        self.means = nn.ParameterList([_constant(torch.zeros(shape)) for shape in shapes])
+        self.means = nn.ParameterList([_constant(torch.zeros(_PARTS, *shape)) for shape in shapes])  # summands
         self.scales = nn.ParameterList([_constant(torch.ones(shape)) for shape in shapes])  # 1 / std
 
     @property
@@ -34,20 +37,25 @@ class ObservationNormalizer(nn.Module):
         """Normalise observations {name: [N, *stacked_shape]}; images and discrete components are left as they are."""
         normalized = dict(observations)
         for name, mean, scale in zip(self._names, self.means, self.scales, strict=True):
-            normalized[name] = ((observations[name].to(torch.float32) - mean) * scale).clamp(-_LARGEST, _LARGEST)
+            centred = observations[name].to(torch.float32) - mean.sum(0)
+            normalized[name] = (centred * scale).clamp(-_LARGEST, _LARGEST)
         return normalized
 
     def statistics(self, name: str) -> tuple[Tensor, Tensor]:
         """Return mean and variance [*stacked_shape] of one component."""
         index = self._names.index(name)
-        return self.means[index].detach(), self.scales[index].detach().square().reciprocal() - _SMALLEST_VARIANCE
+        mean, scale = self.means[index].detach().sum(0), self.scales[index].detach()
+        return mean, scale.square().reciprocal() - _SMALLEST_VARIANCE
 
     @torch.no_grad()
     def set_statistics(self, name: str, mean: Tensor, variance: Tensor) -> None:
         """Set the statistics of one component: mean and variance [*stacked_shape]."""
         index = self._names.index(name)
-        self.means[index].copy_(mean)
-        self.scales[index].copy_((variance + _SMALLEST_VARIANCE).rsqrt())
+        rest = mean.to(torch.float64)
+        for part in self.means[index]:
+            part.copy_(rest.to(torch.bfloat16))
+            rest = rest - part.to(torch.float64)
+        self.scales[index].copy_((variance + _SMALLEST_VARIANCE).rsqrt().to(torch.bfloat16))
 
 
 def _constant(values: Tensor) -> nn.Parameter:

@@ -126,7 +126,9 @@ def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None
     for name, values in seen.items():
         mean, variance = normalizer.statistics(name)
         np.testing.assert_allclose(mean, np.concatenate(values).astype(np.float64).mean(0), rtol=1e-4)
-        np.testing.assert_allclose(variance, np.concatenate(values).astype(np.float64).var(0), rtol=1e-4)
+        np.testing.assert_allclose(
+            variance, np.concatenate(values).astype(np.float64).var(0), rtol=2**-7
+        )  # of bfloat16
 
 
 def test_statistics_that_came_with_weights_change_slowly() -> None:

@@ -1,0 +1,34 @@
+"""policy/network/normalization.py: the statistics as parameters that every kind of snapshot carries exactly."""
+
+import numpy as np
+import pytest
+import torch
+
+from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.protocol.compact import bfloat16, float32
+from daedalus.protocol.spaces import ArraySpace
+
+
+@pytest.fixture
+def normalizer() -> ObservationNormalizer:
+    return ObservationNormalizer({"o": ArraySpace(shape=(3,), dtype="float32")})
+
+
+def test_observations_are_shifted_scaled_and_clipped(normalizer: ObservationNormalizer) -> None:
+    normalizer.set_statistics("o", torch.tensor([1.0, -2.0, 0.0]), torch.tensor([4.0, 0.25, 1.0]))
+    seen = normalizer({"o": torch.tensor([[3.0, -1.0, 50.0]])})["o"]
+    torch.testing.assert_close(seen, torch.tensor([[1.0, 2.0, 10.0]]))
+
+
+def test_compact_snapshot_changes_no_statistic(normalizer: ObservationNormalizer) -> None:
+    """A mean of 1,000 beside a deviation of 0.01: bfloat16 alone would move it by up to 4, which is 400 deviations."""
+    mean, deviation = torch.tensor([1000.123, -7.7777, 3e-5]), torch.tensor([0.01, 3.3, 1.0])
+    normalizer.set_statistics("o", mean, deviation.square())
+    weights = {name: values.detach().numpy() for name, values in normalizer.named_parameters()}
+    compact = float32(bfloat16(weights))
+    assert weights.keys() == compact.keys()
+    for name in weights:
+        np.testing.assert_array_equal(weights[name], compact[name], err_msg=name)
+    kept, variance = normalizer.statistics("o")
+    torch.testing.assert_close(kept, mean, rtol=2**-23, atol=1e-12)
+    torch.testing.assert_close(variance.sqrt(), deviation, rtol=2**-8, atol=1e-6)
