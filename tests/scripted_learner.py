@@ -68,6 +68,8 @@ class ScriptedLearner:
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
+        self.compact_fetches: list[SnapshotRequest] = []
+        self._compact = CompactSnapshotCache(epoch)
         self.transport.declare_presence(keys.learner(run))
         self.transport.serve(keys.rollouts(run, "*"), self.rollouts.put)
         self.transport.serve(keys.snapshots(run), self._newest)
@@ -88,7 +90,8 @@ class ScriptedLearner:
         message = decode(request.payload, Limits())
         assert isinstance(message, SnapshotRequest)
         if message.compact:
-            request.reply(CompactSnapshotCache(self.epoch).answer(message, self.snapshot))
+            self.compact_fetches.append(message)
+            request.reply(self._compact.answer(message, self.snapshot))
             return
         self.fetches.append(message)
         if self.snapshot:  # otherwise the answer is lost

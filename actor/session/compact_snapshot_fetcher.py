@@ -1,4 +1,4 @@
-"""Fetches compact snapshots over a slow link: part by part, and as often as the link allows.
+"""Fetches compact snapshots part by part: over a slow link as often as it allows, else when they are asked for.
 
 State and requests, no threads and no waiting. Answers arrive on the transport's threads, which request the next parts
 at once: if `take` did that, each round trip would last as long as collecting a rollout.
@@ -24,8 +24,17 @@ _RETRY_SECONDS = 1.0  # after a failed fetch
 class CompactSnapshotFetcher:
     """One actor's fetches from one learner epoch."""
 
-    def __init__(self, transport: Transport, run: str, actor: str, on_news: Callable[[], None]) -> None:
-        """`on_news` is called on the transport's threads when `take` may have something new."""
+    def __init__(
+        self, transport: Transport, run: str, actor: str, on_news: Callable[[], None], *, rests: bool = True
+    ) -> None:
+        """Construct the fetcher.
+
+        Args:
+          transport, run, actor: where to fetch, and for whom.
+          on_news: called on the transport's threads when `take` may have something new.
+          rests: after a fetch let the link rest for as long as it took, because a slow link carries rollouts too.
+        """
+        self.rests = rests
         self._transport, self._on_news = transport, on_news
         self._key, self._actor = keys.snapshots(run), actor
         self._held: tuple[int, Bits] | None = None  # the version and weights that differences are added to
@@ -37,13 +46,25 @@ class CompactSnapshotFetcher:
         self._version: int | None = None
         self._fetching = False
         self._fetched: bytes | Message | None = None  # an encoded CompactSnapshot, or another answer of the learner
-        self._began = self._next_at = 0.0
+        self._began = self._next_at = self._seconds = 0.0
+
+    @property
+    def requested_at(self) -> float:
+        """The monotonic time of the last request for the newest snapshot."""
+        return self._began
+
+    @property
+    def seconds(self) -> float:
+        """How long the last fetch took."""
+        return self._seconds
+
+    @property
+    def in_progress(self) -> bool:
+        """Whether a snapshot is awaited."""
+        return self._fetching
 
     def request_newest(self) -> None:
-        """Begin to fetch the newest snapshot, unless a fetch is in progress or the link must rest.
-
-        The link rests for as long as the last fetch took: it carries rollouts and acknowledgements too.
-        """
+        """Begin to fetch the newest snapshot, unless a fetch is in progress or the link must rest."""
         with self._lock:
             if self._fetching or self._fetched is not None or time.monotonic() < self._next_at:
                 return
@@ -105,7 +126,8 @@ class CompactSnapshotFetcher:
         self._parts[message.part] = message.data.tobytes()
         if len(self._parts) == self._count:
             whole = b"".join(self._parts[part] for part in range(self._count))
-            self._end(whole, rest=time.monotonic() - self._began)
+            self._seconds = time.monotonic() - self._began
+            self._end(whole, rest=self._seconds if self.rests else 0.0)
             return none
         first, self._requested = self._requested, min(self._count, len(self._parts) + _PARALLEL_PARTS)
         return range(first, self._requested)

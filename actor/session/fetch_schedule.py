@@ -41,6 +41,11 @@ class FetchSchedule:
         """Note that the rollout is complete."""
         self._rollout_seconds = now - self._began
 
+    @property
+    def rollout_seconds(self) -> float:
+        """Duration of the last rollout."""
+        return self._rollout_seconds
+
     def is_stale(self, now: float, requested_at: float) -> bool:
         """Return whether a snapshot that was requested at a time is too old for a rollout that begins now."""
         return now > requested_at + self._lead + self.patience

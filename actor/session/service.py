@@ -216,7 +216,9 @@ class ActorService:
             self._load(snapshot if synchronous else self._snapshots.newest(waited))
             began = time.monotonic()
             payload = encode(self._collect(welcome.learner_epoch))
-            if self._feed.uses_compact_snapshots:
+            if self._config.link == "auto" and self._snapshots.rollouts_are_slow:
+                self._feed.use_differences()
+            if self._feed.is_slow:
                 self._uploads.size_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
             _check_size(payload, welcome.spec)
             self._uploads.send(self._sequence, payload)

@@ -11,6 +11,8 @@ from daedalus.protocol import keys
 from daedalus.protocol.messages import Message, RunEnded, Snapshot, Welcome
 from daedalus.transport.interface import Inbox, Transport
 
+_SMALL_BYTES = 1 << 20  # of weights whose differences take the learner about a millisecond
+
 
 class SnapshotFeed:
     """The snapshots of one learner after the other. For one thread.
@@ -45,9 +47,21 @@ class SnapshotFeed:
             self._inboxes[self._run] = self._transport.subscribe(keys.snapshots(self._run), self._on_news)
 
     def use_compact_snapshots(self) -> None:
-        """End the subscription; from now on compact snapshots are fetched on request."""
+        """End the subscription; from now on compact snapshots are fetched, as often as a slow link allows."""
         self._unsubscribe()
         self._compact = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
+
+    def use_differences(self) -> None:
+        """Fetch compact snapshots, as differences, in place of whole ones from now on. Idempotent.
+
+        Only of a small network: the learner computes the differences, which for a large one takes longer than to send
+        the whole.
+        """
+        if self._whole is None or self.newest is None:
+            return
+        if sum(array.nbytes for array in self.newest.weights.values()) <= _SMALL_BYTES:
+            self._whole = None
+            self._compact = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news, rests=False)
 
     def use_fetches(self) -> None:
         """End the subscription; from now on whole snapshots are fetched on request, unless compact ones are.
@@ -67,19 +81,28 @@ class SnapshotFeed:
         self._inboxes.clear()
 
     @property
-    def uses_compact_snapshots(self) -> bool:
-        """Whether compact snapshots are fetched."""
-        return self._compact is not None
+    def _slow_link(self) -> CompactSnapshotFetcher | None:
+        return self._compact if self._compact is not None and self._compact.rests else None
+
+    @property
+    def _scheduled(self) -> SnapshotFetcher | CompactSnapshotFetcher | None:
+        """What fetches on request; None while snapshots are pushed, and on a slow link."""
+        return self._whole if self._compact is None else None if self._compact.rests else self._compact
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether snapshots are fetched as often as a slow link allows."""
+        return self._slow_link is not None
 
     @property
     def fetch_seconds(self) -> float:
-        """How long the last fetch of a whole snapshot took."""
-        return 0.0 if self._whole is None else self._whole.seconds
+        """How long the last fetch on request took."""
+        return 0.0 if self._scheduled is None else self._scheduled.seconds
 
     @property
     def fetched_at(self) -> float:
-        """The monotonic time of the last request for a whole snapshot; never too long ago if none are fetched."""
-        return math.inf if self._whole is None else self._whole.requested_at
+        """The monotonic time of the last fetch on request; never too long ago if there are none."""
+        return math.inf if self._scheduled is None else self._scheduled.requested_at
 
     def read(self) -> None:
         """Decode what has come, and update `newest`. May take long: hold no lock meanwhile.
@@ -98,15 +121,15 @@ class SnapshotFeed:
             self._apply(message)
 
     def is_current(self) -> bool:
-        """Read what has come, and return whether no whole snapshot is awaited. Raises as `read` does."""
-        awaited = self._whole is not None and self._whole.in_progress
+        """Read what has come, and return whether no requested snapshot is awaited. Raises as `read` does."""
+        awaited = self._scheduled is not None and self._scheduled.in_progress
         self.read()
         return not awaited
 
     def fetch(self) -> None:
-        """Request the newest whole snapshot, if whole snapshots are fetched. Does not wait."""
-        if self._whole is not None:
-            self._whole.request_newest()
+        """Request the newest snapshot, if snapshots are fetched on request. Does not wait."""
+        if self._scheduled is not None:
+            self._scheduled.request_newest()
 
     def request_newest(self) -> None:
         """Request the newest snapshot in case a push was lost. Raises as `read` does."""
@@ -117,9 +140,9 @@ class SnapshotFeed:
             self._apply(message)
 
     def request_compact_if_behind(self, newest_version: int) -> None:
-        """Request the compact snapshot of a version that acknowledgements mention, if compact snapshots are fetched."""
-        if self._compact is not None and (self.newest is None or newest_version > self.newest.policy_version):
-            self._compact.request_newest()
+        """Request the snapshot of a version that acknowledgements mention, on a slow link."""
+        if self._slow_link is not None and (self.newest is None or newest_version > self.newest.policy_version):
+            self._slow_link.request_newest()
 
     def _apply(self, message: Message) -> None:
         if isinstance(message, RunEnded):

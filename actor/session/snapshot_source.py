@@ -9,6 +9,7 @@ from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol.messages import Snapshot
 
 FIRST_PUSH_SECONDS = 0.02  # before the first snapshot: the learner may be about to have one; doubles
+_SLOW_SECONDS, _SLOW_ROLLOUTS = 0.25, 3  # the first rollout of an environment may be slow
 MISSED_PUSH_SECONDS = 1.0  # without the awaited snapshot for so long, request it
 
 
@@ -18,6 +19,7 @@ class SnapshotSource:
     def __init__(self, feed: SnapshotFeed, monitor: SessionMonitor, uploads: UploadSession) -> None:
         self._feed, self._monitor, self._uploads = feed, monitor, uploads
         self._schedule = FetchSchedule()
+        self._slow_rollouts = 0  # in a row
 
     def begin_rollout(self) -> None:
         """Note that a rollout begins."""
@@ -26,6 +28,12 @@ class SnapshotSource:
     def end_rollout(self) -> None:
         """Note that the rollout is complete."""
         self._schedule.end_rollout(time.monotonic())
+        self._slow_rollouts = self._slow_rollouts + 1 if self._schedule.rollout_seconds > _SLOW_SECONDS else 0
+
+    @property
+    def rollouts_are_slow(self) -> bool:
+        """Whether the last rollouts each took so long that to fetch differences costs the learner little."""
+        return self._slow_rollouts >= _SLOW_ROLLOUTS
 
     def fetch_if_due(self) -> None:
         """Request the snapshot of the next rollout, if this one is about to end and the next can begin at once."""
