@@ -23,7 +23,7 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
     assert "ended, after 10 to 10 env_steps; return 10 to 10, mean 10" in lines["episodes"]
     assert "ms a step" in lines["speed"]
     assert lines["train"].startswith("a2c, 2 actors x 8 environments, rollouts of 16 rows, 1,000,000 env_steps")
-    assert lines["network"] == "encoder mlp, 8,903 parameters"
+    assert lines["network"] == "encoder mlp, 8,907 parameters"
     assert lines["result"] == "no problem found"
 
 
