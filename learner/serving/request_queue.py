@@ -2,8 +2,11 @@
 
 import queue
 import threading
+from typing import Any
 
 from daedalus.transport.interface import Request
+
+_WAKE = object()
 
 
 class RequestQueue:
@@ -13,7 +16,7 @@ class RequestQueue:
         self._max_bytes, self._max_requests = max_bytes, max_requests
         self._bytes = self._number = 0
         self._lock = threading.Lock()
-        self._requests: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def offer(self, request: Request) -> bool:
         """Queue a request and return True, or return False if a bound would be exceeded.
@@ -32,14 +35,20 @@ class RequestQueue:
     def take(self, timeout: float | None = None) -> Request | None:
         """Wait for the oldest request and return it, or None if the queue is closed and empty.
 
-        Raises queue.Empty if no request comes within `timeout` seconds.
+        Raises queue.Empty if no request comes within `timeout` seconds, or after `wake`.
         """
         request = self._requests.get(timeout=timeout)
+        if request is _WAKE:
+            raise queue.Empty
         if request is not None:
             with self._lock:
                 self._bytes -= request.size
                 self._number -= 1
         return request
+
+    def wake(self) -> None:
+        """Let `take` raise queue.Empty once."""
+        self._requests.put(_WAKE)
 
     @property
     def bytes(self) -> int:

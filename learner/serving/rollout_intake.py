@@ -22,8 +22,10 @@ from dataclasses import replace
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.held_answers import HeldAnswers
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
@@ -36,7 +38,8 @@ from daedalus.transport.interface import Request
 
 HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
 _CLOSE_SECONDS = 4.0  # for the intake thread to answer the queued rollouts
-_MOST_HELD_SECONDS = 10.0  # an answer waits no longer: its sender would take the rollout for lost
+
+_ACCEPTED = Acknowledgement(verdict="accepted")
 
 _logger = logging.getLogger(__name__)
 
@@ -75,8 +78,7 @@ class RolloutIntake:
         self._requests = _queue(spec)
         self._named: set[str] = set()  # actors that were logged as left out
         self._ending: Acknowledgement | None = None  # of all rollouts after the end
-        self._computes_since: float | None = None  # the learner's thread a batch
-        self._held: list[Request] = []  # accepted rollouts that are answered with the next batch
+        self._held = HeldAnswers()  # of accepted rollouts, until the next batch is taken
         self._thread = threading.Thread(target=self._judge_requests, name="intake", daemon=True)
 
     def open(self) -> None:
@@ -89,6 +91,8 @@ class RolloutIntake:
             self._ending = Acknowledgement(verdict="finished")
         else:
             self._ending = Acknowledgement(verdict="fenced", reason="the learner is stopping")
+        self._held.release()
+        self._requests.wake()
 
     def close(self) -> None:
         """Answer the queued rollouts, and stop the thread. Call after `end`, without the lock."""
@@ -149,15 +153,15 @@ class RolloutIntake:
           version: newest policy version, before this batch.
         """
         with self._lock:
-            self._computes_since = None
-            self._answer_held()
+            self._held.release()
+            self._requests.wake()  # the intake thread answers: a congested link must not stop the learner
             taken = self._take(version)
             if not taken.rollouts and not taken.stale:
                 self._lock.wait(HEARTBEAT_SECONDS)
                 taken = self._take(version)
             self._count(taken, version)
             if taken.rollouts:
-                self._computes_since = time.monotonic()
+                self._held.begin(time.monotonic())
             self._lock.notify_all()
         return taken.rollouts
 
@@ -205,27 +209,21 @@ class RolloutIntake:
                 actors[rollout.identity.actor].rejected["stale"] += 1
         if not taken.rollouts:
             return
-        updates = self._updates_of(taken.rollouts)
+        updates = updates_of(self._spec.training, taken.rollouts, memory=self._intake.state_size > 0)
         self._counters.trained(taken.rollouts, version, updates)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
                 actors[rollout.identity.actor].env_steps += int(np.count_nonzero(rollout.valid))
         self._version = version + updates
 
-    def _updates_of(self, rollouts: list[Rollout]) -> int:
-        """Return the number of policy versions that the learner makes of a batch of these rollouts."""
-        if self._intake.state_size:
-            return self._spec.training.updates_from(sum(rollout.environments for rollout in rollouts))
-        return self._spec.training.updates_from(sum(int(np.count_nonzero(rollout.valid)) for rollout in rollouts))
-
     # --------------------------------------------------------------------------------------- the intake thread
 
     def _judge_requests(self) -> None:
         while True:
+            self._answer_held()
             try:
                 request = self._requests.take(HEARTBEAT_SECONDS)
             except queue.Empty:
-                self._end_long_hold()
                 continue
             if request is None:
                 break
@@ -233,27 +231,24 @@ class RolloutIntake:
             content = self._intake.read(sender, payload)
             with self._lock:
                 answer = self._judge(sender, content, len(payload))
-                is_held = answer.verdict == "accepted" and self._computes_since is not None and self._ending is None
+                is_held = answer.verdict == "accepted" and self._held.holds and self._ending is None
                 if is_held:
-                    self._held.append(request)
+                    self._held.add(request)
             if not is_held:
                 request.reply(encode(self._ending or answer))
         with self._lock:
-            self._answer_held()
-
-    def _end_long_hold(self) -> None:
-        with self._lock:
-            if self._computes_since is not None and time.monotonic() > self._computes_since + _MOST_HELD_SECONDS:
-                self._computes_since = None
-                self._answer_held()
+            self._held.release()
+        self._answer_held()
 
     def _answer_held(self) -> None:
-        """Answer the accepted rollouts whose answers wait. The caller holds the lock."""
-        held, self._held = self._held, []
-        for request in held:
-            request.reply(
-                encode(self._ending or Acknowledgement(verdict="accepted", policy_version=self._published_version()))
-            )
+        """Answer the accepted rollouts whose answers need not wait any more."""
+        with self._lock:
+            answers = [
+                (request, self._ending or self._final_answer(keys.last_chunk(request.key), _ACCEPTED))
+                for request in self._held.take(time.monotonic())
+            ]
+        for request, answer in answers:
+            request.reply(encode(replace(answer, policy_version=self._published_version())))
 
     def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
@@ -268,7 +263,10 @@ class RolloutIntake:
             self._store(verdict, size)
         else:
             self._count_rejection(sender, verdict)
-        answer = acknowledgement(verdict, self._published_version())
+        return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
+
+    def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
+        """Return the answer to a rollout, `drained` if its actor is asked to leave."""
         actor = self._fleet.actors.get(sender)
         is_final = answer.verdict in ("accepted", "rejected")
         return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer

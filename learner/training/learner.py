@@ -11,6 +11,7 @@ from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.diagnostics import diagnostics
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.run.updates import updates_of
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.gradient_faults import rollouts_at_fault
 from daedalus.learner.training.normalization import ObservationStatistics, RewardNormalizer
@@ -73,7 +74,7 @@ class Learner:
           rollouts: the rollouts of the batch, in order.
           progress: share of the budget that is used, from 0 to 1; the rates are annealed by it.
         """
-        end = self.policy_version + self._updates_of(rollouts)
+        end = self.policy_version + updates_of(self._spec, rollouts, memory=self.state_size > 0)
         if self._rewards is not None:
             self._rewards.add(rollouts)
         kept, left_out = list(rollouts), []
@@ -84,12 +85,6 @@ class Learner:
         self.updates_skipped += end - self.policy_version
         self.policy_version = end
         return left_out
-
-    def _updates_of(self, rollouts: Sequence[Rollout]) -> int:
-        """Return the number of policy versions that a batch of these rollouts makes."""
-        if self.state_size:
-            return self._spec.updates_from(sum(rollout.environments for rollout in rollouts))
-        return self._spec.updates_from(sum(int(np.count_nonzero(rollout.valid)) for rollout in rollouts))
 
     def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""

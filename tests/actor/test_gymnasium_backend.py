@@ -19,7 +19,8 @@ from plain import PlainEnvironments, choices
 from daedalus.actor.environments import make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, RepeatedSteps, make_gymnasium
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, make_gymnasium
+from daedalus.actor.environments.wrappers import RepeatedSteps
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spec import EnvironmentSpec
 

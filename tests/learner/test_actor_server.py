@@ -76,21 +76,31 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
     actor = MemoryTransport(network)
     join = Join(actor="a", incarnation=1, spaces=SPACES, environments=ENVIRONMENTS)
 
-    def verdict(sequence: int, version: int) -> str:
-        rollout = make_rollout(identity("a", sequence), version=version)
-        (answer,) = actor.query(keys.rollouts("r", "a"), encode(rollout), timeout=LIMIT)
-        acknowledgement = decode(answer, Limits())
+    answers: queue.Queue[bytes | None] = queue.Queue()
+
+    def send(sequence: int, version: int) -> None:
+        rollout = encode(make_rollout(identity("a", sequence), version=version))
+        actor.query_async(keys.rollouts("r", "a"), rollout, timeout=LIMIT, on_answer=answers.put)
+
+    def verdict() -> str:
+        acknowledgement = decode(answers.get(timeout=LIMIT) or b"", Limits())
         assert isinstance(acknowledgement, Acknowledgement)
         return acknowledgement.verdict
 
     try:
         actor.query(keys.join("r", "a"), encode(join), timeout=LIMIT)
-        assert verdict(0, version=1) == "rejected"
-        assert verdict(1, version=0) == "accepted"
+        send(0, version=1)
+        assert verdict() == "rejected"
+        send(1, version=0)
+        assert verdict() == "accepted"
         assert len(server.rollouts.take_batch(0)) == 1
-        assert verdict(2, version=updates + 1) == "rejected"
-        assert verdict(3, version=updates) == "accepted"
+        send(2, version=updates + 1)
+        assert verdict() == "rejected"
+        send(3, version=updates)
+        until(lambda: counters.rollouts_accepted == 2)
+        assert answers.empty()  # while the learner computes
         assert len(server.rollouts.take_batch(updates)) == 1
+        assert verdict() == "accepted"
     finally:
         server.close("the test is over")
     assert (counters.updates, counters.rollouts_trained, counters.policy_lag_sum) == (2 * updates, 2, 0)

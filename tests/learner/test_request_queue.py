@@ -1,7 +1,9 @@
 """learner/serving/request_queue.py: first in, first out, bounded by bytes and by number."""
 
+import queue
 import threading
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -88,3 +90,12 @@ def test_take_blocks_until_a_request_or_close() -> None:
     worker.join(60.0)
     assert not worker.is_alive()
     assert taken == [request]
+
+
+def test_a_woken_queue_raises_once_and_keeps_its_requests() -> None:
+    waiting, request = RequestQueue(100, 100), UnansweredRequest(3)
+    waiting.wake()
+    waiting.offer(request)
+    with pytest.raises(queue.Empty):
+        waiting.take()
+    assert waiting.take() is request

@@ -1,0 +1,115 @@
+"""Wrappers of one gymnasium environment: masks in `info`, repeated actions, one episode for each seed."""
+
+from collections.abc import Callable
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.masks import MASK_KEY
+
+Camera = Callable[[np.ndarray], None]
+
+
+class Shutter:
+    """A camera that films only while it is open."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera, self.is_open = camera, False
+
+    def __call__(self, picture: np.ndarray) -> None:
+        """Pass a picture on."""
+        if self.is_open:
+            self._camera(picture)
+
+
+class MaskInInfo(gymnasium.Wrapper):
+    """A wrapper that puts the result of the environment's `action_masks()` into `info`."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {**info, MASK_KEY: self._mask()}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, MASK_KEY: self._mask()}
+
+    def _mask(self) -> np.ndarray:
+        return np.asarray(self.env.get_wrapper_attr("action_masks")(), np.bool_)
+
+
+class RepeatedSteps(gymnasium.Wrapper):
+    """A wrapper that repeats each action, passes every frame to a camera, and applies no_reward_limit."""
+
+    def __init__(
+        self, environment: gymnasium.Env, *, repeat: int, no_reward_limit: int | None, camera: Camera | None = None
+    ) -> None:
+        super().__init__(environment)
+        self._repeat = repeat
+        self._no_reward_limit = no_reward_limit
+        self._camera = camera
+        self._unrewarded = 0  # steps in a row
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env."""
+        started = self.env.reset(seed=seed, options=options)
+        self._unrewarded = 0
+        self._film()
+        return started
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Repeat the action until the episode ends or `repeat` is reached, and sum the rewards."""
+        observation, total, terminated, truncated, info = self._step_once(action)
+        for _ in range(self._repeat - 1):
+            if terminated or truncated:
+                break
+            observation, reward, terminated, truncated, info = self._step_once(action)
+            total += reward
+        self._unrewarded = 0 if total > 0.0 else self._unrewarded + 1
+        if self._no_reward_limit is not None and self._unrewarded >= self._no_reward_limit and not terminated:
+            truncated = True
+        return observation, total, terminated, truncated, info
+
+    def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._film()
+        return observation, float(reward), terminated, truncated, info
+
+    def _film(self) -> None:
+        if self._camera is None:
+            return
+        picture = self.env.render()
+        if not isinstance(picture, np.ndarray):
+            raise EnvironmentSetupError(
+                f"{self.env} renders {type(picture).__name__} instead of an image: a video of it cannot be recorded"
+            )
+        self._camera(picture)
+
+
+class OneEpisode(gymnasium.Wrapper):
+    """A wrapper that plays one episode for each reset with a seed, and then stands still.
+
+    A reset without a seed, by which a vector environment begins the next episode, costs nothing here, and the steps
+    after it neither.
+    """
+
+    _over = False
+    _last: Any = None  # the last observation of the episode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode if a seed is given, else return the last observation."""
+        if seed is None:
+            return self._last, {}
+        self._over = False
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env. After the episode, return the last observation and no reward."""
+        if self._over:
+            return self._last, 0.0, False, False, {}
+        self._last, reward, terminated, truncated, info = self.env.step(action)
+        self._over = terminated or truncated
+        return self._last, reward, terminated, truncated, info
