@@ -1,7 +1,7 @@
 """The rows of a loop that somebody else owns, under one learner. State without threads or I/O."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class ClientRows:
         self._last: Observed | None = None  # the newest observation
         self._acted = False  # the current row has an action and no outcome yet
         self._episode_ended = False  # the next row is a reset row
+        self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
         self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
 
     @property
@@ -72,9 +73,11 @@ class ClientRows:
         observed = self._transforms.observe_one(observation, action_mask, needed=True)
         if self._last is None:
             self._writer.start(observed)
-        self._last = observed
-        if self._acted:
+        elif self._cut == "restarts":
+            self._writer.restart(observed)
+        elif self._acted or self._cut == "resets":
             self._record(observed)
+        self._last, self._cut = observed, ""
 
     def choose(self) -> dict[str, np.ndarray] | None:
         """Return the policy's actions {name: [1, D]}; None after a reset row, whose action has no effect."""
@@ -124,13 +127,26 @@ class ClientRows:
                 "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
                 "pass the last observation"
             )
-        self._end(terminated)
-
-    def _end(self, terminated: bool) -> None:
         assert self._last is not None
         self._terminated, self._truncated = terminated, not terminated
         self._record(self._last)
         self._episode_ended = True
+
+    def cut(self) -> None:
+        """End the episode as truncated at the newest observation: the loop was interrupted.
+
+        What followed the last action is not known, so its row is not learned from. The next `observe` begins another
+        episode.
+        """
+        if self._last is None or self._episode_ended or self._cut:
+            return
+        if not self._writer.cut():
+            self._cut = "restarts"
+        elif self._acted:
+            self._cut = "resets"
+        else:
+            self._episode_ended = True
+        self._acted, self._reward = False, 0.0
 
     def _record(self, observed: Observed) -> None:
         """Complete the row of the last action."""

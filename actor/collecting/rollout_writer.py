@@ -126,6 +126,26 @@ class RolloutWriter:
         self._row += 1
         return self._row == len(self._rewards)
 
+    def cut(self) -> bool:
+        """End the episodes as truncated at the newest observations; return False if this rollout has no row of them.
+
+        The row that has begun is then a reset row: complete it with `record`, with the first observations of the next
+        episodes. After False call `restart`.
+        """
+        if not self._row or not self._valid[self._row - 1].all():
+            return False
+        self._truncated[self._row - 1] = True
+        self._episodes.cut()
+        return True
+
+    def restart(self, observed: Observed) -> None:
+        """Begin the row again, as the first of other episodes. See `start`."""
+        for name, frames in self._frames.items():
+            frames[self._depths[name] + self._row - 1] = observed.frames[name]
+        self._episodes.restart()
+        self._state = np.zeros_like(self._state)
+        self.start(observed)
+
     def finish(
         self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None
     ) -> Rollout:
