@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from gateways import JsonClient, RunningGateway
@@ -39,7 +40,7 @@ def connect(gateway: RunningGateway) -> Iterator[Callable[..., JsonClient]]:
     """Function that returns a connected client."""
     with contextlib.ExitStack() as stack:
 
-        def connect_one(**options: object) -> JsonClient:
+        def connect_one(**options: Any) -> JsonClient:
             client = JsonClient(gateway.port, **options)
             stack.callback(client.close)
             return client
