@@ -7,7 +7,7 @@ import torch
 from daedalus.algorithms.algorithm import Forward, Losses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
-from daedalus.algorithms.losses import policy_gradient_loss, policy_weights
+from daedalus.algorithms.losses import policy_factors, policy_gradient_loss, shares_of
 from daedalus.algorithms.targets import TargetsFunction
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.spec import TrainingSpec
@@ -25,17 +25,21 @@ class PolicyGradient:
         log_probs, entropies = self._distribution.log_prob_and_entropy(parameters[:-1], batch.actions, batch.masks)
         with torch.no_grad():
             targets = self._targets(self._spec, batch, log_probs, values)
-        normalize = self._spec.normalize_advantages
-        factors = policy_weights(targets.advantages, targets.weights, batch.valid, normalize)
+            shares = shares_of(batch.valid)
+            factors = policy_factors(targets, batch.valid, self._spec.normalize_advantages)
         yield Losses(
-            policy_loss=policy_gradient_loss(log_probs, factors, batch.valid),
+            policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,
             values=values[:-1],
             targets=targets.values,
-            advantages=targets.advantages,
-            valid=batch.valid,
+            shares=shares,
             clipped_fraction=torch.zeros((), device=values.device),
             first_pass=FirstPass(
-                log_probs.detach(), batch.behaviour_log_probs, values[:-1].detach(), targets.values, batch.valid
+                log_probs.detach(),
+                batch.behaviour_log_probs,
+                values[:-1].detach(),
+                targets.values,
+                targets.advantages,
+                batch.valid,
             ),
         )

@@ -91,16 +91,16 @@ class Learner:
         batch = self._joined(rollouts)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-            size = float(norm)
-            if not math.isfinite(size):  # such a step would set all parameters to nan for the rest of the run
+            if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
                 return False
             self.policy_version += 1
             self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
-            self.metrics.add_update(terms, norm, clipped=size > self._spec.max_gradient_norm)
+            self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
             if self.policy_version == end:
                 break
         self._observations.add(batch)
-        self.metrics.add_batch(batch)
+        if self._gradients.first_pass is not None:
+            self.metrics.add_batch(batch, self._gradients.first_pass)
         return True
 
     def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
