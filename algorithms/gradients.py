@@ -11,9 +11,13 @@ from daedalus.algorithms.batch import Batch, Components
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.algorithms.losses import explained_variance, masked_mean, value_loss
+from daedalus.algorithms.own_algorithm import check_updates
 from daedalus.algorithms.precision import autocast
 from daedalus.algorithms.registry import build_algorithm
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import is_own
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -32,11 +36,17 @@ class Terms(NamedTuple):
 class GradientComputer:
     """Gradient computation of one algorithm for one network."""
 
-    def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
+    def __init__(
+        self, spec: TrainingSpec, network: ActorCritic, spaces: Spaces, modules: UserModules = NO_MODULES
+    ) -> None:
+        """Raise AlgorithmError if the user's own algorithm cannot be used; `modules` may be imported for it."""
         self._spec, self._network = spec, network
-        self._algorithm = build_algorithm(spec, network.distribution)
+        self._algorithm = build_algorithm(spec, network.distribution, modules)
         self.parameters = FlatParameters(network.learned_parameters())
         self._first_pass: FirstPass | None = None  # of the newest batch
+        if is_own(spec.algorithm):
+            check_updates(spec, lambda batch: self.compute(batch, spec.entropy_bonus), spaces, network.state_size)
+            self._first_pass = None
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
@@ -75,5 +85,5 @@ def _terms(losses: Losses, value_term: Tensor, entropy: Tensor) -> Terms:
         explained_variance=explained_variance(losses.values, losses.targets, losses.valid),
         value_mean=masked_mean(losses.values, losses.valid),
         advantage_std=masked_mean(centred.square(), losses.valid).sqrt(),
-        clipped_fraction=losses.clipped_fraction,
+        clipped_fraction=losses.values.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction,
     )
