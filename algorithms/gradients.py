@@ -11,9 +11,13 @@ from daedalus.algorithms.batch import Batch, Components
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.algorithms.losses import mean, value_loss
+from daedalus.algorithms.own_algorithm import check_updates
 from daedalus.algorithms.precision import is_mixed
 from daedalus.algorithms.registry import build_algorithm
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import is_own
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import TrainingSpec
 
 
@@ -29,12 +33,18 @@ class Terms(NamedTuple):
 class GradientComputer:
     """Gradient computation of one algorithm for one network."""
 
-    def __init__(self, spec: TrainingSpec, network: ActorCritic) -> None:
+    def __init__(
+        self, spec: TrainingSpec, network: ActorCritic, spaces: Spaces, modules: UserModules = NO_MODULES
+    ) -> None:
+        """Raise AlgorithmError if the user's own algorithm cannot be used; `modules` may be imported for it."""
         self._spec, self._network = spec, network
-        self._algorithm = build_algorithm(spec, network.distribution)
+        self._algorithm = build_algorithm(spec, network.distribution, modules)
         self.parameters = FlatParameters(network.learned_parameters())
         self._is_mixed = is_mixed(spec.precision, self.parameters.values.device, network.convolutional)
         self._first_pass: FirstPass | None = None  # of the newest batch
+        if is_own(spec.algorithm):
+            check_updates(spec, lambda batch: self.compute(batch, spec.entropy_bonus), spaces, network.state_size)
+            self._first_pass = None
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
@@ -44,12 +54,16 @@ class GradientComputer:
         # The statistics of observations do not change within a batch: normalise once for all passes.
         batch = replace(batch, observations=self._network.normalizer(batch.observations))
         for losses in self._algorithm.losses(batch, self._forward):
+            if not losses.values.shape == losses.targets.shape == losses.shares.shape:
+                shapes = [tuple(each.shape) for each in (losses.values, losses.targets, losses.shares)]
+                raise ValueError(f"the shapes of values, targets and shares differ: {shapes}")
             value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
             entropy = mean(losses.entropies, losses.shares)
             loss = losses.policy_loss + self._spec.value_coefficient * value_term - entropy_bonus * entropy
             self._first_pass = losses.first_pass
             self.parameters.differentiate(loss)
-            yield Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), losses.clipped_fraction)
+            clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
+            yield Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
 
     @property
     def first_pass(self) -> FirstPass | None:

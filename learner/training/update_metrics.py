@@ -51,8 +51,8 @@ class UpdateMetrics:
         self._updates += 1
         self._clipped_updates += clipped
 
-    def add_batch(self, batch: Batch, first_pass: FirstPass) -> None:
-        """Add the metrics of a batch, count its actions, and keep one of its observations."""
+    def add_first_pass(self, first_pass: FirstPass) -> None:
+        """Add the metrics of a batch."""
         shares = shares_of(first_pass.valid)
         self._batch_sums += torch.stack(
             [
@@ -62,6 +62,9 @@ class UpdateMetrics:
             ]
         )
         self._batches += 1
+
+    def add_batch(self, batch: Batch) -> None:
+        """Count the actions of a batch, and keep one of its observations."""
         if self._image is not None:
             self._newest = batch.observations[self._image][0, 0]
         for name, counts in self._action_counts.items():
@@ -75,12 +78,12 @@ class UpdateMetrics:
             return {}
         means = (self._sums / self._updates).tolist()
         means += [self._norms / self._updates, self._clipped_updates / self._updates]
-        means += (self._batch_sums / max(self._batches, 1)).tolist()
+        means += (self._batch_sums / self._batches).tolist() if self._batches else []
         self._sums.zero_()
         self._norms = 0.0
         self._batch_sums.zero_()
         self._updates = self._clipped_updates = self._batches = 0
-        return dict(zip(METRICS, means, strict=True))
+        return dict(zip(METRICS, means, strict=False))  # an algorithm of the user may give no first pass
 
     def take_action_counts(self) -> dict[str, list[int]]:
         """Return how often each choice of each discrete component was chosen in the batches since the last call."""
