@@ -15,6 +15,7 @@ from daedalus.actor.environments.components import (
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
+from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -45,6 +46,7 @@ class Transforms:
 
         Raises EnvironmentSetupError if the specification does not fit the spaces.
         """
+        observation_space = without(observation_space, spec.leave_out)
         self._observation_space, self._action_space = observation_space, action_space
         self._actions = ActionComponents(spec.action_table, action_space)
         components = observation_components(observation_space)
