@@ -70,6 +70,11 @@ class Transforms:
                 f"supported: {error.errors()[0]['msg']}"
             ) from None
 
+    @property
+    def needs_mask(self) -> bool:
+        """Whether `observe` needs an action mask: the actions have masks, and the observation does not contain them."""
+        return bool(self.spaces.masks) and self._mask_source is None
+
     def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
         """Return batched observations of the environment as the run has them.
 
