@@ -8,6 +8,7 @@ from types import ModuleType
 
 import gymnasium
 
+OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
 _MOST_CHARACTERS = 160  # of a space in a message
 
 
@@ -28,14 +29,23 @@ def unknown_environment(name: str, known: Collection[str], otherwise: str) -> En
     return EnvironmentSetupError(f"unknown environment {name!r}: {hint}")
 
 
-def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import a package that comes with one of our extras. Raises EnvironmentSetupError if it is not installed."""
+def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> ModuleType:
+    """Import a package that comes with one of our extras.
+
+    Args:
+      module: its name.
+      extra: name of the extra.
+      purpose: what needs the package.
+      otherwise: what else the user can do.
+
+    Raises EnvironmentSetupError if the package is not installed.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise EnvironmentSetupError(
-            f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]", '
-            "or use another backend (--set environment.backend=gymnasium)"
+            f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]"'
+            f"{', ' if otherwise else ''}{otherwise}"
         ) from None
 
 
@@ -47,8 +57,8 @@ def creation_errors(environment: str) -> Iterator[None]:
     except EnvironmentSetupError:
         raise
     except gymnasium.error.DependencyNotInstalled as error:
-        box2d = "box2d" in str(error).lower()
-        remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
+        extra = next((extra for extra in ("box2d", "mujoco") if extra in str(error).lower()), None)
+        remedy = first_line(error) if extra is None else f'pip install "daedalus-rl[{extra}]"'
         raise EnvironmentSetupError(
             f"environment {environment} needs a package that is not installed: {remedy}"
         ) from None

@@ -25,6 +25,8 @@ from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode,
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
+# Packages that register environments when they are imported: beginning of the id -> module and extra.
+_PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
@@ -177,8 +179,10 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
             modules.load("environment.id", environment_id)
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from error
-    elif name.startswith("ALE/"):
-        gymnasium.register_envs(import_extra("ale_py", "atari", f"environment {name}"))  # importing it registers them
+    else:
+        for beginning, (module, extra) in _PACKAGES.items():
+            if name.startswith(beginning):
+                gymnasium.register_envs(import_extra(module, extra, f"environment {name}"))
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:

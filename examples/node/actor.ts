@@ -247,11 +247,13 @@ export class Actor {
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
 function checkSupported(spec: link.EnvironmentSpec): void {
-  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, leave_out } = spec;
+  const { crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,
     kwargs: Object.keys(kwargs).length > 0,
     action_repeat: action_repeat !== 1,
+    leave_out: leave_out.length > 0,
     frame_stack: frame_stack !== 1,
     ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };

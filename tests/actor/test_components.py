@@ -207,6 +207,41 @@ def test_discrete_observation_outside_its_space_is_refused() -> None:
         component.values(np.array([0, 3]))
 
 
+# ------------------------------------------------------------------------------------------------- leave_out
+
+
+PARTS = gym.Dict(
+    {"goal": gym.Tuple((gym.Text(9), gym.Discrete(3))), "empty": gym.Box(-1, 1, (0,)), "arm": gym.Box(-1, 1, (2,))}
+)
+
+
+def test_components_that_are_left_out_are_not_read() -> None:
+    spec = EnvironmentSpec(id="Any-v0", leave_out=("goal.0", "empty"))
+    transforms = Transforms(spec, PARTS, gym.Discrete(2))
+    assert list(transforms.spaces.observations) == ["arm", "goal.1"]
+    for observation in (
+        {"goal": ("left", np.int64(2)), "empty": np.zeros(0), "arm": np.ones(2)},
+        {"goal": (None, np.int64(2)), "arm": np.ones(2)},
+    ):
+        frames = transforms.observe_one(observation, None).frames
+        assert {name: values.tolist() for name, values in frames.items()} == {"arm": [[1.0, 1.0]], "goal.1": [[2]]}
+
+
+@pytest.mark.parametrize(
+    ("leave_out", "reason"),
+    [
+        ((), r"component 'arm5'\) is not supported: .*with one to 4 axes.*\"environment.leave_out=\['arm5'\]\""),
+        (("arm5", "word"), r"leave_out names 'word', but the components of the observation are arm5, text"),
+        (("arm5", "text"), "leave_out names every component of the observation: keep one"),
+        (("arm5",), r"component 'text'\) is not supported: use Box, .*\"environment.leave_out=\['text'\]\""),
+    ],
+)
+def test_component_that_is_not_supported_can_be_left_out(leave_out: tuple[str, ...], reason: str) -> None:
+    space = gym.Dict({"arm5": gym.Box(-1, 1, (2, 1, 1, 1, 1)), "text": gym.Text(9)})
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        Transforms(EnvironmentSpec(id="Any-v0", leave_out=leave_out), space, gym.Discrete(2))
+
+
 # --------------------------------------------------------------------------------------------- frame stacks
 
 

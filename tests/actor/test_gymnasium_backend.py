@@ -257,16 +257,49 @@ def test_processes_ignore_interrupts() -> None:
 # ----------------------------------------------------------------------------------------------- missing packages
 
 
-def test_missing_package_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("extra", ["Box2D", "MuJoCo"])
+def test_missing_package_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch, extra: str) -> None:
     def fails(**_kwargs) -> gymnasium.Env:
-        raise gymnasium.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
+        raise gymnasium.error.DependencyNotInstalled(f"{extra} is not installed, run `pip install ...`")
 
     monkeypatch.setitem(gymnasium.registry, "Fails-v0", EnvSpec("Fails-v0", fails))
-    with pytest.raises(EnvironmentSetupError, match=r'pip install "daedalus-rl\[box2d\]"'):
+    with pytest.raises(EnvironmentSetupError, match=rf'pip install "daedalus-rl\[{extra.lower()}\]"$'):
         make_environments(EnvironmentSpec(id="Fails-v0"), 1)
-    monkeypatch.setitem(sys.modules, "ale_py", None)
-    with pytest.raises(EnvironmentSetupError, match=r'ALE/Pong-v5.*pip install "daedalus-rl\[atari\]"'):
-        make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [
+        ("ALE/Pong-v5", "ale_py", "atari"),
+        ("MiniGrid-DoorKey-5x5-v0", "minigrid", "minigrid"),
+        ("BabyAI-GoToLocal-v0", "minigrid", "minigrid"),
+    ],
+)
+def test_missing_package_that_registers_environments_is_reported_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(EnvironmentSetupError, match=rf'{name} needs .*pip install "daedalus-rl\[{extra}\]"$'):
+        make_environments(EnvironmentSpec(id=name), 1)
+
+
+def test_minigrid_is_registered_by_its_names() -> None:
+    pytest.importorskip("minigrid")
+    spec = EnvironmentSpec(id="MiniGrid-DoorKey-5x5-v0", leave_out=("mission",))
+    environments = created(spec, 2)
+    frames = environments.reset(1).frames
+    assert {part: values.shape for part, values in frames.items()} == {"direction": (2, 1), "image": (2, 7, 7, 3)}
+    environments.close()
+
+
+def test_text_of_a_class_of_its_own_can_be_left_out_in_processes() -> None:
+    spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True)
+    environments = created(spec, 2)
+    try:
+        assert environments.reset(1).frames["step"].tolist() == [[0.0], [0.0]]
+        assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [0.0, 1.0]
+    finally:
+        environments.close()
 
 
 def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
