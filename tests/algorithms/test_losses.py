@@ -176,6 +176,13 @@ def test_normalized_of_equal_advantages_is_0() -> None:
     assert torch.equal(normalized(torch.full((2, 2), 3.0), torch.ones(2, 2)), torch.zeros(2, 2))
 
 
+def test_normalized_does_not_amplify_differences_that_are_only_rounding() -> None:
+    tiny = torch.tensor([[1e-9, -1e-9]])
+    positive, negative = normalized(tiny, torch.ones(1, 2))[0].tolist()
+    assert 0.0 < positive < 0.2
+    assert negative == -positive
+
+
 def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_for_worse(
     random: torch.Generator, valid: Tensor
 ) -> None:
