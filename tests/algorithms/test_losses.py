@@ -134,7 +134,8 @@ def test_clipped_fraction_is_over_the_valid_rows(random: torch.Generator, valid:
     log_ratios = normal(random) / 4.0
     left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}
     assert clipped_fraction(log_ratios, valid, 0.3).item() == pytest.approx(mean_of(left, valid))
-    assert clipped_fraction(torch.zeros(ROWS, COLUMNS), valid, 0.3).item() == 0.0
+    for clip_range in (0.3, 0.0):
+        assert clipped_fraction(torch.zeros(ROWS, COLUMNS), valid, clip_range).item() == 0.0
 
 
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:

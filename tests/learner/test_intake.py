@@ -16,7 +16,7 @@ from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
 FENCED = ("epoch", "unknown_actor")  # the causes for which an actor joins again
@@ -119,6 +119,17 @@ def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> 
     weights = {str(number): np.zeros(1, np.float32) for number in range(36)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
     assert_rejected(harness, data, "malformed", "36 arrays, the limit is 35")
+
+
+def test_each_component_adds_its_arrays_to_the_limit() -> None:
+    """A component of the observation has one array, a component of the action two, with its masks."""
+    observation, action = ArraySpace(shape=(3,), dtype="float32"), DiscreteSpace(counts=(4,))
+    spaces = Spaces(observations={"a": observation, "b": observation}, actions=dict.fromkeys("cde", action))
+    weights = {str(number): np.zeros(1, np.float32) for number in range(41)}
+    data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
+    verdict = stacked_harness(spaces).receive(data)
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == "41 arrays, the limit is 40"
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -335,12 +346,18 @@ def test_large_message_of_a_sender_that_has_not_joined_is_fenced(spaces: Spaces 
     )
 
 
-@pytest.mark.parametrize("masked", [False, True])
-def test_size_limit_is_the_documented_one(masked: bool) -> None:
-    """E (T (23 + action and mask bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
-    action = DiscreteSpace(counts=(4,), masked=masked)
+@pytest.mark.parametrize(
+    ("action", "action_bytes"),
+    [
+        (DiscreteSpace(counts=(4, 2)), 2 * 8),
+        (DiscreteSpace(counts=(4, 2), masked=True), 2 * 8 + 6),
+        (ContinuousSpace(low=(0.0,) * 3, high=(1.0,) * 3), 3 * 4),
+    ],
+)
+def test_size_limit_is_the_documented_one(action: DiscreteSpace | ContinuousSpace, action_bytes: int) -> None:
+    """E (T (23 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
     harness = stacked_harness(Spaces(observations={NAME: STACKED}, actions={ACTION: action}), state_size=7)
-    limit = ENVIRONMENTS * (ROWS * (23 + 8 + 4 * masked) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
+    limit = ENVIRONMENTS * (ROWS * (23 + action_bytes) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
     message = Limits(max_bytes=limit).message_bytes
     assert harness.intake.refuse_size("a", message) is None
     refused = harness.intake.refuse_size("a", message + 1)
@@ -512,7 +529,7 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
     spec = run_spec(max_policy_lag=MAX_LAG)
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
     harness.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
-    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5, np.float32))
+    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5 * (1 + 1e-5), np.float32))  # by rounding
     beyond = good(rollout_identity=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
     assert isinstance(harness.receive(encode(within)), Rollout)
     verdict = harness.receive(encode(beyond))
