@@ -133,6 +133,12 @@ def test_huge_ratio_does_not_overflow_the_clipped_loss(log_ratio: float) -> None
     assert gradient[:, 1].all()
 
 
+@pytest.mark.parametrize("clip_range", [0.3, 0.0])
+def test_ratios_of_1_are_not_clipped(valid: Tensor, clip_range: float) -> None:
+    zeros = torch.zeros(ROWS, COLUMNS)
+    assert clipped_policy_loss(zeros, zeros, shares_of(valid), clip_range)[1].item() == 0.0
+
+
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random).requires_grad_()
     log_probs = normal(random).requires_grad_()
@@ -172,6 +178,13 @@ def test_normalized_has_mean_0_and_deviation_1_over_the_valid_rows(random: torch
 
 def test_normalized_of_equal_advantages_is_0() -> None:
     assert torch.equal(normalized(torch.full((2, 2), 3.0), torch.ones(2, 2)), torch.zeros(2, 2))
+
+
+def test_normalized_does_not_amplify_differences_that_are_only_rounding() -> None:
+    tiny = torch.tensor([[1e-9, -1e-9]])
+    positive, negative = normalized(tiny, torch.ones(1, 2))[0].tolist()
+    assert 0.0 < positive < 0.2
+    assert negative == -positive
 
 
 def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_for_worse(

@@ -155,6 +155,8 @@ def test_encoding_an_unsupported_dtype_raises_value_error(dtype: str) -> None:
 def test_threads_may_encode_and_decode_concurrently() -> None:
     """A zstd context shared by threads fails or crashes within a few of these operations."""
     failures: list[object] = []
+    rollouts = [some_rollout(), some_rollout(PIXELS)]
+    encoded = [encode(rollout) for rollout in rollouts]
 
     def work(value: int) -> None:
         model = np.tile(np.arange(value, value + 100, dtype=np.uint8), 5000)
@@ -163,6 +165,7 @@ def test_threads_may_encode_and_decode_concurrently() -> None:
                 came = decode(encode(Program(hash="h", model=model)), LIMITS)
                 assert isinstance(came, Program)
                 assert came.model.tobytes() == model.tobytes()
+            assert [encode(rollout) for rollout in rollouts] == encoded
         except Exception as error:
             failures.append(error)
 
