@@ -159,6 +159,10 @@ class ClientActor:
         if self._rows is not None:
             self._rows.cut()
 
+    def release(self) -> None:
+        """Let go of the policy version: this actor will not act again."""
+        self.version = self._rows = None
+
     # --------------------------------------------------------------------------------------------- sending
 
     def _keep(self, writer: RolloutWriter) -> None:

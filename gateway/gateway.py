@@ -162,7 +162,7 @@ class Gateway:
                 await self._enter(seat)
         except TimeoutError:
             self.leave(actor)
-            missing = "a learner" if self.session is None else "a policy"
+            missing = "learner" if self.session is None else "policy"
             raise ClientError("unavailable", f"no {missing} came within {_JOIN_SECONDS:g} s: try again later") from None
         except BaseException:
             self.leave(actor)
@@ -177,7 +177,10 @@ class Gateway:
     def _returning(self, name: str, spaces: ClientSpaces) -> ClientActor | None:
         """Return the actor of a client that was here a moment ago, with the same spaces."""
         _, actor = self._parked.pop(name, (0.0, None))
-        return actor if actor is not None and actor.spaces.stated == spaces.stated else None
+        if actor is not None and actor.spaces.stated != spaces.stated:
+            actor.release()
+            return None
+        return actor
 
     async def _enter(self, seat: _Seat) -> None:
         """Join the learner, and wait for a policy of it."""
@@ -243,8 +246,13 @@ class Gateway:
         actor.cut()
         if actor.epoch >= 0 and not actor.ended_by[0]:
             self._parked[actor.name] = time.monotonic(), actor
-            while len(self._parked) > _MAX_PARKED:
-                self._parked.pop(next(iter(self._parked)))
+            if len(self._parked) > _MAX_PARKED:
+                self._forget_parked()
+
+    def _forget_parked(self) -> None:
+        """Forget the actor that has been absent longest."""
+        _, actor = self._parked.pop(next(iter(self._parked)))
+        actor.release()
 
     async def act(self, actor: ClientActor, message: Act) -> Any:
         """Return a client's action. Raises ClientError if the message does not fit; nothing has changed then."""
@@ -264,7 +272,8 @@ class Gateway:
         while True:
             await asyncio.sleep(_TICK_SECONDS)
             now = time.monotonic()
-            self._parked = {name: kept for name, kept in self._parked.items() if now < kept[0] + _PARK_SECONDS}
+            while self._parked and now > next(iter(self._parked.values()))[0] + _PARK_SECONDS:
+                self._forget_parked()
             for _, actor in self._parked.values():
                 actor.send()
             for seat in list(self._seats.values()):
@@ -305,7 +314,7 @@ class Gateway:
         if seat is not None and time.monotonic() > seat.actor.heard_at + _SLOW_SECONDS:
             seat.on_end(ClientError("unavailable", "the client is idle, and others wait for its memory"))
         elif self._parked:
-            self._parked.pop(next(iter(self._parked)))
+            self._forget_parked()
 
     async def _rejoin(self, seat: _Seat) -> None:
         """Join a learner that has restarted, or that the network had lost."""
@@ -329,7 +338,8 @@ class Gateway:
     def _on_run_over(self, reason: str) -> None:
         self.session = self._policy = self._next_policy = None
         self.last_run_end = reason
-        self._parked.clear()
+        while self._parked:
+            self._forget_parked()
         self._newest_version = -1
         for seat in list(self._seats.values()):
             seat.on_end(reason)

@@ -6,7 +6,7 @@ import logging
 import socket
 import ssl
 from asyncio.transports import BaseTransport
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import uvicorn
@@ -21,6 +21,7 @@ from daedalus.transport.credentials import CERTIFICATE, KEY
 _PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
 _MAX_CONNECTIONS = 2048
 _STOP_SECONDS = 2  # for connections to end after a stop
+_QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _REQUEST_SECONDS = 10.0  # from the connection to a complete request
 
 
@@ -45,6 +46,13 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
         super().handle_connect(event)
         if self.response.status_code == 101:
             self.scope["extensions"] = {**(self.scope["extensions"] or {}), "daedalus.limit": self._set_limit}  # type: ignore[typeddict-item] - extensions may have any name
+
+    def send_receive_event_to_app(self) -> None:
+        """Queue a message; pause reading only if the application is behind, which costs two system calls."""
+        paused = self.read_paused
+        self.read_paused = paused or self.queue.qsize() < _QUEUED_MESSAGES
+        super().send_receive_event_to_app()
+        self.read_paused = paused or self.queue.qsize() > _QUEUED_MESSAGES
 
     def _set_limit(self, size: int) -> None:
         self.conn.max_message_size = size
@@ -80,10 +88,13 @@ class Server(uvicorn.Server):
         """Capture none."""
         yield
 
-    async def run_until(self, stop: asyncio.Event, listener: socket.socket) -> None:
-        """Serve until `stop` is set, then close all connections."""
+    async def run_until(
+        self, stop: asyncio.Event, listener: socket.socket, on_stop: Callable[[], Awaitable[None]]
+    ) -> None:
+        """Serve until `stop` is set, then await `on_stop`, which may still send, and close all connections."""
         ends = [asyncio.ensure_future(self.serve([listener])), asyncio.ensure_future(stop.wait())]
         await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        await on_stop()
         self.should_exit = True
         ends[1].cancel()
         await ends[0]

@@ -182,15 +182,12 @@ async def _serve(
     names = [*LOOPBACK, *arguments.host, *([] if serving is None else _bracketed(serving.hosts()))]
     gateway = Gateway(transport, GatewayConfig(name=name, owner=owner, run=arguments.run), fail)
     gateway.open()
-    try:
-        watch = asyncio.create_task(_set_when_stopped(stop, ended))
-        rules = guard([*names, socket.gethostname()], port, arguments.allow_origin, tokens)
-        shown = arguments.listen.rpartition(":")[0]
-        _logger.info("clients connect to %s://%s:%d/actor", "wss" if tls else "ws", shown, port)
-        await Server(application(gateway, rules), tls).run_until(ended, listener)
-        watch.cancel()
-    finally:
-        await gateway.close()
+    watch = asyncio.create_task(_set_when_stopped(stop, ended))
+    rules = guard([*names, socket.gethostname()], port, arguments.allow_origin, tokens)
+    shown = arguments.listen.rpartition(":")[0]
+    _logger.info("clients connect to %s://%s:%d/actor", "wss" if tls else "ws", shown, port)
+    await Server(application(gateway, rules), tls).run_until(ended, listener, gateway.close)
+    watch.cancel()
     if failures:
         raise failures[0]
     return 0

@@ -46,8 +46,7 @@ class RunningGateway:
         gateway.open()
         ready.set_result(gateway)
         rules = guard(LOOPBACK, self.port, [], None)
-        await Server(application(gateway, rules)).run_until(self._stop, self.listener)
-        await gateway.close()
+        await Server(application(gateway, rules)).run_until(self._stop, self.listener, gateway.close)
 
     def _fail(self, error: Exception) -> None:
         self.failure = error
