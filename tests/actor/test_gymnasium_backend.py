@@ -288,7 +288,7 @@ class Drifting(gymnasium.Env):
     ],
 )
 def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch, later: Any, reason: str) -> None:
-    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda: Drifting(later)))
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda **_: Drifting(later)))
     environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
     environments.reset(1)
     environments.step({"action": np.zeros((2, 1), np.int64)})
@@ -297,7 +297,7 @@ def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    failing = EnvSpec("Drifting-v0", lambda: Drifting(KeyError("gripper")))
+    failing = EnvSpec("Drifting-v0", lambda **_: Drifting(KeyError("gripper")))
     monkeypatch.setitem(gymnasium.registry, "Drifting-v0", failing)
     environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
     environments.reset(1)
