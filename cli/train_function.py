@@ -15,10 +15,12 @@ from typing import Any, TextIO
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
+from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign
+from daedalus.policy.user_modules import UserModules, modules_of
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -72,7 +74,7 @@ def train(
     Args:
       preset: a preset such as "cartpole", or the path of a TOML file such as a run's config.toml.
       env: any gymnasium environment with default settings, instead of a preset; "module:Id" for your own.
-      algorithm: "a2c", "a3c", "impala" or "appo".
+      algorithm: "a2c", "a3c", "impala" or "appo", or "module:Class" for your own.
       actors: number of actor processes.
       seed: seed of the network, the environments and the actions.
       env_steps: budget, the environment steps of all actors together.
@@ -101,6 +103,7 @@ def train(
             spaces, spec = transformed_spaces(chosen, spec, spaces), chosen
     if env is not None:
         directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
+    spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
     weights = None if init_from is None else Path(init_from)
     with (
         run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,

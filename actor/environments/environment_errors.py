@@ -27,7 +27,7 @@ def reason_of(error: ValidationError) -> str:
     """Return why a space is not supported, in words."""
     first = error.errors()[0]
     if first["type"] == "less_than_equal":  # the count of a discrete variable
-        return f"{first['input']:,} choices of one variable: use at most {first['ctx']['le']:,}"
+        return f"{first['input']:,} choices of one variable: use at most {first.get('ctx', {}).get('le'):,}"
     return first["msg"].removeprefix("Value error, ")
 
 
