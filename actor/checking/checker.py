@@ -35,9 +35,8 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
             registered = registration(spec.id, modules)
             if registered.entry_point is None:
                 return ()
-            environment = gymnasium.make(
-                registered, disable_env_checker=True, **cast("dict[str, Any]", spec.kwargs)
-            ).unwrapped
+            kwargs: dict[str, Any] = {**spec.kwargs}
+            environment = gymnasium.make(registered, disable_env_checker=True, **kwargs).unwrapped
     except EnvironmentSetupError:
         return ()  # reported before
     with warnings.catch_warnings(record=True) as caught:
