@@ -35,7 +35,8 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
             registered = registration(spec.id, modules)
             if registered.entry_point is None:
                 return ()
-            environment = gymnasium.make(registered, disable_env_checker=True, **spec.kwargs).unwrapped
+            kwargs: dict[str, Any] = {**spec.kwargs}
+            environment = gymnasium.make(registered, disable_env_checker=True, **kwargs).unwrapped
     except EnvironmentSetupError:
         return ()  # reported before
     with warnings.catch_warnings(record=True) as caught:
@@ -68,7 +69,7 @@ def _play_legally(environment: gymnasium.Env) -> None:
             return result
 
         @functools.wraps(step)
-        def step_legally(_action: Any) -> Any:
+        def step_legally(action: Any) -> Any:  # the checker's own action is replaced
             result = step(newest[0].legal_action())
             if not (result[2] or result[3]):
                 newest[0] = _Masks(environment, result[0], result[4])

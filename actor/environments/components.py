@@ -12,7 +12,7 @@ from gymnasium import spaces as gym
 from pydantic import ValidationError
 
 from daedalus.actor.environments.action_table import table_actions
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.leaves import Leaf, LeftOut, leaves
 from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
 
@@ -58,11 +58,16 @@ class ObservationComponent(NamedTuple):
         if self.first is not None:
             values = values - self.first
             if ((values < 0) | (values >= self.counts)).any():
+                where = f" in component {self.leaf.name!r}" if self.leaf.path else ""
                 raise EnvironmentSetupError(
-                    f"the environment returned an observation outside its space {described(self.leaf.space)}"
+                    f"the environment returned an observation outside its space{where}: "
+                    f"{described(values + self.first)} for {described(self.leaf.space)}"
                 )
             return values
-        return values if values.dtype in (np.uint8, np.float32) else values.astype(np.float32)
+        if values.dtype in (np.uint8, np.float32):
+            return values
+        with np.errstate(over="ignore"):  # the learner names a value that is not finite
+            return values.astype(np.float32)
 
 
 def observation_components(space: gymnasium.Space) -> tuple[ObservationComponent, ...]:
@@ -103,7 +108,7 @@ class ActionComponents:
             self.spaces: dict[str, ActionSpace] = {leaf.name: self._component(leaf) for leaf in self._leaves}
         except ValidationError as error:
             raise EnvironmentSetupError(
-                f"action space {described(space)} is not supported: {error.errors()[0]['msg']}"
+                f"action space {described(space)} is not supported: {reason_of(error)}"
             ) from None
 
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:

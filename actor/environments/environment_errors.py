@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from types import ModuleType
 
 import gymnasium
+from pydantic import ValidationError
 
 OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
 _MOST_CHARACTERS = 160  # of a space in a message
@@ -20,6 +21,14 @@ def first_line(error: BaseException) -> str:
     """Return the type of an error and the first line of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
+
+
+def reason_of(error: ValidationError) -> str:
+    """Return why a space is not supported, in words."""
+    first = error.errors()[0]
+    if first["type"] == "less_than_equal":  # the count of a discrete variable
+        return f"{first['input']:,} choices of one variable: use at most {first.get('ctx', {}).get('le'):,}"
+    return first["msg"].removeprefix("Value error, ")
 
 
 def unknown_environment(name: str, known: Collection[str], otherwise: str) -> EnvironmentSetupError:

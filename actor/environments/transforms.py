@@ -13,7 +13,7 @@ from daedalus.actor.environments.components import (
     observation_components,
     only_of_batch,
 )
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
@@ -67,7 +67,7 @@ class Transforms:
         except ValidationError as error:
             raise EnvironmentSetupError(
                 f"observation space {described(observation_space)} with action space {described(action_space)} is not "
-                f"supported: {error.errors()[0]['msg']}"
+                f"supported: {reason_of(error)}"
             ) from None
 
     @property

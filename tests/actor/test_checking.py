@@ -120,6 +120,7 @@ def test_observations_of_several_parts_are_checked_part_by_part() -> None:
         ({**good, "camera": np.zeros((3, 2), np.uint8)}, "whose part 'camera' is of shape (3, 2), but observation_"),
         ({**good, "camera": np.zeros((2, 2), np.float32)}, "of dtype float32, but observation_space['camera'] has"),
         (np.zeros(2), "of type ndarray, but observation_space has the parts"),
+        ({**good, "joints": (2, np.array([-2e15]))}, "with the value -2e+15 at index 0: it must be within +-1e+15"),
     ]
     for value, message in bad:
         ((kind, text),) = observation_violations(space, value, "step")

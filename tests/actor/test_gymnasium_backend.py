@@ -254,6 +254,58 @@ def test_processes_ignore_interrupts() -> None:
         environments.close()
 
 
+# ------------------------------------------------------------------------------- observations outside their space
+
+
+class Drifting(gymnasium.Env):
+    """Environment that returns another observation in its second step."""
+
+    observation_space = gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(0, 255, (2,), np.uint8)})
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, later: Any) -> None:
+        self._later, self._step = later, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        return {"a": np.zeros(2, np.uint8)}, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        self._step += 1
+        if self._step == 2 and isinstance(self._later, Exception):
+            raise self._later
+        return self._later if self._step == 2 else self.reset()[0], 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("later", "reason"),
+    [
+        ({"b": 1}, r"an observation with the parts \['b'\], but observation_space has the parts \['a'\]"),
+        (
+            {"a": np.zeros(3, np.uint8)},
+            r"whose part 'a' is of shape \(3,\), but observation_space\['a'\] has shape \(2,\)",
+        ),
+        ({"a": np.array([1.5, 300.0])}, r"whose part 'a' is of dtype float64, but .* has dtype uint8"),
+    ],
+)
+def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch, later: Any, reason: str) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda **_: Drifting(later)))
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
+    environments.reset(1)
+    environments.step({"action": np.zeros((2, 1), np.int64)})
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
+def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = EnvSpec("Drifting-v0", lambda **_: Drifting(KeyError("gripper")))
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", failing)
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
+    environments.reset(1)
+    environments.step({"action": np.zeros((2, 1), np.int64)})
+    with pytest.raises(KeyError, match="gripper"):
+        environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
 # ----------------------------------------------------------------------------------------------- missing packages
 
 
