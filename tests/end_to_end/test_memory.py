@@ -45,9 +45,9 @@ def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start
         environment.grey = true
         environment.resize = [84, 84]
         environment.frame_stack = 4
-        environment.max_episode_steps = 400
+        environment.max_episode_steps = 100
         policy = {encoder = "nature", memory = "gru", memory_units = 32}
-        collection = {actors = 1, envs_per_actor = 4, rollout_length = 16}
+        collection = {actors = 1, envs_per_actor = 2, rollout_length = 16}
         training = {algorithm = "appo", env_steps = 1000000, passes = 2, minibatches = 2}
         evaluation = {seconds = 0.2, episodes = 1, final_episodes = 2}
         service = {log_seconds = 0.2}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import Running, until
+from processes import Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -22,18 +22,21 @@ CARTPOLE = vector_spaces(4, 2)
 Start = Callable[..., Running]
 
 
-@pytest.fixture
-def client(start: Start, address: str) -> Iterator[Transport]:
-    """Transport of a client that is connected to a running learner."""
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
-    learner.expect("actors join with")
-    transport = connect([address])
-    try:
-        until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))  # the key that the learner serves last
-        yield transport
-        assert learner.process.poll() is None, learner.output
-    finally:
-        transport.close()
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
+    """Transport of a client that is connected to a running learner, which the tests share."""
+    address = free_address()
+    with starting(tmp_path_factory.mktemp("learner")) as start:
+        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
+        learner.expect("actors join with")
+        transport = connect([address])
+        try:
+            # The key that the learner serves last.
+            until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
+            yield transport
+            assert learner.process.poll() is None, learner.output
+        finally:
+            transport.close()
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
@@ -77,7 +80,7 @@ def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) ->
         ):
             ask(client, key, payload)
         client.publish(keys.snapshots("run"), payload)
-    answer = ask(client, keys.rollouts("run", "client"), b"\xff")
+    answer = ask(client, keys.rollouts("run", "x"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "fenced"
     ask(client, keys.join("run", "client"), join(spaces=CARTPOLE, environments=2))
