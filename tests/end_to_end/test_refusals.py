@@ -1,6 +1,7 @@
 """Test of a real learner with mismatching actors and with arbitrary bytes."""
 
 import re
+import shutil
 import socket
 import struct
 from collections.abc import Callable, Iterator
@@ -89,17 +90,21 @@ def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) ->
     assert answer.verdict == "rejected"
 
 
-def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+    slow = ("--set", "environment.kwargs.seconds=0.1", "--set", "collection.envs_per_actor=1")
+    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
     learner.expect("actors join with")
-    first = start("actor", "--connect", address, "--name", "arm")
+    actor = ("actor", "--connect", address, "--name", "arm", "--allow-module", "slow_environment")
+    first = start(*actor)
     first.expect("joined run")
-    second = start("actor", "--connect", address, "--name", "arm")
+    second = start(*actor)
     second.expect("waiting for the other actor of this name to leave")
     assert second.wait() == 1
     second.expect("actor name 'arm' is already in use: choose another --name")
-    third = start("actor", "--connect", address, "--name", "arm")
+    third = start(*actor)
     third.expect("waiting for the other actor of this name to leave")
     first.end()
     third.expect("joined run 'run' as 'arm'")

@@ -122,7 +122,8 @@ def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: 
 
 
 def test_resume_has_nothing_to_do_or_continues_with_new_settings(start: Start, tmp_path: Path) -> None:
-    first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run")
+    small = ("--actors", 1, "--set", "evaluation.final_episodes=2")
+    first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run", *small)
     assert first.wait() == 3, first.output  # the budget ended without the target
     before = newest_checkpoint(tmp_path / "run")
     rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
