@@ -15,11 +15,13 @@ from typing import Any, TextIO
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
+from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, assign
+from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -75,7 +77,7 @@ def train(
     Args:
       preset: a preset such as "cartpole", or the path of a TOML file such as a run's config.toml.
       env: any gymnasium environment with default settings, instead of a preset; "module:Id" for your own.
-      algorithm: "a2c", "a3c", "impala" or "appo".
+      algorithm: "a2c", "a3c", "impala" or "appo", or "module:Class" for your own.
       actors: number of actor processes.
       seed: seed of the network, the environments and the actions.
       env_steps: budget, the environment steps of all actors together.
@@ -100,6 +102,7 @@ def train(
         chosen = choice.spec(partial(_assign, changes=settings or {}), default_settings(spaces))
         spaces, spec = _transformed_spaces(chosen, spec, spaces), chosen
         directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
+    spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
     weights = None if init_from is None else Path(init_from)
     with (
         run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,

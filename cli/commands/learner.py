@@ -16,8 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
+from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
     STOPPED,
     exit_on_thread_exceptions,
@@ -65,7 +67,15 @@ if TYPE_CHECKING:
     from daedalus.learner.training.checkpoint import Checkpoint
 
 REACHED, FAILED, BAD_USAGE, NOT_REACHED = 0, 1, 2, 3
-_FAILURES = CheckpointMismatchError, CredentialsError, DamagedError, NetworkError, SettingsError, TransportError
+_FAILURES = (
+    AlgorithmError,
+    CheckpointMismatchError,
+    CredentialsError,
+    DamagedError,
+    NetworkError,
+    SettingsError,
+    TransportError,
+)
 
 
 def main() -> int:
@@ -131,6 +141,7 @@ def _serve(
         spaces = expected_spaces(run.spec, run.modules, stop)
         if arguments.env is not None and not run.exists and spaces is not None:
             chosen, directory = resolve(arguments, default_settings(spaces))
+            chosen = with_record(chosen, run.modules)
             if chosen.environment != run.spec.environment:
                 spaces = expected_spaces(chosen, run.modules, stop)
             run = replace(run, spec=chosen, directory=directory)

@@ -126,7 +126,8 @@ export class Actor {
     const random = seeded(seed);
     const vector = new VectorCartPole(environments, random, spec.environment.max_episode_steps ?? undefined);
     const collector = new Collector(vector, policy, spec.environment, spec.collection.rollout_length, random);
-    const synchronous = spec.training.algorithm === "a2c"; // it uses one rollout of each policy version
+    // A synchronous algorithm uses one rollout of each policy version.
+    const synchronous = spec.training.algorithm === "a2c" || spec.training.algorithm_record?.synchronous === true;
     for (let loaded = -1; ; ) {
       await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {

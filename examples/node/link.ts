@@ -29,7 +29,7 @@ export interface Welcome {
   spec: {
     environment: EnvironmentSpec;
     collection: { envs_per_actor: number; rollout_length: number; window: number };
-    training: { algorithm: string };
+    training: { algorithm: string; algorithm_record: { synchronous: boolean } | null };
   };
 }
 
