@@ -8,8 +8,9 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
+# Two processes share the tests; those of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 # Test with real containers, if docker is installed. debootstrap makes the base image if none can be pulled.
 test-compose: .venv/ready-test

@@ -1,15 +1,13 @@
 """Fixtures for tests with processes."""
 
 import json
-import socket
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import log_lines
 import pytest
 from hypothesis import Phase, settings
-from processes import Running
+from processes import Running, free_address, starting
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None)
@@ -34,21 +32,11 @@ def _log_lines() -> Iterator[None]:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Function that starts `daedalus ARGUMENTS` in the folder of the test. Processes left are killed at the end."""
-    running: list[Running] = []
-
-    def start_one(*arguments: object, directory: Path = tmp_path) -> Running:
-        words = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-        running.append(Running(words + [str(argument) for argument in arguments], directory))
-        return running[-1]
-
-    yield start_one
-    for one in running:
-        one.end()
+    with starting(tmp_path) as start_one:
+        yield start_one
 
 
 @pytest.fixture
 def address() -> str:
     """Return a loopback address that no process listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_address()

@@ -123,7 +123,9 @@ def test_both_memory_orders_decode_to_the_same_array() -> None:
 def test_every_shape_of_at_least_two_dimensions_can_be_swapped(shape: tuple[int, ...]) -> None:
     values = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
     turned = np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
-    came = decode(encode(dataclasses.replace(SNAPSHOT, weights={"w": turned})), LIMITS)
+    data = encode(dataclasses.replace(SNAPSHOT, weights={"w": turned}))
+    assert unwire(data)[1]["arrays"][0][3] is not turned.flags.c_contiguous
+    came = decode(data, LIMITS)
     assert isinstance(came, Snapshot)
     np.testing.assert_array_equal(came.weights["w"], values)
 
