@@ -66,8 +66,9 @@ def _parsed(content: Any) -> dict[str, tuple[str, float]]:
         raise ValueError("the tokens are not a map")
     tokens = {}
     for name, entry in content.items():
-        known, expires = entry["sha256"], entry["expires"]
-        if re.fullmatch("[0-9a-f]{64}", known) is None or not isinstance(expires, (int, float)):
-            raise ValueError(f"the token of {name} is damaged")
-        tokens[name] = known, float(expires)
+        match entry:
+            case {"sha256": str(known), "expires": int() | float() as expires} if re.fullmatch("[0-9a-f]{64}", known):
+                tokens[name] = known, float(expires)
+            case _:
+                raise ValueError(f"the token of {name!a} is damaged")
     return tokens

@@ -39,7 +39,7 @@ def connect(gateway: RunningGateway) -> Iterator[Callable[..., JsonClient]]:
     """Function that returns a connected client."""
     with contextlib.ExitStack() as stack:
 
-        def connect_one(**options: object) -> JsonClient:
+        def connect_one(**options: Any) -> JsonClient:
             client = JsonClient(gateway.port, **options)
             stack.callback(client.close)
             return client

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 from processes import LIMIT
@@ -15,7 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from daedalus.gateway.app import application
 from daedalus.gateway.gateway import Gateway, GatewayConfig
 from daedalus.gateway.security import LOOPBACK, guard
-from daedalus.gateway.server import Server
+from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import Tokens
 from daedalus.transport.interface import Transport
 
@@ -28,8 +29,11 @@ CARTPOLE = {
 class RunningGateway:
     """A gateway with its web server, on a thread of its own."""
 
-    def __init__(self, transport: Transport, tokens: Tokens | None = None, owner: str = "") -> None:
-        self._transport, self._tokens = transport, tokens
+    def __init__(self, transport: Transport, certificates: Path | None = None, owner: str = "") -> None:
+        """`certificates` is the folder of a gateway; without it, plain WebSockets on loopback."""
+        self._transport = transport
+        self._tokens = None if certificates is None else Tokens(certificates)
+        self._tls = None if certificates is None else tls_context(certificates)
         self._config = GatewayConfig(name=f"{owner}.gateway" if owner else "gateway", owner=owner)
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
@@ -45,8 +49,8 @@ class RunningGateway:
         gateway = Gateway(self._transport, self._config, self._fail)
         gateway.open()
         ready.set_result(gateway)
-        rules = guard(LOOPBACK, self.port, [], None)
-        await Server(application(gateway, rules)).run_until(self._stop, self.listener, gateway.close)
+        rules = guard(LOOPBACK, self.port, [], self._tokens)
+        await Server(application(gateway, rules), self._tls).run_until(self._stop, self.listener, gateway.close)
 
     def _fail(self, error: Exception) -> None:
         self.failure = error
@@ -68,8 +72,8 @@ class RunningGateway:
 class JsonClient:
     """A client, as it would be written in another language."""
 
-    def __init__(self, port: int, **options: Any) -> None:
-        address = f"ws://127.0.0.1:{port}/actor"
+    def __init__(self, port: int, scheme: str = "ws", **options: Any) -> None:
+        address = f"{scheme}://127.0.0.1:{port}/actor"
         self._stack = contextlib.ExitStack()
         self.socket: ClientConnection = self._stack.enter_context(
             connect(address, open_timeout=LIMIT, close_timeout=LIMIT, **options)
