@@ -183,6 +183,7 @@ def test_policy_factors_are_weighted_after_the_advantages_are_normalised(
 
 def test_normalized_of_equal_advantages_is_0() -> None:
     assert torch.equal(normalized(torch.full((2, 2), 3.0), torch.ones(2, 2)), torch.zeros(2, 2))
+    assert normalized(torch.tensor([[3.0, 5.0]]), torch.tensor([[1.0, 0.0]]))[0, 0].item() == 0.0  # one valid row
 
 
 def test_normalized_does_not_amplify_differences_that_are_only_rounding() -> None:
