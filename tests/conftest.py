@@ -1,6 +1,7 @@
 """Fixtures for tests with processes."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -8,6 +9,10 @@ import log_lines
 import pytest
 from hypothesis import Phase, settings
 from processes import Running, free_address, starting
+
+# The tensors of the tests are small. Further threads would spend most of their time waiting, on the cores of the other
+# processes of the tests. A learner sets its own number of threads.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None)
