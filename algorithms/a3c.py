@@ -6,13 +6,10 @@ does not correct for the policy lag.
 """
 
 from daedalus.algorithms.policy_gradient import PolicyGradient
-from daedalus.algorithms.targets import uncorrected_targets
-from daedalus.policy.network.distributions.joint import ActionDistribution
-from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.algorithms import ALGORITHMS
 
 
 class A3c(PolicyGradient):
     """Mnih et al. (2016), algorithm S3, with the gradient computed by the learner (see the top of this file)."""
 
-    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
-        super().__init__(spec, distribution, uncorrected_targets)
+    record = ALGORITHMS["a3c"]

@@ -1,38 +1,68 @@
-"""Interface of an algorithm to the code that computes its gradients."""
+"""Interface of an algorithm: how its updates are scheduled, and the losses of a batch.
+
+docs/guides/algorithm.md shows how to add one.
+"""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, Components
 from daedalus.algorithms.diagnostics import FirstPass
+from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.protocol.algorithms import AlgorithmRecord
+from daedalus.protocol.spec import TrainingSpec
 
-# The network on R rows of B environments: observations {name: [R, B, ...]}, state [B, S], starts [R, B] -> parameters
-# of the action distributions [R, B, P], values [R, B].
+# The network on R rows of B environments: normalised observations {name: [R, B, ...]}, state [B, S], starts [R, B] ->
+# parameters of the action distributions [R, B, P], values [R, B].
 Forward = Callable[[Components, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class Losses(NamedTuple):
-    """Terms of the loss of one update before they are weighted and summed, and the inputs of its metrics."""
+    """Terms of the loss of one update before they are weighted and summed, and the inputs of its metrics.
+
+    The loss of the update is policy_loss + value_coefficient * L(values, targets) - entropy_bonus * mean(entropies),
+    where L is `training.value_loss` and both means are over the valid rows.
+    """
 
     policy_loss: Tensor  # scalar
     entropies: Tensor  # [R, B], nats
     values: Tensor  # [R, B]
     targets: Tensor  # [R, B], value targets, without gradients
-    advantages: Tensor  # [R, B], without gradients
-    valid: Tensor  # [R, B] float32, 1 or 0
-    clipped_fraction: Tensor  # scalar, share of rows whose probability ratio was clipped
-    first_pass: FirstPass  # of the whole batch; the same object in all updates of a batch
+    shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
+    clipped_fraction: Tensor | None = None  # scalar, share of rows whose probability ratio was clipped; None: no clip
+    first_pass: FirstPass | None = None  # of the whole batch, for its diagnostics; the same object in all updates
 
 
-class Algorithm(Protocol):
-    """The mathematics of one algorithm. Its scheduling is in daedalus/protocol/algorithms.py."""
+class Algorithm:
+    """Base class of all algorithms.
+
+    A class of its own derives from it, sets `record` and defines `losses`. The learner constructs it once.
+    """
+
+    record: ClassVar[AlgorithmRecord] = AlgorithmRecord()  # how the updates are scheduled
+
+    def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
+        """Construct the algorithm.
+
+        Args:
+          spec: settings of the training.
+          distribution: distributions of the actions of the policy.
+
+        The entries of `training.algorithm_kwargs` follow as keyword arguments.
+        """
+        self.spec, self.distribution = spec, distribution
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
-        """Yield the losses of each update of a batch, in order.
+        """Yield the losses of each update of a batch, in order. The observations of the batch are normalised.
 
         The caller changes the parameters between two updates, so losses are computed only when the caller asks for
         the next update. The number of updates is that of `TrainingSpec.updates_from`.
+
+        Args:
+          batch: T rows of B environments. `batch.observations`, `batch.initial_state` and `batch.starts` are the
+            arguments of `forward`, and have T+1 rows; the last row only bootstraps.
+          forward: the network.
         """
-        ...
+        raise NotImplementedError

@@ -65,14 +65,16 @@ class BatchAssembler:
         """Return one batch of all rollouts, in the given order."""
         rows = rollouts[0].rows
         width = sum(rollout.environments for rollout in rollouts)
-        batch = self._allocate(rows, width, rollouts[0].initial_state.shape[1])
+        batch = self.allocate(rows, width, rollouts[0].initial_state.shape[1])
         first = 0
         for rollout in rollouts:
             self._copy(rollout, batch, slice(first, first + rollout.environments))
             first += rollout.environments
         return batch
 
-    def _allocate(self, rows: int, width: int, state_size: int) -> Batch:
+    def allocate(self, rows: int, width: int, state_size: int) -> Batch:
+        """Return the memory of a batch: T rows of B environments. It is zeros at first, later the last batch."""
+
         def rows_of(name: str, dtype: str, *shape: int, extra: int = 0) -> Tensor:
             return self._array(name, (rows + extra, width, *shape), dtype)
 

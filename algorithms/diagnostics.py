@@ -15,6 +15,7 @@ class FirstPass(NamedTuple):
     behaviour_log_probs: Tensor  # log mu(a_t | s_t)
     values: Tensor  # V(s_t)
     targets: Tensor  # value targets
+    advantages: Tensor  # before they are normalised
     valid: Tensor  # float32, 1 or 0
 
 

@@ -1,19 +1,26 @@
-"""Algorithms by name. The record of the same name in daedalus/protocol/algorithms.py describes the scheduling."""
-
-from collections.abc import Callable
+"""Algorithms by name: those of this package, and the user's own as `module:Class`."""
 
 from daedalus.algorithms.a2c import A2c
 from daedalus.algorithms.a3c import A3c
 from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.impala import Impala
+from daedalus.algorithms.own_algorithm import own_algorithm
 from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spec import TrainingSpec
 
-Builder = Callable[[TrainingSpec, ActionDistribution], Algorithm]
-BUILDERS: dict[str, Builder] = {"a2c": A2c, "a3c": A3c, "impala": Impala, "appo": Appo}
+CLASSES: dict[str, type[Algorithm]] = {"a2c": A2c, "a3c": A3c, "impala": Impala, "appo": Appo}
 
 
-def build_algorithm(spec: TrainingSpec, distribution: ActionDistribution) -> Algorithm:
-    """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions."""
-    return BUILDERS[spec.algorithm](spec, distribution)
+def build_algorithm(
+    spec: TrainingSpec, distribution: ActionDistribution, modules: UserModules = NO_MODULES
+) -> Algorithm:
+    """Return the algorithm named by `spec.algorithm`, for a policy with these action distributions.
+
+    `modules` may be imported. Raises AlgorithmError for an algorithm of the user's own that cannot be constructed.
+    """
+    if is_own(spec.algorithm):
+        return own_algorithm(spec, distribution, modules)
+    return CLASSES[spec.algorithm](spec, distribution)

@@ -1,14 +1,10 @@
 """Value targets and advantages of a batch, with and without correction for policy lag."""
 
-from collections.abc import Callable
-
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.returns import Targets, actor_critic_targets, vtrace_targets
 from daedalus.protocol.spec import TrainingSpec
-
-TargetsFunction = Callable[[TrainingSpec, Batch, Tensor, Tensor], Targets]
 
 
 def uncorrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:

@@ -168,7 +168,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         since = run.started if first else time.monotonic()
         arguments = ["--prepared", str(run.directory), *listening, "--started", repr(since)]
         arguments += [*_logging_options(run.log_level, run.log_json), *run.observer.learner_options]
-        arguments += allow_settings(run.spec.policy.user_modules)
+        arguments += allow_settings(run.spec.learner_modules)
         if run.spaces is not None:
             arguments += ["--spaces", run.spaces.model_dump_json()]
         if run.init_from is not None:

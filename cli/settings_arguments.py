@@ -9,6 +9,7 @@ from typing import Any
 
 from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, command_parser
 from daedalus.cli.logs import add_logging
+from daedalus.cli.own_algorithm import with_record
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
@@ -50,7 +51,8 @@ def add_settings(options: argparse.ArgumentParser) -> None:
     options.add_argument(
         "--algorithm",
         metavar="NAME",
-        help=", ".join(f"{algorithm.name} ({algorithm.summary})" for algorithm in ALGORITHMS.values()),
+        help=", ".join(f"{name} ({record.summary})" for name, record in ALGORITHMS.items())
+        + ". Write module:Class for your own",
     )
     options.add_argument(
         "--actors",
@@ -207,7 +209,8 @@ def choose_run(arguments: argparse.Namespace) -> ChosenRun:
             )
     own = modules_of(spec.user_modules) if named else []
     modules = UserModules(frozenset({*arguments.allow_module, *own}), str(directory / run_directory.CONFIG))
-    modules.check(spec.policy.user_modules)  # the learner makes no environment
+    modules.check(spec.learner_modules)  # the learner makes no environment
+    spec = with_record(spec, modules)
     exists = (directory / run_directory.CONFIG).exists()
     return ChosenRun(spec=spec, directory=directory, exists=exists, modules=modules)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
-from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm, is_own
 from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
@@ -55,6 +55,8 @@ class EnvironmentSpec(Specification):
     no_reward_limit: PositiveInt | None = None
     """Truncate an episode after this many env_steps in a row without a positive reward. Not in evaluations."""
 
+    leave_out: Annotated[tuple[ComponentName, ...], Field(max_length=64)] = ()
+    """Components of the observation that the policy does not see, such as a text: `leave_out = ["mission"]`."""
     crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None
     """Pixels to remove at the top, bottom, left and right."""
     grey: bool = False
@@ -140,8 +142,13 @@ class CollectionSpec(Specification):
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
-    algorithm: Annotated[str, AfterValidator(check_algorithm)] = "impala"
-    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes."""
+    algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
+    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes. Or
+    `module:Class` for your own."""
+    algorithm_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
+    """Further arguments of the constructor of an algorithm of your own."""
+    algorithm_record: AlgorithmRecord | None = None
+    """Schedule of an algorithm of your own, for the actors. Taken from the class: leave it unset."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
     """Seed of the network, the environments and the actions."""
     env_steps: PositiveInt = 1_000_000
@@ -186,7 +193,7 @@ class TrainingSpec(Specification):
     normalize_rewards: bool = False
     """Divide rewards by the running standard deviation of the discounted return, so that values are near one."""
     normalize_advantages: bool = False
-    """Scale the advantages of each update to mean 0 and standard deviation 1."""
+    """Scale the advantages of each batch to mean 0 and standard deviation 1."""
 
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """Optimiser of the network's parameters."""
@@ -209,6 +216,16 @@ class TrainingSpec(Specification):
     """Threads of the learner. More than one is slower if actors use the same cores."""
 
     @property
+    def user_modules(self) -> dict[str, str]:
+        """Settings that name a module as `module:name`, with their values."""
+        return {"training.algorithm": self.algorithm} if is_own(self.algorithm) else {}
+
+    @property
+    def record(self) -> AlgorithmRecord:
+        """How the updates are scheduled. For an algorithm of the user's own: the default, until its class is known."""
+        return ALGORITHMS.get(self.algorithm) or self.algorithm_record or AlgorithmRecord()
+
+    @property
     def updates_per_batch(self) -> int:
         """Number of policy versions that one batch produces, if the batch is not smaller than its minibatches."""
         return self.updates_from(self.minibatches)
@@ -218,14 +235,14 @@ class TrainingSpec(Specification):
 
         A part is an environment where the policy has memory, else a valid row.
         """
-        return self.passes * min(self.minibatches, parts) if ALGORITHMS[self.algorithm].passes_over_batch else 1
+        return self.passes * min(self.minibatches, parts) if self.record.passes_over_batch else 1
 
     @property
     def policy_lag_bound(self) -> int:
         """Largest policy lag that is learned from, in updates."""
         if self.max_policy_lag is not None:
             return self.max_policy_lag
-        return ALGORITHMS[self.algorithm].max_lag_batches * self.updates_per_batch
+        return self.record.max_lag_batches * self.updates_per_batch
 
 
 class EvaluationSpec(Specification):
@@ -284,9 +301,19 @@ class RunSpec(Specification):
     def _one_batch_fits_the_barrier(self) -> "RunSpec":
         if self.algorithm.synchronous and self.training.batch_rollouts is not None:
             raise ValueError(
-                f"training.batch_rollouts has no meaning for {self.algorithm.name}: "
+                f"training.batch_rollouts has no meaning for {self.training.algorithm}: "
                 "its batch is one rollout of every live actor"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _arguments_are_of_an_own_algorithm(self) -> "RunSpec":
+        for name in ("algorithm_kwargs", "algorithm_record"):
+            if getattr(self.training, name) and not is_own(self.training.algorithm):
+                raise ValueError(
+                    f"training.{name} is for an algorithm of your own (module:Class), not for "
+                    f"{self.training.algorithm}: leave it unset"
+                )
         return self
 
     @model_validator(mode="after")
@@ -314,12 +341,17 @@ class RunSpec(Specification):
     @property
     def user_modules(self) -> dict[str, str]:
         """Settings that name a module as `module:name`, with their values."""
-        return {**self.environment.user_modules, **self.policy.user_modules}
+        return {**self.environment.user_modules, **self.learner_modules}
+
+    @property
+    def learner_modules(self) -> dict[str, str]:
+        """Those of `user_modules` that the learner imports."""
+        return {**self.policy.user_modules, **self.training.user_modules}
 
     @property
     def algorithm(self) -> AlgorithmRecord:
         """How the run's updates are scheduled."""
-        return ALGORITHMS[self.training.algorithm]
+        return self.training.record
 
     @property
     def batch_rollouts(self) -> int:

@@ -10,13 +10,13 @@ from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allo
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import process_started, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.run_report import report
 from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.finished import FinishedRun, finished_run
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
@@ -26,6 +26,7 @@ from daedalus.policy.user_modules import (
     UserModuleError,
     UserModules,
     allow_settings,
+    modules_of,
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -78,11 +79,14 @@ def train(arguments: list[str]) -> int:
         spec, directory = resolve(parsed)
         if parsed.run_dir is not None:
             run_directory.check_free(directory)  # before the environment is made
-        spaces = checked_spaces(spec, fork=True)
-        if parsed.env is not None:
-            chosen, directory = resolve(parsed, default_settings(spaces))
+        if parsed.env is None:
+            spaces = checked_spaces(spec, fork=True)
+        else:
+            spaces, defaults = checked_defaults(spec, fork=True)
+            chosen, directory = resolve(parsed, defaults)
             spaces = transformed_spaces(chosen, spec, spaces, fork=True)
             spec = chosen
+        spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
     except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)
@@ -131,9 +135,10 @@ def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
     """Return the specification of a run with the changes of the command line. Raises SettingsError, UserModuleError."""
     spec = run_directory.read_config(parsed.directory)
     source = str(parsed.directory / run_directory.CONFIG)
-    UserModules(frozenset(parsed.allow_module), source).check(spec.user_modules)
+    modules = UserModules(frozenset(parsed.allow_module), source)
+    modules.check(spec.user_modules)
     budget = [] if parsed.env_steps is None else [f"training.env_steps={parsed.env_steps}"]
-    return with_changes(spec, [*parsed.set, *budget], parsed.directory)
+    return with_record(with_changes(spec, [*parsed.set, *budget], parsed.directory), modules)
 
 
 def train_parser() -> argparse.ArgumentParser:

@@ -12,6 +12,7 @@ export interface EnvironmentSpec {
   action_table: unknown;
   action_repeat: number;
   no_reward_limit: number | null;
+  leave_out: string[];
   crop: unknown;
   grey: boolean;
   resize: unknown;
@@ -29,7 +30,7 @@ export interface Welcome {
   spec: {
     environment: EnvironmentSpec;
     collection: { envs_per_actor: number; rollout_length: number; window: number };
-    training: { algorithm: string };
+    training: { algorithm: string; algorithm_record: { synchronous: boolean } | null };
   };
 }
 

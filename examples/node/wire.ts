@@ -8,7 +8,7 @@
 import { decode as unpack, encode as pack } from "@msgpack/msgpack";
 import { constants, zstdCompressSync, zstdDecompressSync } from "node:zlib";
 
-export const PROTOCOL_VERSION = 6;
+export const PROTOCOL_VERSION = 7;
 export const MAX_BODY_BYTES = 2 ** 30; // of messages from the learner: weights may be large
 
 const MAGIC = 0x44454144; // "DAED" as a little-endian number
@@ -51,6 +51,11 @@ export class ProtocolError extends Error {}
 
 /** The other end uses another version of the protocol. */
 export class VersionMismatchError extends ProtocolError {}
+
+/** Return an array of zeros. */
+export function zeros(dtype: Dtype, shape: number[]): WireArray {
+  return { dtype, shape, data: new TYPES[dtype](shape.reduce((product, side) => product * side, 1)) };
+}
 
 /** Encode a message. */
 export function encode(message: Message): Buffer {

@@ -42,9 +42,11 @@ _PACKAGES = (
 
 def default_directory(name: str, spec: RunSpec) -> Path:
     """Return the default directory of a new run: runs/NAME-ALGORITHM-sSEED-TIME."""
-    plain = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
+    plain, algorithm = (
+        re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-") for part in (name, spec.training.algorithm.rpartition(":")[2])
+    )
     stamp = time.strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{plain}-{spec.training.algorithm}-s{spec.training.seed}-{stamp}"
+    return Path("runs") / f"{plain}-{algorithm}-s{spec.training.seed}-{stamp}"
 
 
 def check_free(directory: Path) -> None:
@@ -116,7 +118,8 @@ def remove_failed(directory: Path) -> None:
 
 def write_config(directory: Path, spec: RunSpec) -> None:
     """Write config.toml: all settings, including defaults; unset settings are omitted."""
-    text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True))
+    derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
+    text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
     _replace(directory / CONFIG, text)
 
 

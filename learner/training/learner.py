@@ -20,7 +20,6 @@ from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -36,7 +35,8 @@ class Learner:
 
         `modules` may be imported for the policy.
 
-        Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces.
+        Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces,
+        AlgorithmError if the algorithm of the user cannot be used.
         """
         if spec.device == "cuda" and not torch.cuda.is_available():
             raise SettingsError(
@@ -48,7 +48,7 @@ class Learner:
         self._spec, self._spaces = spec, spaces
         self._device = torch.device(spec.device)
         self._network = ActorCritic(policy, spaces, modules).to(self._device)
-        self._gradients = GradientComputer(spec, self._network)
+        self._gradients = GradientComputer(spec, self._network, spaces, modules)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
         self._optimizer = build_optimizer(spec, self._flat.values)
@@ -91,15 +91,16 @@ class Learner:
         batch = self._joined(rollouts)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-            size = float(norm)
-            if not math.isfinite(size):  # such a step would set all parameters to nan for the rest of the run
+            if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
                 return False
             self.policy_version += 1
             self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
-            self.metrics.add_update(terms, norm, clipped=size > self._spec.max_gradient_norm)
+            self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
             if self.policy_version == end:
                 break
         self._observations.add(batch)
+        if self._gradients.first_pass is not None:
+            self.metrics.add_first_pass(self._gradients.first_pass)
         self.metrics.add_batch(batch)
         return True
 
@@ -121,7 +122,7 @@ class Learner:
     def take_diagnostics(self) -> dict[str, float]:
         """Return the diagnostics of the newest batch (algorithms/diagnostics.py), once; empty without a new batch."""
         first_pass = self._gradients.take_first_pass()
-        rho_clip = self._spec.rho_clip if ALGORITHMS[self._spec.algorithm].corrected else None
+        rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
         return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
     # ----------------------------------------------------------------------------- for actors and checkpoints

@@ -18,7 +18,6 @@ SPEC = RunSpec(
     environment=EnvironmentSpec(id="corridor:Corridor-v0", wrap="wrappers:step_costs"),
     policy=PolicySpec(encoder="nets:Net"),
 )
-ALL = ("--allow-module", "corridor", "--allow-module", "wrappers", "--allow-module", "nets")
 
 
 @pytest.fixture

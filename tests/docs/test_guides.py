@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from building import SPACES, make_rollouts
 from pages import DOCS, code_blocks
 from plain import PlainEnvironments, act, choices, plain_spaces
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.callbacks import TrainingRun
+from daedalus.cli.own_algorithm import with_record
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
 from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
 from daedalus.learner.training.learner import Learner
@@ -64,6 +66,21 @@ def test_the_network_becomes_a_program(folder: Path) -> None:
     observations = np.full((5, 3, 12, 12), 255, np.uint8)
     actions = act(runtime, observations, np.zeros((5, 0), np.float32), np.random.default_rng(0))[0]
     assert actions.shape == (5,)
+
+
+def test_the_algorithm_learns(folder: Path) -> None:
+    code = example("algorithm.md")
+    assert len(code.splitlines()) <= 60
+    (folder / "my_module.py").write_text(code)
+    modules = UserModules(frozenset({"my_module"}))
+    training = {"algorithm": "my_module:KlPenalty", "algorithm_kwargs": {"penalty": 1e3}}
+    spec = with_record(run_spec({"environment": {"id": "Any-v0"}, "training": training}), modules)
+    assert spec.algorithm.corrected
+    learner = Learner(spec.training, PolicySpec(hidden=(8,)), SPACES, modules)
+    before = {name: values.copy() for name, values in learner.weights().items()}
+    assert learner.step(make_rollouts(1), 0.0) == []
+    assert learner.metrics.take_means()["policy_loss"] > 10.0  # the KL to random log-probabilities, a thousand times
+    assert not np.array_equal(learner.weights()["policy_head.weight"], before["policy_head.weight"])
 
 
 def test_the_metrics_writer_writes(folder: Path) -> None:

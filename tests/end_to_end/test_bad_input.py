@@ -25,6 +25,7 @@ Start = Callable[..., Running]
         (["train", "cartpole", "--set", "training.learning_rate=7"], 2, r"must be above 0 and at most 1"),
         (["train", "cartpole", "--set", "learning_rate=7"], 2, r"write section.key=value"),
         (["train", "cartpole", "--algorithm", "a4c"], 2, "training.algorithm must be one of a2c, a3c, impala, appo"),
+        (["learner", "cartpole", "--algorithm", "absent:A"], 2, "training.algorithm=absent:A: cannot import absent"),
         (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
         (["train", "nothing.toml"], 2, r"nothing.toml: No such file"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),

@@ -84,7 +84,7 @@ def test_msgpack_clients_may_send_bytes_for_arrays(learner: ScriptedLearner, con
     client = connect()
 
     def ask(message: dict[str, Any]) -> dict[str, Any]:
-        client.socket.send(msgpack.packb(message))
+        client.socket.send(bytes(msgpack.packb(message) or b""))
         answer = client.socket.recv(timeout=10)
         assert isinstance(answer, bytes)
         return msgpack.unpackb(answer)

@@ -38,7 +38,7 @@ from daedalus.protocol.messages import (
 )
 
 
-@pytest.mark.parametrize("version", [6, 7, 65535])
+@pytest.mark.parametrize("version", [6, 8, 65535])
 def test_origin_of_a_join_is_readable_whatever_its_version(version: int) -> None:
     origin = Origin(host="arm-box", software="daedalus-rl 9.9", address="tcp/10.0.0.7:1")
     data = bytearray(encode(Join(actor="a", incarnation=1, origin=origin)))
@@ -123,7 +123,9 @@ def test_both_memory_orders_decode_to_the_same_array() -> None:
 def test_every_shape_of_at_least_two_dimensions_can_be_swapped(shape: tuple[int, ...]) -> None:
     values = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
     turned = np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
-    came = decode(encode(dataclasses.replace(SNAPSHOT, weights={"w": turned})), LIMITS)
+    data = encode(dataclasses.replace(SNAPSHOT, weights={"w": turned}))
+    assert unwire(data)[1]["arrays"][0][3] is not turned.flags.c_contiguous
+    came = decode(data, LIMITS)
     assert isinstance(came, Snapshot)
     np.testing.assert_array_equal(came.weights["w"], values)
 
@@ -155,6 +157,8 @@ def test_encoding_an_unsupported_dtype_raises_value_error(dtype: str) -> None:
 def test_threads_may_encode_and_decode_concurrently() -> None:
     """A zstd context shared by threads fails or crashes within a few of these operations."""
     failures: list[object] = []
+    rollouts = [some_rollout(), some_rollout(PIXELS)]
+    encoded = [encode(rollout) for rollout in rollouts]
 
     def work(value: int) -> None:
         model = np.tile(np.arange(value, value + 100, dtype=np.uint8), 5000)
@@ -163,6 +167,7 @@ def test_threads_may_encode_and_decode_concurrently() -> None:
                 came = decode(encode(Program(hash="h", model=model)), LIMITS)
                 assert isinstance(came, Program)
                 assert came.model.tobytes() == model.tobytes()
+            assert [encode(rollout) for rollout in rollouts] == encoded
         except Exception as error:
             failures.append(error)
 
@@ -178,7 +183,7 @@ def test_threads_may_encode_and_decode_concurrently() -> None:
 # --------------------------------------------------------------------------------- the layout, golden
 
 
-def test_bytes_of_version_6_are_as_documented() -> None:
+def test_bytes_of_version_7_are_as_documented() -> None:
     header = msgpack.packb(
         {
             "kind": "Snapshot",
@@ -190,14 +195,14 @@ def test_bytes_of_version_6_are_as_documented() -> None:
     assert header is not None
     padding = bytes(-(12 + len(header)) % 8)
     body = struct.pack("<4f", 1, 2, 3, 4) + bytes([1, 2, 3]) + bytes(5)
-    expected = b"DAED" + struct.pack("<H", 6) + struct.pack("<H", 0) + struct.pack("<I", len(header))
+    expected = b"DAED" + struct.pack("<H", 7) + struct.pack("<H", 0) + struct.pack("<I", len(header))
     assert encode(SNAPSHOT) == expected + header + padding + body
 
 
 def test_prefix_can_be_read_with_struct() -> None:
     data = SAMPLES["rollout"]
     magic, version, flags, length = struct.unpack_from("<4sHHI", data)
-    assert (magic, version, flags) == (b"DAED", 6, 1)
+    assert (magic, version, flags) == (b"DAED", 7, 1)
     content = msgpack.unpackb(data[12 : 12 + length])
     assert list(content) == ["kind", "fields", "arrays", "size"]
     assert content["kind"] == "Rollout"

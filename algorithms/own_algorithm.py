@@ -1,0 +1,78 @@
+"""An algorithm supplied by the user as `module:Class`: its class, its construction, and a trial before the run."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+
+from daedalus.algorithms.algorithm import Algorithm
+from daedalus.algorithms.batch import Batch, BatchAssembler, each
+from daedalus.algorithms.errors import AlgorithmError
+from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.user_modules import UserModuleError, UserModules
+from daedalus.protocol.algorithms import AlgorithmRecord
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import TrainingSpec
+
+_SETTING = "training.algorithm"
+_ROWS, _ENVIRONMENTS = 3, 2  # of the trial
+
+
+def own_class(name: str, modules: UserModules) -> type[Algorithm]:
+    """Return the class `module:Class`.
+
+    Raises AlgorithmError if it may not be imported, or is not a class of Algorithm with a record.
+    """
+    try:
+        found = modules.attribute(_SETTING, name)
+    except UserModuleError as error:
+        raise AlgorithmError(str(error)) from error.__cause__
+    except Exception as error:  # the user's module may raise anything
+        raise _fault(name, error) from error
+    if not (isinstance(found, type) and issubclass(found, Algorithm)):
+        raise AlgorithmError(f"{_SETTING}={name}: it is not a class of daedalus.algorithms.algorithm.Algorithm")
+    if not isinstance(found.record, AlgorithmRecord):
+        raise AlgorithmError(f"{_SETTING}={name}: its record is not an AlgorithmRecord")
+    return found
+
+
+def own_algorithm(spec: TrainingSpec, distribution: ActionDistribution, modules: UserModules) -> Algorithm:
+    """Return the user's algorithm that `spec.algorithm` names. Raises AlgorithmError."""
+    kind: Any = own_class(spec.algorithm, modules)
+    try:
+        return kind(spec, distribution, **spec.algorithm_kwargs)
+    except Exception as error:  # the user's code may raise anything
+        raise _fault(spec.algorithm, error) from error
+
+
+def check_updates(
+    spec: TrainingSpec, updates: Callable[[Batch], Iterator[object]], spaces: Spaces, state_size: int
+) -> None:
+    """Make the updates of a small batch of zeros, to find the faults of an algorithm before the run.
+
+    Args:
+      spec: names the algorithm.
+      updates: computes the gradients of a batch; the parameters stay as they are.
+      spaces: components of the batch.
+      state_size: S, the size of the policy's memory; 0 without one.
+
+    Raises AlgorithmError.
+    """
+    batch = BatchAssembler(spaces, torch.device("cpu")).allocate(_ROWS, _ENVIRONMENTS, state_size)
+    each(batch.masks, lambda mask: mask.fill_(True))
+    batch.valid.fill_(1.0)
+    expected = spec.updates_from(_ENVIRONMENTS if state_size else _ROWS * _ENVIRONMENTS)
+    try:
+        with torch.random.fork_rng(devices=()):  # the run itself begins with the random state of its seed
+            made = sum(1 for _ in updates(batch.to(torch.device(spec.device))))
+    except Exception as error:  # the user's code may raise anything
+        raise _fault(spec.algorithm, error) from error
+    if made != expected:
+        raise AlgorithmError(
+            f"{_SETTING}={spec.algorithm}: its losses make {made} updates of a batch, and its record says {expected}"
+        )
+
+
+def _fault(name: str, error: Exception) -> AlgorithmError:
+    first_line = next(iter(str(error).strip().splitlines()), "")
+    return AlgorithmError(f"{_SETTING}={name}: {type(error).__name__}: {first_line}")

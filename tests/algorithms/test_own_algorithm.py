@@ -1,0 +1,159 @@
+"""An algorithm of the user's own: it is found, tried before the run, and scheduled by its record."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from building import POLICY, RECURRENT, SPACES, make_rollouts, run_spec
+
+from daedalus.algorithms.errors import AlgorithmError
+from daedalus.cli.own_algorithm import with_record
+from daedalus.cli.settings_arguments import choose_run, learner_parser
+from daedalus.learner.run import run_directory
+from daedalus.learner.run.settings import SettingsError
+from daedalus.learner.training.learner import Learner
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
+from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
+
+MODULE = "own_algorithms"
+CODE = """
+import torch
+from daedalus.algorithms.algorithm import Algorithm
+from daedalus.algorithms.appo import Appo
+from daedalus.algorithms.a3c import A3c
+from daedalus.protocol.algorithms import AlgorithmRecord
+
+class Barrier(A3c):
+    record = AlgorithmRecord(synchronous=True)
+
+class Twice(Algorithm):
+    def losses(self, batch, forward):
+        yield from A3c(self.spec, self.distribution).losses(batch, forward)
+        yield from A3c(self.spec, self.distribution).losses(batch, forward)
+
+class Passes(Appo):
+    record = AlgorithmRecord(passes_over_batch=True, corrected=True, batch_rollouts=5, max_lag_batches=2)
+
+class Unfinished(Algorithm):
+    pass
+
+class WrongShape(A3c):
+    def losses(self, batch, forward):
+        for losses in super().losses(batch, forward):
+            yield losses._replace(targets=losses.targets[:-1])
+
+class NoRecord(A3c):
+    record = {"synchronous": True}
+
+class Random(A3c):
+    def __init__(self, spec, distribution, *, draws):
+        super().__init__(spec, distribution)
+        self.draws = draws
+
+    def losses(self, batch, forward):
+        torch.rand(self.draws)
+        yield from super().losses(batch, forward)
+
+number = 3
+"""
+
+
+@pytest.fixture
+def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UserModules:
+    """The user's module, in the working directory."""
+    (tmp_path / f"{MODULE}.py").write_text(CODE)
+    (tmp_path / "broken.py").write_text("raise RuntimeError('no licence')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in (MODULE, "broken"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return UserModules(frozenset({MODULE, "broken"}))
+
+
+def training(name: str, **fields: Any) -> TrainingSpec:
+    return TrainingSpec.model_validate({"algorithm": f"{MODULE}:{name}", **fields})
+
+
+def resolved(modules: UserModules, name: str, **fields: Any) -> RunSpec:
+    return with_record(run_spec(algorithm=f"{MODULE}:{name}", **fields), modules)
+
+
+def test_the_record_of_the_class_schedules_the_run(modules: UserModules) -> None:
+    unresolved = run_spec(algorithm=f"{MODULE}:Barrier")
+    assert not unresolved.algorithm.synchronous
+    assert with_record(unresolved, modules).algorithm.synchronous
+    passes = resolved(modules, "Passes", passes=2, minibatches=3)
+    assert (passes.batch_rollouts, passes.training.updates_per_batch, passes.training.policy_lag_bound) == (5, 6, 12)
+    with pytest.raises(SettingsError, match="batch_rollouts has no meaning for own_algorithms:Barrier"):
+        resolved(modules, "Barrier", batch_rollouts=2)
+
+
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT])
+@pytest.mark.parametrize(("name", "same"), [("Barrier", "a2c"), ("Passes", "appo")])
+def test_an_own_algorithm_learns_as_its_base_does(
+    modules: UserModules, name: str, same: str, policy: PolicySpec
+) -> None:
+    """The trial before the run leaves no trace: neither in the parameters nor in the random state."""
+    learners = []
+    for spec in (resolved(modules, name).training, TrainingSpec(algorithm=same)):
+        learner = Learner(spec, policy, SPACES, modules)
+        assert learner.take_diagnostics() == {}
+        for seed in range(2):
+            learner.step(make_rollouts(seed, state_size=learner.state_size), 0.0)
+        learners.append(learner)
+    own, base = learners
+    assert own.policy_version == base.policy_version
+    assert all(np.array_equal(values, base.weights()[key]) for key, values in own.weights().items())
+
+
+def test_arguments_reach_the_constructor(modules: UserModules) -> None:
+    Learner(training("Random", algorithm_kwargs={"draws": 3}), POLICY, SPACES, modules)
+    with pytest.raises(AlgorithmError, match=r"own_algorithms:Random: TypeError: .*draws"):
+        Learner(training("Random"), POLICY, SPACES, modules)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        (f"{MODULE}:Unfinished", "NotImplementedError"),
+        (f"{MODULE}:Twice", "its losses make 2 updates of a batch, and its record says 1"),
+        (f"{MODULE}:WrongShape", "ValueError: the shapes of values, targets and shares differ"),
+        (f"{MODULE}:NoRecord", "its record is not an AlgorithmRecord"),
+        (f"{MODULE}:number", "it is not a class of daedalus.algorithms.algorithm.Algorithm"),
+        (f"{MODULE}:absent", "has no 'absent'"),
+        ("broken:A", "RuntimeError: no licence"),
+        ("other:A", "asks for training.algorithm=other:A, but the module other may not be imported here"),
+    ],
+)
+def test_a_fault_is_reported_in_one_line_before_the_run(modules: UserModules, name: str, reason: str) -> None:
+    with pytest.raises(AlgorithmError) as caught:
+        Learner(TrainingSpec(algorithm=name), POLICY, SPACES, modules)
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_run_directory_holds_the_settings_and_not_the_record(modules: UserModules, tmp_path: Path) -> None:
+    spec = resolved(modules, "Random", algorithm_kwargs={"draws": 3})
+    run_directory.create(tmp_path / "run", spec)
+    assert run_directory.read_config(tmp_path / "run") == run_spec(
+        algorithm=f"{MODULE}:Random", algorithm_kwargs={"draws": 3}
+    )
+    assert run_directory.default_directory("Any-v0", spec).name.startswith("Any-v0-Random-s1-")
+
+
+def test_a_resumed_learner_imports_the_algorithm_only_if_allowed(modules: UserModules, tmp_path: Path) -> None:
+    run_directory.create(tmp_path / "run", run_spec(algorithm=f"{MODULE}:Barrier"))
+    words = ["--run-dir", str(tmp_path / "run"), "--resume"]
+    with pytest.raises(ModuleNotAllowedError, match=f"asks for training.algorithm={MODULE}:Barrier"):
+        choose_run(learner_parser().parse_args(words))
+    chosen = choose_run(learner_parser().parse_args([*words, "--allow-module", MODULE]))
+    assert chosen.spec.algorithm.synchronous
+
+
+def test_arguments_of_a_built_in_algorithm_are_refused() -> None:
+    with pytest.raises(ValueError, match="algorithm_kwargs is for an algorithm of your own"):
+        run_spec(algorithm="impala", algorithm_kwargs={"x": 1})
+    with pytest.raises(ValueError, match="algorithm_record is for an algorithm of your own"):
+        run_spec(algorithm="impala", algorithm_record={"synchronous": True})
