@@ -96,7 +96,7 @@ def _gym(space: _Component) -> gymnasium.Space:
         case DiscreteSpace(counts=(count,)):
             return gym.Discrete(count)
         case DiscreteSpace():
-            return gym.MultiDiscrete(space.counts)
+            return gym.MultiDiscrete(list(space.counts))
         case ContinuousSpace():
             low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
             high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
