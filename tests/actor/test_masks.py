@@ -6,7 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from collectors import collect, started_collector
 from gymnasium import spaces as gym
+from plain import PlainPolicy
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
@@ -14,6 +16,8 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.acting.noise import Noise
+from daedalus.policy.acting.runtime import Choice
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
@@ -80,6 +84,30 @@ def test_masks_accompany_their_observations(convention: str) -> None:
         assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
     finally:
         environments.close()
+
+
+class LegalPolicy(PlainPolicy):
+    """A policy that takes the first legal choice."""
+
+    def act(
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
+        actions = masks["action"].argmax(1)[:, None]
+        return Choice({"action": actions}, np.zeros(len(actions), np.float32), state)
+
+
+def test_rollout_holds_the_mask_of_each_row() -> None:
+    """Two episodes, each with the row that only resets, whose mask has no meaning."""
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "info"})
+    collector = started_collector(spec, LegalPolicy(), count=2, rollout_length=6)
+    try:
+        for legal in ([0, 1, 2, 0, 0, 1], [2, 0, 0, 1, 2, 0]):
+            masks = collect(collector).masks["action"]
+            assert masks.dtype == np.bool_
+            for environment in range(2):
+                assert masks[:, environment].tolist() == np.eye(3, dtype=np.bool_)[legal].tolist()
+    finally:
+        collector.close()
 
 
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])

@@ -15,6 +15,7 @@ import node
 import numpy as np
 import pytest
 import torch
+from learner_status import actor_status, env_steps, learner_status
 from plain import ACTION, NAME, plain
 from processes import LIMIT, Running, until
 from recording_learner import ONE_AT_A_TIME, SPEC, RecordingLearner
@@ -251,17 +252,10 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
     actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1])
 
-    def status() -> dict:
-        asked = start("status", "--connect", address, "--json")
-        return json.loads(asked.output) if asked.wait() in (0, 3) else {"actors": [], "episode_return_mean": None}
-
-    def env_steps() -> int:
-        return next((one["env_steps"] for one in status()["actors"] if one["actor"] == "wing-ts"), 0)
-
-    until(lambda: env_steps() > 0)
-    before = env_steps()
-    until(lambda: env_steps() > before + 10_000)
-    report = status()
+    until(lambda: env_steps(learner_status(address), "wing-ts") > 0)
+    before = env_steps(learner_status(address), "wing-ts")
+    until(lambda: env_steps(learner_status(address), "wing-ts") > before + 10_000)
+    report = learner_status(address)
     (seen,) = report["actors"]
     assert seen["alive"]
     assert seen["environments"] == 6
@@ -269,7 +263,7 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     assert set(seen["rollouts_rejected"]) <= {"stale"}
     assert report["episode_return_mean"] > 5  # the statistics of its episodes arrived
     actor.process.kill()
-    until(lambda: not status()["actors"][0]["alive"])
+    until(lambda: actor_status(learner_status(address), "wing-ts").get("alive") is False)
     learner.process.terminate()
     learner.wait()
     bridge.process.terminate()
