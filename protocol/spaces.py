@@ -10,6 +10,7 @@ from pydantic import Field, StringConstraints, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
+LARGEST_OBSERVATION = 1e15  # of a number in an observation: beyond it squares overflow float32
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64

@@ -10,9 +10,11 @@ from collectors import collect, started_collector
 from gymnasium import spaces as gym
 from plain import PlainPolicy
 
+from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import Choice
@@ -43,6 +45,7 @@ class Narrowing(gymnasium.Env):
         return np.arange(3) == self._step % 3
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
         self._step = 0
         return self._shown()
 
@@ -174,7 +177,49 @@ def test_mask_that_does_not_fit_is_refused(mask: Any, reason: str) -> None:
         observe(mask)
 
 
-def test_one_mask_for_several_discrete_components_is_refused() -> None:
-    action = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
-    with pytest.raises(EnvironmentSetupError, match="the action has 2 discrete components: give a map"):
-        Transforms(SPEC, gym.Box(0, 1), action, np.ones((1, 5)))
+BOTH = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
+
+
+@pytest.mark.parametrize(
+    "mask", [np.array([1, 0, 0, 1, 1]), [1, 0, 0, 1, 1], ([1, 0], np.array([0, 1, 1])), ((1, 0), [0, 1, 1], None)]
+)
+def test_one_mask_covers_the_choices_of_all_components(mask: Any) -> None:
+    """Also lists and tuples, as `sample(mask)` of gymnasium's spaces takes them."""
+    transforms = Transforms(SPEC, gym.Box(0, 1), BOTH, mask_of_one(mask))
+    masks = transforms.observe_one(np.zeros(1), mask).masks
+    assert {name: part.tolist() for name, part in masks.items()} == {"0": [[True, False]], "1": [[False, True, True]]}
+
+
+def test_one_mask_of_another_size_is_refused() -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"has shape \(4,\), but .* have 2 \+ 3 choices: give a map"):
+        Transforms(SPEC, gym.Box(0, 1), BOTH, np.ones((1, 4)))
+    both = np.empty(2, np.object_)
+    both[:] = [[1, 0], None]  # gymnasium's batch where one environment gives no mask
+    with pytest.raises(EnvironmentSetupError, match="differs in size between environments: give it in every step"):
+        Transforms(SPEC, gym.Box(0, 1), gym.Discrete(2), both)
+
+
+@pytest.mark.parametrize("make", [list, tuple])
+def test_masks_of_an_environment_may_be_lists(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
+    masked = Narrowing.mask
+    monkeypatch.setattr(
+        Narrowing, "_shown", lambda self: (np.zeros(1, np.float32), {"action_mask": make(masked(self))})
+    )
+    environments = make_environments(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "list"}), 2)
+    observed = environments.reset(1)
+    for _ in range(4):
+        observed, *_ = environments.step({"action": observed.masks["action"].argmax(1)[:, None]})
+    assert observed.masks["action"].tolist() == [[True, False, False]] * 2
+    environments.close()
+
+
+def narrowing_notes(convention: str) -> tuple[str, ...]:
+    return gymnasium_notes(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention}), NO_MODULES)
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation"])
+def test_gymnasiums_checker_plays_legal_actions(convention: str) -> None:
+    """Only choice 0 is legal at first, and the checker would sample another."""
+    assert not [note for note in narrowing_notes(convention) if "Error" in note]
+    (note,) = [note for note in narrowing_notes("none") if "Error" in note]
+    assert "an illegal action was taken" in note

@@ -136,6 +136,12 @@ def test_huge_ratio_does_not_overflow_the_clipped_loss(log_ratio: float) -> None
     assert gradient[:, 1].all()
 
 
+@pytest.mark.parametrize("clip_range", [0.3, 0.0])
+def test_ratios_of_1_are_not_clipped(valid: Tensor, clip_range: float) -> None:
+    zeros = torch.zeros(ROWS, COLUMNS)
+    assert clipped_policy_loss(zeros, zeros, shares_of(valid), clip_range)[1].item() == 0.0
+
+
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random).requires_grad_()
     log_probs = normal(random).requires_grad_()
