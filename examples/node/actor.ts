@@ -88,7 +88,7 @@ export class Actor {
       const inquiry = { ...known, spaces: null, environments: 0 };
       const { run, spec, learner_epoch } = await link.join(bridge, this.#run, inquiry);
       this.#run = run;
-      checkSupported(spec.environment);
+      checkSupported(spec.environment, spec.collection.upload);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
         this.#publishedVersion = 0;
@@ -246,7 +246,7 @@ export class Actor {
 }
 
 /** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
-function checkSupported(spec: link.EnvironmentSpec): void {
+function checkSupported(spec: link.EnvironmentSpec, upload: string): void {
   const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
   const settings = {
     id: id !== ID,
@@ -256,6 +256,7 @@ function checkSupported(spec: link.EnvironmentSpec): void {
     ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
+  if (upload !== "rollouts") unsupported.push("collection.upload");
   if (unsupported.length === 0) return;
   throw new RefusedError(
     `the run's environment ${id} has unsupported settings (${unsupported.join(", ")}): ` +

@@ -1,14 +1,13 @@
 """Metrics of updates and batches since the last metrics row. State; no I/O."""
 
-import itertools
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import Terms
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
 GRADIENT_CLIPPED_FRACTION = "gradient_clipped_fraction"  # share of the updates
@@ -27,16 +26,7 @@ class UpdateMetrics:
         self._image_space = arrays.get(self._image or "")
         self._sums = torch.zeros(len(METRICS) - 1, device=device)
         self._updates = self._clipped_updates = 0
-        self._action_counts = {
-            name: torch.zeros(space.choices, dtype=torch.int64, device=device)
-            for name, space in spaces.actions.items()
-            if isinstance(space, DiscreteSpace)
-        }
-        self._first_choices = {  # of each variable among all choices of its component
-            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device)
-            for name, space in spaces.actions.items()
-            if isinstance(space, DiscreteSpace)
-        }
+        self._actions = ActionCounts(spaces, device)
         self._newest: Tensor | None = None  # the first image of the newest batch
 
     def add_update(self, terms: Terms, gradient_norm: Tensor, clipped: bool) -> None:
@@ -49,10 +39,11 @@ class UpdateMetrics:
         """Count the actions of a batch, and keep one of its observations."""
         if self._image is not None:
             self._newest = batch.observations[self._image][0, 0]
-        for name, counts in self._action_counts.items():
-            choices = batch.actions[name] + self._first_choices[name]  # [T, B, D]
-            weights = batch.valid.unsqueeze(-1).expand(choices.shape)
-            counts += torch.bincount(choices.flatten(), weights.flatten(), len(counts)).to(torch.int64)
+        self._actions.add(batch)
+
+    def add_action_counts(self, counts: dict[str, Tensor]) -> None:
+        """Add how often each choice of each discrete component was made, [choices] int64."""
+        self._actions.merge(counts)
 
     def take_means(self) -> dict[str, float]:
         """Return means over the updates since the last call, by name; empty if there were no updates."""
@@ -65,10 +56,7 @@ class UpdateMetrics:
 
     def take_action_counts(self) -> dict[str, list[int]]:
         """Return how often each choice of each discrete component was chosen in the batches since the last call."""
-        taken = {name: counts.tolist() for name, counts in self._action_counts.items()}
-        for counts in self._action_counts.values():
-            counts.zero_()
-        return taken
+        return self._actions.take()
 
     def take_observation_image(self) -> np.ndarray | None:
         """Return an observation of the newest batch, with its frames side by side: uint8 [H, W] or [H, W, 3].
