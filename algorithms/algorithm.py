@@ -14,8 +14,8 @@ from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spec import TrainingSpec
 
-# The network on R rows of B environments: observations {name: [R, B, ...]}, state [B, S], starts [R, B] -> parameters
-# of the action distributions [R, B, P], values [R, B].
+# The network on R rows of B environments: normalised observations {name: [R, B, ...]}, state [B, S], starts [R, B] ->
+# parameters of the action distributions [R, B, P], values [R, B].
 Forward = Callable[[Components, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
@@ -30,8 +30,7 @@ class Losses(NamedTuple):
     entropies: Tensor  # [R, B], nats
     values: Tensor  # [R, B]
     targets: Tensor  # [R, B], value targets, without gradients
-    advantages: Tensor  # [R, B], without gradients
-    valid: Tensor  # [R, B] float32, 1 or 0
+    shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
     clipped_fraction: Tensor | None = None  # scalar, share of rows whose probability ratio was clipped; None: no clip
     first_pass: FirstPass | None = None  # of the whole batch, for its diagnostics; the same object in all updates
 
@@ -56,7 +55,7 @@ class Algorithm:
         self.spec, self.distribution = spec, distribution
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
-        """Yield the losses of each update of a batch, in order.
+        """Yield the losses of each update of a batch, in order. The observations of the batch are normalised.
 
         The caller changes the parameters between two updates, so losses are computed only when the caller asks for
         the next update. The number of updates is that of `TrainingSpec.updates_from`.

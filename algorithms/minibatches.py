@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, Components, each
-from daedalus.algorithms.returns import Targets
+from daedalus.algorithms.losses import shares_of
+
+_LARGE_BYTES = 4096  # of one row of a component, from which on it is not copied for a whole pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,12 +27,11 @@ class Minibatch:
     masks: Components  # of the masked actions [R, B, choices] bool
     log_probs: Tensor  # [R, B], log pi(a_t | s_t) before the first update of the batch
     targets: Tensor  # [R, B], value targets
-    advantages: Tensor  # [R, B]
-    weights: Tensor  # [R, B], of the rows in the policy gradient
-    valid: Tensor  # [R, B] float32
+    factors: Tensor  # [R, B], of the rows in the policy loss
+    shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
 
 
-def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -> Iterator[Minibatch]:
+def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
     """Yield one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
@@ -39,7 +40,9 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
 
     Args:
       log_probs: [T, B], log pi(a_t | s_t) before the first update of the batch.
-      targets: value targets and advantages, [T, B].
+      targets: [T, B], value targets.
+      factors: [T, B], of the rows in the policy loss.
+      count: largest number of minibatches.
     """
     if batch.initial_state.shape[1]:
         order = torch.randperm(batch.rewards.shape[1]).to(batch.rewards.device)
@@ -51,42 +54,47 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Targets, count: int) -
                 actions=each(batch.actions, partial(_columns, part=part)),
                 masks=each(batch.masks, partial(_columns, part=part)),
                 log_probs=log_probs[:, part],
-                targets=targets.values[:, part],
-                advantages=targets.advantages[:, part],
-                weights=targets.weights[:, part],
-                valid=batch.valid[:, part],
+                targets=targets[:, part],
+                factors=factors[:, part],
+                shares=shares_of(batch.valid[:, part]),
             )
         return
     rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
     order = rows[torch.randperm(len(rows)).to(rows.device)]
-    # One gather for each array and pass, and minibatches that are views of the result: gathering each minibatch would
-    # take as many operations as there are minibatches, and small ones cost as much as large ones. Observations can be
-    # images, of which a second copy of the whole batch would be too much.
-    small = [each(batch.actions, partial(_rows, rows=order)), each(batch.masks, partial(_rows, rows=order))]
-    shuffled = [_rows(values, order) for values in (batch.starts, log_probs, *targets, batch.valid)]
-    start = 0
-    for part in order.tensor_split(min(count, len(order))) if len(order) else ():
-        columns = slice(start, start := start + len(part))
-        actions, masks = (each(components, partial(_columns, part=columns)) for components in small)
-        starts, own_log_probs, values, advantages, weights, valid = (array[:, columns] for array in shuffled)
+    number = min(count, len(order))
+    if not number:
+        return
+
+    def parts_of(values: Tensor) -> tuple[Tensor, ...]:
+        """Gather values of rows [T, B, ...] in the order of the pass, and split them: [1, n, ...] each.
+
+        One gather for each array and pass, and views of it: gathering each minibatch would take as many operations as
+        there are minibatches, and small ones cost as much as large ones.
+        """
+        return values.flatten(0, 1)[order].unsqueeze(0).tensor_split(number, dim=1)
+
+    # Of images a second copy of the whole batch would be too much.
+    large = {name: values for name, values in batch.observations.items() if values[0, 0].nbytes > _LARGE_BYTES}
+    observations, actions, masks = (
+        {name: parts_of(values) for name, values in components.items() if name not in large}
+        for components in (batch.observations, batch.actions, batch.masks)
+    )
+    arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
+    for index, part in enumerate(order.tensor_split(number)):
+        starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
+        gathered = {name: values.flatten(0, 1)[part].unsqueeze(0) for name, values in large.items()}
         yield Minibatch(
-            observations=each(batch.observations, partial(_rows, rows=part)),
+            observations={name: parts[index] for name, parts in observations.items()} | gathered,
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
             starts=starts,
-            actions=actions,
-            masks=masks,
+            actions={name: parts[index] for name, parts in actions.items()},
+            masks={name: parts[index] for name, parts in masks.items()},
             log_probs=own_log_probs,
-            targets=values,
-            advantages=advantages,
-            weights=weights,
-            valid=valid,
+            targets=own_targets,
+            factors=own_factors,
+            shares=batch.valid.new_full((1, len(part)), 1.0 / len(part)),
         )
 
 
-def _columns(values: Tensor, part: Tensor | slice, rows: int | None = None) -> Tensor:
+def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:
     return values[:rows, part]
-
-
-def _rows(values: Tensor, rows: Tensor) -> Tensor:
-    """Return rows of [T, B, ...] by their numbers in T x B, as [1, N, ...]."""
-    return values.flatten(0, 1)[rows].unsqueeze(0)

@@ -8,7 +8,7 @@ from torch import Tensor
 from daedalus.algorithms.algorithm import Algorithm, Forward, Losses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
-from daedalus.algorithms.losses import policy_gradient_loss, policy_weights
+from daedalus.algorithms.losses import policy_factors, policy_gradient_loss, shares_of
 from daedalus.algorithms.returns import Targets
 from daedalus.algorithms.targets import uncorrected_targets
 
@@ -26,16 +26,20 @@ class PolicyGradient(Algorithm):
         log_probs, entropies = self.distribution.log_prob_and_entropy(parameters[:-1], batch.actions, batch.masks)
         with torch.no_grad():
             targets = self.targets(batch, log_probs, values)
-        normalize = self.spec.normalize_advantages
-        factors = policy_weights(targets.advantages, targets.weights, batch.valid, normalize)
+            shares = shares_of(batch.valid)
+            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
         yield Losses(
-            policy_loss=policy_gradient_loss(log_probs, factors, batch.valid),
+            policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,
             values=values[:-1],
             targets=targets.values,
-            advantages=targets.advantages,
-            valid=batch.valid,
+            shares=shares,
             first_pass=FirstPass(
-                log_probs.detach(), batch.behaviour_log_probs, values[:-1].detach(), targets.values, batch.valid
+                log_probs.detach(),
+                batch.behaviour_log_probs,
+                values[:-1].detach(),
+                targets.values,
+                targets.advantages,
+                batch.valid,
             ),
         )

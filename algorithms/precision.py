@@ -6,16 +6,12 @@ from typing import Literal
 import torch
 
 
-def autocast(
-    precision: Literal["auto", "float32", "bfloat16"], device: torch.device, convolutional: bool
-) -> torch.autocast:
-    """Return the context for forward passes, with mixed precision if it is requested or known to be faster.
+def is_mixed(precision: Literal["auto", "float32", "bfloat16"], device: torch.device, convolutional: bool) -> bool:
+    """Return whether forward passes compute in bfloat16: if it is requested or known to be faster.
 
-    "auto" enables bfloat16 for a convolutional network on a device that multiplies bfloat16 in hardware.
+    "auto" means bfloat16 for a convolutional network on a device that multiplies bfloat16 in hardware.
     """
-    enabled = precision == "bfloat16" or (precision == "auto" and convolutional and _multiplies_bfloat16(device))
-    # Enter the context for each forward pass: its cache of cast weights must not survive an update of the weights.
-    return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
+    return precision == "bfloat16" or (precision == "auto" and convolutional and _multiplies_bfloat16(device))
 
 
 def _multiplies_bfloat16(device: torch.device) -> bool:

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import BatchAssembler
-from daedalus.algorithms.diagnostics import diagnostics
+from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import unpacked
 from daedalus.algorithms.gradients import GradientComputer
@@ -82,7 +81,10 @@ class RolloutGradients:
             self._rewards.scale(batch)
         (terms,) = self._computer.compute(batch, self._entropy_bonus)
         first_pass = self._computer.take_first_pass()
-        measured = {} if first_pass is None else diagnostics(first_pass, None)
+        measured: dict[str, float] = {}
+        if first_pass is not None:
+            measured = dict(zip(BATCH_METRICS, batch_metrics(first_pass).tolist(), strict=True))
+            measured |= diagnostics(first_pass, None)
         self._actions.add(batch)
         gradient = Gradient(
             identity=rollout.identity,
@@ -101,10 +103,11 @@ class RolloutGradients:
         return gradient if self._in_float32 else self._rounded(gradient)
 
     def _computed(self) -> dict[str, np.ndarray]:
+        """Return a copy of the computed gradient by parameter."""
+        learned = {name: each.shape for name, each in self._parameters.items() if each.requires_grad}
+        parts = self._computer.parameters.gradients.split([shape.numel() for shape in learned.values()])
         return {
-            name: parameter.grad.numpy().copy()
-            for name, parameter in self._parameters.items()
-            if isinstance(parameter.grad, Tensor)
+            name: part.view(shape).numpy().copy() for (name, shape), part in zip(learned.items(), parts, strict=True)
         }
 
     def _rounded(self, gradient: Gradient) -> Gradient:

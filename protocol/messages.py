@@ -19,18 +19,13 @@ from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
 LARGEST_GRADIENT_NORM = 1e12  # no healthy actor comes near it, and the mean of many gradients stays finite
-# Names in Gradient.metrics: the terms of the loss (algorithms/gradients.py), and the diagnostics of a rollout with
-# valid rows (algorithms/diagnostics.py).
-LOSS_TERMS = (
-    "policy_loss",
-    "value_loss",
-    "entropy",
+# Names in Gradient.metrics: the terms of the loss (algorithms/gradients.py), and the diagnostics that an algorithm
+# gives of a rollout (algorithms/diagnostics.py).
+LOSS_TERMS = ("policy_loss", "value_loss", "entropy", "clipped_fraction")
+DIAGNOSTICS = (
     "explained_variance",
     "value_mean",
     "advantage_std",
-    "clipped_fraction",
-)
-DIAGNOSTICS = (
     "behaviour_kl",
     "rho_mean",
     "rho_effective_share",

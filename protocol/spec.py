@@ -194,7 +194,7 @@ class TrainingSpec(Specification):
     normalize_rewards: bool = False
     """Divide rewards by the running standard deviation of the discounted return, so that values are near one."""
     normalize_advantages: bool = False
-    """Scale the advantages of each update to mean 0 and standard deviation 1."""
+    """Scale the advantages of each batch to mean 0 and standard deviation 1."""
 
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """Optimiser of the network's parameters."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.diagnostics import diagnostics
+from daedalus.algorithms.diagnostics import batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
@@ -19,6 +19,7 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.gradient_faults import rollouts_at_fault
 from daedalus.learner.training.optimizers import build_optimizer
 from daedalus.learner.training.received_gradients import (
+    batch_metrics_of,
     diagnostics_of,
     mean_gradient,
     mean_terms,
@@ -105,18 +106,19 @@ class Learner:
             if self.policy_version == end:
                 break
         self._observations.add(batch)
+        if self._gradients.first_pass is not None:
+            self.metrics.add_batch_metrics(batch_metrics(self._gradients.first_pass))
         self.metrics.add_batch(batch)
         return True
 
     def _make_update(self, terms: Terms, progress: float) -> bool:
         """Make an update with the computed gradient. Return False, without an update, if it is not finite."""
         norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-        size = float(norm)
-        if not math.isfinite(size):  # such a step would set all parameters to nan for the rest of the run
+        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
             return False
         self.policy_version += 1
         self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
-        self.metrics.add_update(terms, norm, clipped=size > self._spec.max_gradient_norm)
+        self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
         return True
 
     def apply(self, gradients: Sequence[Gradient], progress: float) -> None:
@@ -135,6 +137,9 @@ class Learner:
         if self._make_update(mean_terms(gradients, self._device), progress):
             components = tuple(self._observations.moments)
             self._observations.merge([observation_moments(gradient, components) for gradient in gradients])
+            for gradient in gradients:
+                if (measured := batch_metrics_of(gradient)) is not None:
+                    self.metrics.add_batch_metrics(measured.to(self._device))
         else:
             self.policy_version += 1
             self.updates_skipped += 1

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.diagnostics import BATCH_METRICS
 from daedalus.algorithms.gradients import Terms
 from daedalus.algorithms.normalization import Moments
 from daedalus.protocol.messages import Gradient
@@ -43,9 +44,16 @@ def mean_terms(gradients: Sequence[Gradient], device: torch.device) -> Terms:
     )
 
 
+def batch_metrics_of(gradient: Gradient) -> Tensor | None:
+    """Return BATCH_METRICS [3] of the rollout; None if its algorithm gives none."""
+    given = [float(gradient.metrics[name]) for name in BATCH_METRICS if name in gradient.metrics]
+    return torch.tensor(given) if len(given) == len(BATCH_METRICS) else None
+
+
 def diagnostics_of(gradient: Gradient) -> dict[str, float]:
     """Return the diagnostics of a rollout; empty for a rollout without valid rows."""
-    return {name: float(value) for name, value in gradient.metrics.items() if name not in Terms._fields}
+    others = (*Terms._fields, *BATCH_METRICS)
+    return {name: float(value) for name, value in gradient.metrics.items() if name not in others}
 
 
 def observation_moments(gradient: Gradient, components: Sequence[str]) -> dict[str, Moments]:

@@ -6,12 +6,13 @@ from torch import Tensor
 
 from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.diagnostics import BATCH_METRICS
 from daedalus.algorithms.gradients import Terms
 from daedalus.protocol.spaces import ArraySpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
 GRADIENT_CLIPPED_FRACTION = "gradient_clipped_fraction"  # share of the updates
-METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION)
+METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION, *BATCH_METRICS)
 
 
 class UpdateMetrics:
@@ -24,16 +25,24 @@ class UpdateMetrics:
         arrays = {name: space for name, space in spaces.observations.items() if isinstance(space, ArraySpace)}
         self._image = next((name for name, space in arrays.items() if _shows_image(space)), None)
         self._image_space = arrays.get(self._image or "")
-        self._sums = torch.zeros(len(METRICS) - 1, device=device)
-        self._updates = self._clipped_updates = 0
+        self._sums = torch.zeros(len(Terms._fields), device=device)
+        self._norms = 0.0
+        self._batch_sums = torch.zeros(len(BATCH_METRICS), device=device)
+        self._updates = self._clipped_updates = self._batches = 0
         self._actions = ActionCounts(spaces, device)
         self._newest: Tensor | None = None  # the first image of the newest batch
 
-    def add_update(self, terms: Terms, gradient_norm: Tensor, clipped: bool) -> None:
+    def add_update(self, terms: Terms, gradient_norm: float, clipped: bool) -> None:
         """Add the metrics of an update that changed the parameters, with a clipped gradient or not."""
-        self._sums += torch.stack([*terms, gradient_norm])
+        self._sums += torch.stack(terms)
+        self._norms += gradient_norm
         self._updates += 1
         self._clipped_updates += clipped
+
+    def add_batch_metrics(self, metrics: Tensor) -> None:
+        """Add BATCH_METRICS of a batch, or of the rollout of a gradient."""
+        self._batch_sums += metrics
+        self._batches += 1
 
     def add_batch(self, batch: Batch) -> None:
         """Count the actions of a batch, and keep one of its observations."""
@@ -46,13 +55,17 @@ class UpdateMetrics:
         self._actions.merge(counts)
 
     def take_means(self) -> dict[str, float]:
-        """Return means over the updates since the last call, by name; empty if there were no updates."""
+        """Return means over the updates, or batches, since the last call, by name; empty without updates."""
         if not self._updates:
             return {}
-        means = [*(self._sums / self._updates).tolist(), self._clipped_updates / self._updates]
+        means = (self._sums / self._updates).tolist()
+        means += [self._norms / self._updates, self._clipped_updates / self._updates]
+        means += (self._batch_sums / self._batches).tolist() if self._batches else []
         self._sums.zero_()
-        self._updates = self._clipped_updates = 0
-        return dict(zip(METRICS, means, strict=True))
+        self._norms = 0.0
+        self._batch_sums.zero_()
+        self._updates = self._clipped_updates = self._batches = 0
+        return dict(zip(METRICS, means, strict=False))  # an algorithm of the user may give no first pass
 
     def take_action_counts(self) -> dict[str, list[int]]:
         """Return how often each choice of each discrete component was chosen in the batches since the last call."""

@@ -1,5 +1,7 @@
 """The actor-critic network, built from its specification. Needs torch: actors do not import this file."""
 
+from contextlib import nullcontext
+
 import torch
 from torch import Tensor, nn
 
@@ -52,19 +54,30 @@ class ActorCritic(nn.Module):
 
         Args:
           observations: of each component [R, B, *stacked_shape].
+          state, starts: as in `unroll`.
+
+        Returns: as `unroll`.
+        """
+        return self.unroll(self.normalizer(observations), state, starts)
+
+    def unroll(self, normalized: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute policies and values for R consecutive rows of B environments from normalised observations.
+
+        Args:
+          normalized: what `normalizer` returns, of each component [R, B, *stacked_shape].
           state: [B, S] float32, the memory before row 0.
           starts: [R, B] bool, whether an episode starts with the row, which clears the memory.
 
         Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast.
         """
-        flat = {name: values.flatten(0, 1) for name, values in observations.items()}
-        normalized = self.normalizer(flat)
-        features = self.encoder(normalized).unflatten(0, starts.shape)  # [R, B, F]
+        flat = {name: values.flatten(0, 1) for name, values in normalized.items()}
+        features = self.encoder(flat).unflatten(0, starts.shape)  # [R, B, F]
         remembered = critic = self.memory.unroll(features, state, starts)
         if self.value_encoder is not None:
-            critic = self.value_encoder(normalized).unflatten(0, starts.shape)
+            critic = self.value_encoder(flat).unflatten(0, starts.shape)
         # Both heads in full precision: bfloat16 would round values and logits to 8 bits, which is much of a TD error.
-        with torch.autocast(remembered.device.type, enabled=False):
+        device = remembered.device.type
+        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
             return self.policy_head(remembered.float()), self.value_head(critic.float()).squeeze(-1)
 
     def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:

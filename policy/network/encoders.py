@@ -13,13 +13,11 @@ from torch.nn import functional
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.network.layers import orthogonal
+from daedalus.policy.network.perceptron import Perceptron
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
 
-_ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
-_GAIN = math.sqrt(2.0)
 _SMALLEST_FOR_NATURE = 36  # pixels of the shorter side
 
 Observations = dict[str, Tensor]
@@ -34,13 +32,8 @@ class FlatEncoder(nn.Module):
     def __init__(self, spaces: ObservationSpaces, spec: PolicySpec) -> None:
         super().__init__()
         self._spaces = spaces
-        layers: list[nn.Module] = []
-        width = sum(_width(space) for space in spaces.values())
-        for units in spec.hidden:
-            layers += [orthogonal(nn.Linear(width, units), _GAIN), _ACTIVATIONS[spec.activation]()]
-            width = units
-        self.layers = nn.Sequential(*layers)
-        self.features = width
+        self.layers = Perceptron(sum(_width(space) for space in spaces.values()), spec.hidden, spec.activation)
+        self.features = self.layers.features
 
     def forward(self, observations: Observations) -> Tensor:
         """Encode observations."""

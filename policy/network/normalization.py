@@ -34,7 +34,7 @@ class ObservationNormalizer(nn.Module):
         return self._names
 
     def forward(self, observations: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Normalise observations {name: [N, *stacked_shape]}; images and discrete components are left as they are."""
+        """Normalise observations {name: [..., *stacked_shape]}; images and discrete components are left as they are."""
         normalized = dict(observations)
         for name, mean, scale in zip(self._names, self.means, self.scales, strict=True):
             centred = observations[name].to(torch.float32) - mean.sum(0)

@@ -43,7 +43,7 @@ def first_pass(errors: Tensor) -> FirstPass:
     """The first pass of four valid rows and of one that only resets, whose numbers have no meaning."""
     behaviour, values = torch.full((5, 1), -1.5), torch.full((5, 1), 3.0)
     log_ratios = torch.cat([LOG_RATIOS, torch.tensor([1e30])]).unsqueeze(1)
-    return FirstPass(behaviour + log_ratios, behaviour, values, values + errors, VALID)
+    return FirstPass(behaviour + log_ratios, behaviour, values, values + errors, errors, VALID)
 
 
 def test_diagnostics_of_a_batch() -> None:

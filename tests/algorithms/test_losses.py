@@ -8,13 +8,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from daedalus.algorithms.losses import (
-    clipped_fraction,
     clipped_policy_loss,
     explained_variance,
-    masked_mean,
+    mean,
     normalized,
     policy_gradient_loss,
+    shares_of,
     value_loss,
+    variance,
 )
 from daedalus.policy.network.distributions.categorical import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
@@ -44,14 +45,14 @@ def mean_of(terms: dict[tuple[int, int], float], valid: Tensor) -> float:
     return math.fsum(kept) / len(kept)
 
 
-def test_masked_mean_is_the_mean_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
+def test_mean_is_the_mean_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random)
     expected = mean_of({cell: values[cell].item() for cell in CELLS}, valid)
-    assert masked_mean(values, valid).item() == pytest.approx(expected, rel=1e-5)
+    assert mean(values, shares_of(valid)).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_masked_mean_without_valid_rows_is_0() -> None:
-    assert masked_mean(torch.ones(2, 2), torch.zeros(2, 2)).item() == 0.0
+def test_mean_without_valid_rows_is_0() -> None:
+    assert mean(torch.ones(2, 2), shares_of(torch.zeros(2, 2))).item() == 0.0
 
 
 def test_policy_gradient_loss_is_minus_the_mean_log_prob_times_advantage(
@@ -59,7 +60,7 @@ def test_policy_gradient_loss_is_minus_the_mean_log_prob_times_advantage(
 ) -> None:
     log_probs, advantages = normal(random), normal(random)
     expected = -mean_of({cell: log_probs[cell].item() * advantages[cell].item() for cell in CELLS}, valid)
-    assert policy_gradient_loss(log_probs, advantages, valid).item() == pytest.approx(expected, rel=1e-5)
+    assert policy_gradient_loss(log_probs, advantages, shares_of(valid)).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid: Tensor) -> None:
@@ -68,7 +69,7 @@ def test_policy_gradient_is_the_softmax_gradient(random: torch.Generator, valid:
     actions = torch.randint(0, 4, (ROWS, COLUMNS), generator=random)
     advantages = normal(random)
     log_probs, _ = Categorical(DiscreteSpace(counts=(4,))).log_prob_and_entropy(logits, actions.unsqueeze(-1))
-    policy_gradient_loss(log_probs, advantages, valid).backward()
+    policy_gradient_loss(log_probs, advantages, shares_of(valid)).backward()
     chosen = torch.nn.functional.one_hot(actions, 4)
     expected = (logits.detach().softmax(-1) - chosen) * (advantages * valid / valid.sum()).unsqueeze(-1)
     assert logits.grad is not None
@@ -87,7 +88,9 @@ def test_clipped_policy_loss_equals_the_equation_of_the_paper(
         return min(ratio * advantage, clipped * advantage)
 
     expected = -mean_of({cell: gain(cell) for cell in CELLS}, valid)
-    loss = clipped_policy_loss(log_ratios, advantages, valid, clip_range)
+    loss, clipped_share = clipped_policy_loss(log_ratios, advantages, shares_of(valid), clip_range)
+    left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > clip_range) for cell in CELLS}
+    assert clipped_share.item() == pytest.approx(mean_of(left, valid))
     assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
@@ -96,7 +99,7 @@ def test_clipped_policy_loss_equals_a_hand_worked_example() -> None:
     log_ratios = torch.tensor([[1.5, 1.5, 0.5, 0.5, 1.1, 1.0]]).log().requires_grad_()
     advantages = torch.tensor([[2.0, -2.0, 2.0, -2.0, 3.0, 100.0]])
     valid = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
-    loss = clipped_policy_loss(log_ratios, advantages, valid, 0.2)
+    loss, clipped_share = clipped_policy_loss(log_ratios, advantages, shares_of(valid), 0.2)
     # min(3, 2.4) + min(-3, -2.4) + min(1, 1.6) + min(-1, -1.6) + min(3.3, 3.3), over five rows
     assert loss.item() == pytest.approx(-(2.4 - 3.0 + 1.0 - 1.6 + 3.3) / 5.0)
     loss.backward()
@@ -104,7 +107,7 @@ def test_clipped_policy_loss_equals_a_hand_worked_example() -> None:
     expected = torch.tensor([[0.0, 3.0, -1.0, 0.0, -3.3, 0.0]]) / 5.0
     assert log_ratios.grad is not None
     assert_close(log_ratios.grad, expected)
-    assert clipped_fraction(log_ratios.detach(), valid, 0.2).item() == pytest.approx(4 / 5)
+    assert clipped_share.item() == pytest.approx(4 / 5)
 
 
 def test_clipped_gradient_equals_the_policy_gradient_at_a_ratio_of_1(random: torch.Generator, valid: Tensor) -> None:
@@ -113,9 +116,9 @@ def test_clipped_gradient_equals_the_policy_gradient_at_a_ratio_of_1(random: tor
     for clipped in (False, True):
         log_probs = before.clone().requires_grad_()
         if clipped:
-            clipped_policy_loss(log_probs - before, advantages, valid, 0.2).backward()
+            clipped_policy_loss(log_probs - before, advantages, shares_of(valid), 0.2)[0].backward()
         else:
-            policy_gradient_loss(log_probs, advantages, valid).backward()
+            policy_gradient_loss(log_probs, advantages, shares_of(valid)).backward()
         gradients.append(log_probs.grad)
     assert_close(gradients[0], gradients[1])
 
@@ -123,30 +126,23 @@ def test_clipped_gradient_equals_the_policy_gradient_at_a_ratio_of_1(random: tor
 @pytest.mark.parametrize("log_ratio", [1e3, 1e30])
 def test_huge_ratio_does_not_overflow_the_clipped_loss(log_ratio: float) -> None:
     log_ratios = torch.tensor([[log_ratio, 0.1], [log_ratio, -0.1]], requires_grad=True)
-    loss = clipped_policy_loss(log_ratios, torch.tensor([[1.0, 1.0], [-1.0, 1.0]]), torch.ones(2, 2), 0.2)
+    loss, _ = clipped_policy_loss(log_ratios, torch.tensor([[1.0, 1.0], [-1.0, 1.0]]), torch.full((2, 2), 0.25), 0.2)
     (gradient,) = torch.autograd.grad(loss, log_ratios)
     assert loss.isfinite()
     assert gradient.isfinite().all()
     assert gradient[:, 1].all()
 
 
-def test_clipped_fraction_is_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
-    log_ratios = normal(random) / 4.0
-    left = {cell: float(abs(math.exp(log_ratios[cell].item()) - 1.0) > 0.3) for cell in CELLS}
-    assert clipped_fraction(log_ratios, valid, 0.3).item() == pytest.approx(mean_of(left, valid))
-    assert clipped_fraction(torch.zeros(ROWS, COLUMNS), valid, 0.3).item() == 0.0
-
-
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random).requires_grad_()
     log_probs = normal(random).requires_grad_()
-    policy_gradient_loss(log_probs, normal(random) - values, valid).backward()
+    policy_gradient_loss(log_probs, normal(random) - values, shares_of(valid)).backward()
     assert values.grad is None
-    clipped_policy_loss(log_probs, normal(random) - values, valid, 0.2).backward()
+    clipped_policy_loss(log_probs, normal(random) - values, shares_of(valid), 0.2)[0].backward()
     assert values.grad is None
     for kind in ("mse", "huber"):
         targets = normal(random).requires_grad_()
-        value_loss(values, targets, valid, kind).backward()
+        value_loss(values, targets, shares_of(valid), kind).backward()
         assert targets.grad is None
         assert values.grad is not None
 
@@ -154,7 +150,7 @@ def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Te
 def test_mse_is_the_mean_squared_error_without_a_half(random: torch.Generator, valid: Tensor) -> None:
     values, targets = normal(random), normal(random)
     expected = mean_of({cell: (values[cell].item() - targets[cell].item()) ** 2 for cell in CELLS}, valid)
-    assert value_loss(values, targets, valid, "mse").item() == pytest.approx(expected, rel=1e-5)
+    assert value_loss(values, targets, shares_of(valid), "mse").item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_huber_is_quadratic_within_1_and_linear_beyond(random: torch.Generator, valid: Tensor) -> None:
@@ -163,7 +159,9 @@ def test_huber_is_quadratic_within_1_and_linear_beyond(random: torch.Generator, 
 
     values, targets = normal(random), normal(random)
     terms = {cell: huber(values[cell].item() - targets[cell].item()) for cell in CELLS}
-    assert value_loss(values, targets, valid, "huber").item() == pytest.approx(mean_of(terms, valid), rel=1e-5)
+    assert value_loss(values, targets, shares_of(valid), "huber").item() == pytest.approx(
+        mean_of(terms, valid), rel=1e-5
+    )
 
 
 def test_normalized_has_mean_0_and_deviation_1_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
@@ -180,10 +178,12 @@ def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_
     random: torch.Generator, valid: Tensor
 ) -> None:
     targets = normal(random)
-    assert explained_variance(targets, targets, valid).item() == pytest.approx(1.0)
-    assert explained_variance(targets + 7.0, targets, valid).item() == pytest.approx(1.0, abs=1e-5)
-    assert explained_variance(torch.full_like(targets, 2.0), targets, valid).item() == pytest.approx(0.0, abs=1e-5)
-    assert explained_variance(-targets, targets, valid).item() == pytest.approx(-3.0, rel=1e-4)
+    assert explained_variance(targets, targets, shares_of(valid)).item() == pytest.approx(1.0)
+    assert explained_variance(targets + 7.0, targets, shares_of(valid)).item() == pytest.approx(1.0, abs=1e-5)
+    assert explained_variance(torch.full_like(targets, 2.0), targets, shares_of(valid)).item() == pytest.approx(
+        0.0, abs=1e-5
+    )
+    assert explained_variance(-targets, targets, shares_of(valid)).item() == pytest.approx(-3.0, rel=1e-4)
 
 
 def test_explained_variance_equals_its_definition_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
@@ -191,7 +191,8 @@ def test_explained_variance_equals_its_definition_over_the_valid_rows(random: to
     kept = valid == 1.0
     residual = (targets - values)[kept]
     expected = 1.0 - residual.var(correction=0) / targets[kept].var(correction=0)
-    assert_close(explained_variance(values, targets, valid), expected)
+    assert_close(explained_variance(values, targets, shares_of(valid)), expected)
+    assert_close(variance(values, shares_of(valid)), values[kept].var(correction=0))
 
 
 def test_content_of_invalid_rows_does_not_change_losses_or_gradients(random: torch.Generator, valid: Tensor) -> None:
@@ -202,12 +203,12 @@ def test_content_of_invalid_rows_does_not_change_losses_or_gradients(random: tor
         ours = (first + shift).requires_grad_()
         theirs = second - 3.0 * shift
         losses = [
-            policy_gradient_loss(ours, theirs, valid),
-            policy_gradient_loss(ours, normalized(theirs, valid), valid),
-            clipped_policy_loss(ours * valid, theirs, valid, 0.2),
-            value_loss(ours, theirs, valid, "mse"),
-            value_loss(ours, theirs, valid, "huber"),
-            explained_variance(ours, theirs, valid),
+            policy_gradient_loss(ours, theirs, shares_of(valid)),
+            policy_gradient_loss(ours, normalized(theirs, valid), shares_of(valid)),
+            clipped_policy_loss(ours * valid, theirs, shares_of(valid), 0.2)[0],
+            value_loss(ours, theirs, shares_of(valid), "mse"),
+            value_loss(ours, theirs, shares_of(valid), "huber"),
+            explained_variance(ours, theirs, shares_of(valid)),
         ]
         gradients = torch.autograd.grad(losses, ours, [torch.ones(())] * len(losses))
         assert torch.equal(gradients[0] * (1.0 - valid), torch.zeros_like(valid))

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.minibatches import Minibatch, minibatches
-from daedalus.algorithms.returns import Targets
 
 WIDTH = 2 * ENVIRONMENTS
 
@@ -21,10 +20,11 @@ class Numbered:
 
     batch: Batch
     numbers: Tensor  # [T, B]
-    targets: Targets
+    targets: Tensor  # [T, B]
+    factors: Tensor  # [T, B]
 
     def pass_of(self, count: int) -> list[Minibatch]:
-        return list(minibatches(self.batch, self.numbers, self.targets, count))
+        return list(minibatches(self.batch, self.numbers, self.targets, self.factors, count))
 
     def assert_holds(self, minibatch: Minibatch) -> None:
         """Assert that every row of a minibatch equals the row of the batch with the same number."""
@@ -32,11 +32,12 @@ class Numbered:
             t, b = divmod(int(minibatch.log_probs[row, column]), WIDTH)
             assert torch.equal(minibatch.observations[NAME][row, column], self.batch.observations[NAME][t, b])
             assert torch.equal(minibatch.actions[ACTION][row, column], self.batch.actions[ACTION][t, b])
-            for name in ("starts", "valid"):
-                assert torch.equal(getattr(minibatch, name)[row, column], getattr(self.batch, name)[t, b])
-            assert torch.equal(minibatch.targets[row, column], self.targets.values[t, b])
-            assert torch.equal(minibatch.advantages[row, column], self.targets.advantages[t, b])
-            assert torch.equal(minibatch.weights[row, column], self.targets.weights[t, b])
+            assert torch.equal(minibatch.starts[row, column], self.batch.starts[t, b])
+            assert bool(minibatch.shares[row, column] > 0.0) == bool(self.batch.valid[t, b])
+            assert torch.equal(minibatch.targets[row, column], self.targets[t, b])
+            assert torch.equal(minibatch.factors[row, column], self.factors[t, b])
+        counted = minibatch.shares[minibatch.shares > 0.0]
+        torch.testing.assert_close(counted, torch.full_like(counted, 1.0 / len(counted)))
 
 
 def numbered(state_size: int) -> Numbered:
@@ -44,9 +45,7 @@ def numbered(state_size: int) -> Numbered:
     batch = join(make_rollouts(1, state_size=state_size))
     assert not batch.valid.all()
     numbers = torch.arange(ROWS * WIDTH, dtype=torch.float32).reshape(ROWS, WIDTH)
-    return Numbered(
-        batch, numbers, Targets(torch.randn(ROWS, WIDTH), torch.randn(ROWS, WIDTH), torch.rand(ROWS, WIDTH))
-    )
+    return Numbered(batch, numbers, torch.randn(ROWS, WIDTH), torch.randn(ROWS, WIDTH))
 
 
 COUNTS = [1, 2, 3, 4, 7, ROWS * WIDTH, ROWS * WIDTH + 5]
@@ -57,15 +56,15 @@ def test_pass_without_memory_contains_each_valid_row_once(count: int) -> None:
     made = numbered(state_size=0)
     parts = made.pass_of(count)
     assert len(parts) == min(count, int(made.batch.valid.sum()))
-    assert all(minibatch.valid.numel() for minibatch in parts)
-    sizes = [minibatch.valid.numel() for minibatch in parts]
+    assert all(minibatch.shares.numel() for minibatch in parts)
+    sizes = [minibatch.shares.numel() for minibatch in parts]
     assert max(sizes) - min(sizes) <= 1
     taken = torch.cat([minibatch.log_probs.flatten() for minibatch in parts])
     expected = made.numbers[made.batch.valid == 1.0]
     assert torch.equal(taken.sort().values, expected)
     for minibatch in parts:
-        assert len(minibatch.valid) == 1
-        assert minibatch.initial_state.shape == (minibatch.valid.shape[1], 0)
+        assert len(minibatch.shares) == 1
+        assert minibatch.initial_state.shape == (minibatch.shares.shape[1], 0)
         made.assert_holds(minibatch)
 
 
@@ -74,7 +73,7 @@ def test_pass_with_memory_contains_each_environment_once_with_all_rows(count: in
     made = numbered(state_size=5)
     parts = made.pass_of(count)
     assert len(parts) == min(count, WIDTH)
-    widths = [minibatch.valid.shape[1] for minibatch in parts]
+    widths = [minibatch.shares.shape[1] for minibatch in parts]
     assert max(widths) - min(widths) <= 1
     taken = torch.cat([minibatch.log_probs for minibatch in parts], dim=1)  # [T, B] in another order of columns
     columns = taken[0].long()

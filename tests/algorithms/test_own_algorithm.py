@@ -119,7 +119,7 @@ def test_arguments_reach_the_constructor(modules: UserModules) -> None:
     [
         (f"{MODULE}:Unfinished", "NotImplementedError"),
         (f"{MODULE}:Twice", "its losses make 2 updates of a batch, and its record says 1"),
-        (f"{MODULE}:WrongShape", "RuntimeError: The size of tensor"),
+        (f"{MODULE}:WrongShape", "ValueError: the shapes of values, targets and shares differ"),
         (f"{MODULE}:NoRecord", "its record is not an AlgorithmRecord"),
         (f"{MODULE}:number", "it is not a class of daedalus.algorithms.algorithm.Algorithm"),
         (f"{MODULE}:absent", "has no 'absent'"),

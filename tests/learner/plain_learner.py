@@ -34,7 +34,8 @@ class PlainLearner:
             before, _, values = self._play_back(batch)
         streams = [self._stream(batch, b, before, values) for b in range(batch.rewards.shape[1])]
         targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
-        measured = [self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
+        first = self._first_pass_metrics(list(targets), targets, values)
+        measured = [first | self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
         return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
 
     def _parts(self, batch: Batch) -> list[list[Cell]]:
@@ -62,7 +63,8 @@ class PlainLearner:
         log_probs, entropies, values = self._play_back(batch)
         advantages = torch.tensor([targets[cell][1] for cell in cells])
         if spec.normalize_advantages:
-            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+            whole = torch.tensor([advantage for _, advantage, _ in targets.values()])  # of the batch
+            advantages = (advantages - whole.mean()) / (whole.std(correction=0) + 1e-8)
         advantages = torch.tensor([targets[cell][2] for cell in cells]) * advantages  # rho_t A_t
         predicted = torch.stack([values[cell] for cell in cells])
         goals = torch.tensor([targets[cell][0] for cell in cells])
@@ -79,16 +81,23 @@ class PlainLearner:
         (policy_loss + spec.value_coefficient * value_loss - bonus * entropy).backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, spec.max_gradient_norm)
         self._descend(rate)
-        with torch.no_grad():
-            explained = 1.0 - (goals - predicted).var(correction=0) / goals.var(correction=0)
         return {
             "policy_loss": policy_loss.item(),
             "value_loss": value_loss.item(),
             "entropy": entropy.item(),
-            "explained_variance": explained.item(),
             "gradient_norm": norm.item(),
-            "value_mean": predicted.mean().item(),
             "clipped_fraction": ((ratios - 1.0).abs() > spec.clip_range).float().mean().item(),
+        }
+
+    @staticmethod
+    def _first_pass_metrics(
+        cells: list[Cell], targets: dict[Cell, tuple[float, float, float]], values: Played
+    ) -> dict[str, float]:
+        goals = torch.tensor([targets[cell][0] for cell in cells])
+        predicted = torch.stack([values[cell] for cell in cells])
+        return {
+            "explained_variance": (1.0 - (goals - predicted).var(correction=0) / goals.var(correction=0)).item(),
+            "value_mean": predicted.mean().item(),
         }
 
     def _play_back(self, batch: Batch) -> tuple[Played, Played, Played]:

@@ -539,7 +539,7 @@ def test_share_of_clipped_gradients_counts_updates() -> None:
     metrics = UpdateMetrics(SPACES, torch.device("cpu"))
     terms = Terms(*[torch.zeros(()) for _ in Terms._fields])
     for clipped in (True, False, False, True, False):
-        metrics.add_update(terms, torch.ones(()), clipped)
+        metrics.add_update(terms, 1.0, clipped)
     assert metrics.take_means()["gradient_clipped_fraction"] == 0.4
-    metrics.add_update(terms, torch.ones(()), clipped=True)
+    metrics.add_update(terms, 1.0, clipped=True)
     assert metrics.take_means()["gradient_clipped_fraction"] == 1.0

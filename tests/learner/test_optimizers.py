@@ -76,8 +76,7 @@ def test_backward_fills_the_flat_gradients_repeatedly() -> None:
     reference = copy.deepcopy(module)
     flat = FlatParameters(module.parameters())
     for scale in (1.0, -3.0):
-        flat.gradients.zero_()
-        (scale * module(torch.ones(3, 4))).square().sum().backward()
+        flat.differentiate((scale * module(torch.ones(3, 4))).square().sum())
         reference.zero_grad()
         (scale * reference(torch.ones(3, 4))).square().sum().backward()
         expected = [parameter.grad.flatten() for parameter in reference.parameters() if parameter.grad is not None]
@@ -89,10 +88,26 @@ def test_gradient_clipping_equals_torch_clipping(max_norm: float) -> None:
     module = network()
     reference = copy.deepcopy(module)
     flat = FlatParameters(module.parameters())
-    for each in (module, reference):
-        each(torch.ones(3, 4)).square().sum().mul(10.0).backward()
+    reference(torch.ones(3, 4)).square().sum().mul(10.0).backward()
+    flat.differentiate(module(torch.ones(3, 4)).square().sum().mul(10.0))
     norm = nn.utils.clip_grad_norm_(reference.parameters(), max_norm)
-    assert_close(flat.clip_gradients(max_norm), norm)
-    for ours, theirs in zip(module.parameters(), reference.parameters(), strict=True):
-        assert ours.grad is not None
-        assert_close(ours.grad, theirs.grad)
+    assert flat.clip_gradients(max_norm) == pytest.approx(norm.item())
+    theirs = [parameter.grad.flatten() for parameter in reference.parameters() if parameter.grad is not None]
+    assert_close(flat.gradients, torch.cat(theirs))
+
+
+def test_gradient_of_a_parameter_that_the_loss_does_not_use_is_0() -> None:
+    module = network()
+    flat = FlatParameters(module.parameters())
+    flat.gradients.fill_(3.0)
+    flat.differentiate(next(iter(module.parameters())).sum())
+    used = next(iter(module.parameters())).numel()
+    assert flat.gradients[:used].eq(1.0).all()
+    assert flat.gradients[used:].eq(0.0).all()
+
+
+@pytest.mark.parametrize("bad", [math.inf, math.nan])
+def test_clipping_leaves_gradients_that_are_not_finite(bad: float) -> None:
+    flat = FlatParameters(network().parameters())
+    flat.gradients[3] = bad
+    assert not math.isfinite(flat.clip_gradients(0.5))

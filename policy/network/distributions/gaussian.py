@@ -36,14 +36,16 @@ class Gaussian(Distribution):
 
     def log_prob(self, parameters: Tensor, actions: Tensor) -> Tensor:
         """See Distribution: sum_d log N(a_d; mu_d, sigma_d^2)."""
-        mean, log_std = self._mean_and_log_std(parameters)
-        deviations = (actions - mean) * (-log_std).exp()
-        return (-0.5 * deviations.square() - log_std - _HALF_LOG_2_PI).sum(-1)
+        return _log_density(*self._mean_and_log_std(parameters), actions)
 
     def entropy(self, parameters: Tensor) -> Tensor:
         """See Distribution: sum_d (log sigma_d + log(2 pi e) / 2)."""
+        return _entropy(*self._mean_and_log_std(parameters))
+
+    def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """See Distribution."""
         mean, log_std = self._mean_and_log_std(parameters)
-        return (log_std.expand_as(mean) + _HALF_LOG_2_PI + 0.5).sum(-1)
+        return _log_density(mean, log_std, actions), _entropy(mean, log_std)
 
     def _mean_and_log_std(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         if not self._state_dependent:
@@ -72,3 +74,18 @@ class SquashedGaussian(Gaussian):
         u = mean.unsqueeze(-1) + log_std.exp().unsqueeze(-1) * nodes  # [..., D, Q]
         log_slopes = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))  # log(1 - tanh^2 u), without overflow
         return super().entropy(parameters) + (log_slopes * weights).sum(-1).sum(-1)
+
+    def log_prob_and_entropy(self, parameters: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """See Distribution."""
+        return self.log_prob(parameters, actions), self.entropy(parameters)
+
+
+def _log_density(mean: Tensor, log_std: Tensor, actions: Tensor) -> Tensor:
+    """Return sum_d log N(a_d; mu_d, sigma_d^2): mean and actions [..., D], log_std [D] or [..., D] -> [...]."""
+    deviations = (actions - mean) * (-log_std).exp()
+    return -0.5 * deviations.square().sum(-1) - (log_std + _HALF_LOG_2_PI).sum(-1)
+
+
+def _entropy(mean: Tensor, log_std: Tensor) -> Tensor:
+    """Return sum_d (log sigma_d + log(2 pi e) / 2), arguments as for `_log_density`."""
+    return (log_std + (_HALF_LOG_2_PI + 0.5)).sum(-1).expand(mean.shape[:-1])
