@@ -87,7 +87,10 @@ class ClientActor:
         epoch = current.session.learner_epoch
         if self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch):
             self._begin_rows(current)
-        self.rows.observe(values, mask)
+        try:
+            self.rows.observe(values, mask)
+        except ValueError as error:
+            raise ClientError("misfit", str(error)) from None
 
     def _add_reward(self, value: float) -> None:
         if value and (self._rows is None or not self._rows.in_episode):

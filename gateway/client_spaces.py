@@ -13,7 +13,7 @@ from gymnasium import spaces as gym
 from pydantic import ValidationError
 
 from daedalus.gateway.errors import ClientError
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 _NUMBER_BYTES, _INTEGER_BYTES, _FLAG_BYTES = 32, 8, 8  # of one value in JSON, with a comma and some indentation
 _NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of everything else in a message
@@ -96,7 +96,7 @@ def _gym(space: _Component) -> gymnasium.Space:
         case DiscreteSpace(counts=(count,)):
             return gym.Discrete(count)
         case DiscreteSpace():
-            return gym.MultiDiscrete(space.counts)
+            return gym.MultiDiscrete(list(space.counts))
         case ContinuousSpace():
             low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
             high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
@@ -173,6 +173,8 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
         numbers = array.astype(np.float32).reshape(space.shape)
     if not np.isfinite(numbers).all():
         raise ClientError("misfit", f"{what} has a value that is not finite")
+    if (np.abs(numbers) > LARGEST_OBSERVATION).any():
+        raise ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
     return numbers
 
 

@@ -148,7 +148,11 @@ def _shown(value: Any) -> str:
 
 def encode(message: dict[str, Any], *, as_text: bool) -> str | bytes:
     """Return a message of the gateway as JSON or msgpack."""
-    return json.dumps(message, separators=(",", ":")) if as_text else bytes(msgpack.packb(message))
+    if as_text:
+        return json.dumps(message, separators=(",", ":"))
+    packed = msgpack.packb(message)
+    assert packed is not None  # its annotation is for streams too
+    return packed
 
 
 def welcome(run: str, environment: str, name: str) -> dict[str, Any]:

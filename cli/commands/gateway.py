@@ -118,7 +118,9 @@ def main() -> int:
     try:
         listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
-        print(f"daedalus gateway: cannot listen on {arguments.listen}: {error.strerror}", file=sys.stderr)
+        print(
+            f"daedalus gateway: cannot listen on {arguments.listen}: {os.strerror(error.errno or 0)}", file=sys.stderr
+        )
         return 1
     transport: Transport | None = None
     try:
