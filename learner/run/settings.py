@@ -126,15 +126,24 @@ def _one_line(error: ValidationError) -> str:
     if not name:
         return message
     if first["type"] == "tuple_type":
-        return f"setting {name} is {value!r}, which is not a list: write {name}=[{value}]"
+        return f"setting {name} is {value!r}, which is not a list: write {_as_list(name, value)}"
     if first["type"] == "string_pattern_mismatch":
         return f"setting {name} is {value!r}, which is not valid. {_description(path)}"
     bounds = _bounds(path)
     return f"setting {name} {message}, not {value!r}{f' (it must be {bounds})' if bounds else ''}"
 
 
+def _as_list(name: str, value: Any) -> str:
+    """Return an assignment of a list. A shell removes the quotes of texts, so that no valid list is left."""
+    if not isinstance(value, str):
+        return f"{name}=[{value}]"
+    parts = [part.strip() for part in value.strip("[]").split(",")]
+    return f'--set "{name}={parts}"'
+
+
 def _description(path: list[str]) -> str:
-    """Return the description of a setting in one line, or an empty string."""
+    """Return the description of a setting, or of the list that it is part of, in one line, or an empty string."""
+    path = [part for part in path if not part.isdigit()]
     model = _model(path[:-1])
     field = model.model_fields.get(path[-1]) if model else None
     return " ".join((field.description or "").split()) if field else ""

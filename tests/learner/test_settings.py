@@ -159,6 +159,14 @@ def test_value_of_wrong_type_is_refused() -> None:
     assert error_message("policy.hidden=64") == (
         "setting policy.hidden is 64, which is not a list: write policy.hidden=[64]"
     )
+    for shell in ("mission", "[mission]"):  # without the quotes that a shell removed
+        assert error_message(f"environment.leave_out={shell}").endswith(
+            "which is not a list: write --set \"environment.leave_out=['mission']\""
+        )
+    assert error_message("environment.leave_out=['a b']") == (
+        "setting environment.leave_out.0 is 'a b', which is not valid. Components of the observation that the policy "
+        'does not see, such as a text: `leave_out = ["mission"]`.'
+    )
     assert error_message("policy.encoder=cnn").startswith(
         "setting policy.encoder is 'cnn', which is not valid. Encoder of"
     )
