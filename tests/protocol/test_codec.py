@@ -29,6 +29,7 @@ from wire_format import (
 from daedalus.protocol.codec import decode, encode, origin_of
 from daedalus.protocol.limits import JOIN_LIMITS
 from daedalus.protocol.messages import (
+    CompactSnapshot,
     Join,
     Message,
     Origin,
@@ -218,9 +219,34 @@ def test_incompressible_body_is_sent_uncompressed() -> None:
     assert unwire(encode(Program(hash="h", model=np.zeros(1000, "|u1"))))[0] == 1
 
 
-@pytest.mark.parametrize(("frames", "level"), [(np.zeros((9, 4, 8, 8), np.uint8), 1), (None, -1)])
-def test_body_is_compressed_at_the_level_of_its_kind(frames: np.ndarray | None, level: int) -> None:
-    flags, _, body = unwire(encode(some_rollout(frames)))
+def few_values(dtype: str, *shape: int) -> np.ndarray:
+    """Return noise of eight values, which each level of zstd compresses in its own way."""
+    return np.random.default_rng(0).integers(0, 8, shape).astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("message", "level"),
+    [
+        (some_rollout(few_values("uint8", 9, 4, 20, 20)), 1),
+        (some_rollout(few_values("float32", 9, 4, 20, 20)), -1),
+        (some_rollout(few_values("uint8", 9, 4, 400)), -1),
+        (
+            CompactSnapshot(
+                learner_epoch=1,
+                policy_version=2,
+                program="",
+                base_version=None,
+                weights={"w": few_values("uint8", 2, 4000)},
+            ),
+            1,
+        ),
+        (Program(hash="h", model=few_values("uint8", 5000)), -1),
+    ],
+    ids=["images", "images of floats", "bytes", "compact snapshot", "program"],
+)
+def test_body_is_compressed_at_the_level_of_its_kind(message: Message, level: int) -> None:
+    flags, _, body = unwire(encode(message))
     plain = zstandard.ZstdDecompressor().decompress(body)
     assert flags == 1
     assert body == zstandard.ZstdCompressor(level=level).compress(plain)
+    assert body != zstandard.ZstdCompressor(level=-level).compress(plain)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import zstandard
 from wire_format import (
+    JOIN,
     LIMITS,
     PREFIX,
     SAMPLES,
@@ -155,3 +156,10 @@ def test_body_at_the_limit_is_accepted_and_a_larger_one_rejected() -> None:
             assert isinstance(decode(data, limits), kind)
     with pytest.raises(ProtocolError, match=r"a message of .* bytes, the limit is 4096"):
         decode(SAMPLES["snapshot"] + bytes(5000), limits)
+
+
+def test_header_at_the_limit_is_read() -> None:
+    length = PREFIX.unpack_from(SAMPLES["join"])[3]
+    assert decode(SAMPLES["join"], Limits(max_header_bytes=length)) == JOIN
+    with pytest.raises(ProtocolError, match=f"the header declares {length} bytes, the limit is {length - 1}"):
+        decode(SAMPLES["join"], Limits(max_header_bytes=length - 1))
