@@ -40,7 +40,7 @@ FROM build AS build-learner
 # torch first, with its exact version: on some indexes a range would select the CUDA build.
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt torch==2.13.0
 COPY . .
-RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,plot,certs,monitoring]" \
+RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,plot,certs,monitoring,gateway]" \
     && find /opt/daedalus -type d '(' -name tests -o -name test ')' -prune -exec rm -r {} +
 
 FROM run AS learner

@@ -8,8 +8,9 @@ PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
 
+# Two processes share the tests; those of one file run in one process, because they share what they start.
 test: check
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 # Test with real containers, if docker is installed. debootstrap makes the base image if none can be pulled.
 test-compose: .venv/ready-test
@@ -63,7 +64,7 @@ docs: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,certs,box2d,envpool,atari,video,monitoring,docs,dev]"
+	$(PIP) -e ".[learner,plot,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,docs,dev]"
 	touch $@
 
 clean:

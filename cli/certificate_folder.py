@@ -3,7 +3,9 @@
     ca/ca.pem, ca/key.pem            the CA that signs the certificates of learner and router
     ca/actor-NAME/ca.pem, key.pem    the issuer of this actor's certificates; operators likewise
     ca/IDENTITY/certificate.pem      a copy of the certificate that was issued last
-    learner/, router/, actor-NAME/   what the process of this identity needs: see transport/credentials.py
+    learner/, router/, gateway/, actor-NAME/    what the process of this identity needs: see transport/credentials.py
+
+The tokens of a gateway's clients are in client_tokens.py.
 
 An issuer of its own for each client makes revocation possible: without the issuer in clients.pem, no listener accepts
 the certificate. The file needs the package `cryptography`.
@@ -23,7 +25,8 @@ from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, Credentials, CredentialsError
 from daedalus.transport.zenoh_settings import Capacity, as_config_file, session_settings
 
-LISTENERS = ("learner", "router")
+LISTENERS = ("learner", "router", "gateway")
+_ZENOH_LISTENERS = ("learner", "router")
 CLIENT_ROLES = ("actor", "operator")
 
 _CA_LIFETIME = datetime.timedelta(days=3650)
@@ -67,7 +70,7 @@ class CertificateFolder:
             )
         CertificateAuthority.create(directory / "ca", "Daedalus CA", _CA_LIFETIME)
         made = cls(directory)
-        made.issue([*map(Identity, LISTENERS), Identity("operator", "operator")], lifetime, hosts)
+        made.issue([*map(Identity, _ZENOH_LISTENERS), Identity("operator", "operator")], lifetime, hosts)
         return made
 
     def identities(self) -> dict[Identity, Issued]:
@@ -131,7 +134,7 @@ class CertificateFolder:
         """Write clients.pem for learner and router, and the configuration of a standard zenohd."""
         issuers = sorted((self.directory / "ca").glob(f"*/{CA}"))
         content = "".join(path.read_text("ascii") for path in (self.directory / "ca" / CA, *issuers))
-        for role in LISTENERS:
+        for role in _ZENOH_LISTENERS:
             if (self.directory / role).exists():
                 _replace(self.directory / role / CLIENTS, content)
         router = (self.directory / "router").resolve()

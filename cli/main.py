@@ -22,7 +22,8 @@ on several machines, one process at a time:
   router     connect learner and actors at a fixed address
   status     show the state of a learner and its actors
   drain      ask actors to leave after their current rollout
-  bridge     connect actors that are written in other languages
+  gateway    connect actors in any language
+  bridge     connect actors that are written in other languages and run the policy themselves
   exporter   export the status as Prometheus metrics
   certs      create certificates for encrypted connections
 
@@ -61,7 +62,7 @@ def _run() -> int:
     return _COMMANDS[command](rest)
 
 
-_MODULES = {name: f"daedalus.cli.commands.{name}" for name in ("learner", "actor", "evaluate", "bridge")}
+_MODULES = {name: f"daedalus.cli.commands.{name}" for name in ("learner", "actor", "evaluate", "bridge", "gateway")}
 
 
 def _train(arguments: list[str]) -> int:

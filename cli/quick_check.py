@@ -11,8 +11,9 @@ import signal
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.run.default_settings import default_settings
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -40,20 +41,36 @@ def checked_spaces(spec: RunSpec, *, fork: bool = False) -> Spaces | None:
 
     The user has named the modules of the environment. See quick_check. Raises EnvironmentProblemError.
     """
-    from daedalus.actor.checking.report import slow_steps  # a process that checks nothing does not need it
+    report = _checked(spec, fork)
+    if problem := report.text_problem(spec):
+        raise EnvironmentProblemError(problem)
+    return report.spaces
+
+
+def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | None, dict[str, Any]]:
+    """Check an environment without settings: return its spaces and the default settings for it. See checked_spaces.
+
+    A text that never changes is left out, and logged.
+    """
+    return _defaults(_checked(spec, fork), spec)
+
+
+def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
+    from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps
 
     try:
         report = quick_check(spec.environment, UserModules(frozenset(modules_of(spec.user_modules))), fork=fork)
     except CheckTimeoutError as error:
         _logger.warning("the check of the environment was %s: the run starts without it", error)
-        return None
+        return EnvironmentReport()
     if report.problems:
         raise EnvironmentProblemError(report.problems[0])
     for warning in report.warnings:
         _logger.warning("%s", warning)
-    if advice := slow_steps(report, spec, os.cpu_count() or 1):
-        _logger.info("%s", advice)
-    return report.spaces
+    for advice in (slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec)):
+        if advice:
+            _logger.info("%s", advice)
+    return report
 
 
 def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *, fork: bool = False) -> Spaces | None:
@@ -68,8 +85,8 @@ def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *,
         report = quick_check(spec.environment, modules, play=False, fork=fork)
     except CheckTimeoutError:
         return None
-    if report.problems:
-        raise EnvironmentProblemError(report.problems[0])
+    if problem := (*report.problems, report.text_problem(spec))[0]:
+        raise EnvironmentProblemError(problem)
     return report.spaces
 
 
@@ -81,16 +98,39 @@ def expected_spaces(spec: RunSpec, modules: UserModules, stop: threading.Event) 
       modules: the modules that may be imported.
       stop: ends the attempt early when it is set.
     """
+    report = _expected(spec, modules, stop)
+    if problem := report.text_problem(spec):
+        _logger.info("%s", problem)
+        return None
+    return report.spaces
+
+
+def expected_defaults(
+    spec: RunSpec, modules: UserModules, stop: threading.Event
+) -> tuple[Spaces | None, dict[str, Any]]:
+    """Return the spaces of an environment without settings, and the default settings for it. See expected_spaces."""
+    return _defaults(_expected(spec, modules, stop), spec)
+
+
+def _expected(spec: RunSpec, modules: UserModules, stop: threading.Event) -> "EnvironmentReport":
+    from daedalus.actor.checking.report import EnvironmentReport
+
     try:
         report = quick_check(spec.environment, modules, play=False, stop=stop)
     except CheckTimeoutError as error:
         reason = str(error)
     else:
-        if report.spaces is not None:
-            return report.spaces
+        if report.spaces is not None and not report.problems:
+            return report
         reason = report.problems[0]
     _logger.info("the first actor decides the spaces of the run, because they are not known here: %s", reason)
-    return None
+    return EnvironmentReport()
+
+
+def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None, dict[str, Any]]:
+    for name, text in report.constant_texts.items():
+        _logger.info("observation component %r is left out (environment.leave_out): it is always %r", name, text)
+    return report.spaces, default_settings(report.spaces, [*spec.environment.leave_out, *report.constant_texts])
 
 
 def quick_check(

@@ -16,14 +16,11 @@ from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
 from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.policy.user_modules import UserModules, modules_of
-from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -97,10 +94,14 @@ def train(
     spec = choice.spec(partial(_assign, changes=settings or {}))
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     run_directory.check_free(directory)  # before the environment is made
-    spaces = _checked_spaces(spec, quiet)
+    with _checking(quiet):
+        if env is None:
+            spaces = checked_spaces(spec)
+        else:
+            spaces, defaults = checked_defaults(spec)
+            chosen = choice.spec(partial(_assign, changes=settings or {}), defaults)
+            spaces, spec = transformed_spaces(chosen, spec, spaces), chosen
     if env is not None:
-        chosen = choice.spec(partial(_assign, changes=settings or {}), default_settings(spaces))
-        spaces, spec = _transformed_spaces(chosen, spec, spaces), chosen
         directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
     weights = None if init_from is None else Path(init_from)
@@ -129,17 +130,12 @@ def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
             raise SettingsError(f"settings {path!r}: {error}") from None
 
 
-def _transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None) -> Spaces | None:
-    try:
-        return transformed_spaces(spec, before, spaces)
-    except EnvironmentProblemError as error:
-        raise TrainingError(str(error)) from None
-
-
-def _checked_spaces(spec: RunSpec, quiet: bool) -> Spaces | None:
+@contextmanager
+def _checking(quiet: bool) -> Iterator[None]:
+    """Show what the check of the environment logs. Raise TrainingError for a problem that it finds."""
     try:
         with _records_to(_handler(quiet)):
-            return checked_spaces(spec)
+            yield
     except EnvironmentProblemError as error:
         raise TrainingError(str(error)) from None
 

@@ -10,6 +10,7 @@ from pydantic import Field, StringConstraints, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
+LARGEST_OBSERVATION = 1e15  # of a number in an observation: beyond it squares overflow float32
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64
@@ -134,7 +135,10 @@ class ContinuousSpace(Specification):
             if not all(bound is None or math.isfinite(bound) for bound in (low, high)):
                 raise ValueError("a bound is not finite: leave it out")
             if low is not None and high is not None and not low < high:
-                raise ValueError(f"the lower bound {low:g} is not below the upper bound {high:g}")
+                raise ValueError(
+                    f"the lower bound {low:g} is not below the upper bound {high:g}: "
+                    "leave a number that cannot change out of the action"
+                )
         return self
 
     @property

@@ -55,6 +55,8 @@ class EnvironmentSpec(Specification):
     no_reward_limit: PositiveInt | None = None
     """Truncate an episode after this many env_steps in a row without a positive reward. Not in evaluations."""
 
+    leave_out: Annotated[tuple[ComponentName, ...], Field(max_length=64)] = ()
+    """Components of the observation that the policy does not see, such as a text: `leave_out = ["mission"]`."""
     crop: tuple[NaturalInt, NaturalInt, NaturalInt, NaturalInt] | None = None
     """Pixels to remove at the top, bottom, left and right."""
     grey: bool = False

@@ -8,6 +8,7 @@ TEST_MODULES = UserModules(
             "corridor",
             "corridor_wrappers",
             "counting_environment",
+            "mission_environment",
             "nested_environment",
             "picture_environment",
             "test_car_racing",

@@ -1,19 +1,31 @@
 """Fixtures for tests with processes."""
 
-import socket
-import sys
+import json
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import log_lines
 import pytest
 from hypothesis import Phase, settings
-from processes import Running
+from processes import Running, free_address, starting
+
+# The tensors of the tests are small. Further threads would spend most of their time waiting, on the cores of the other
+# processes of the tests. A learner sets its own number of threads.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # No test depends on the speed of the machine. For `make mutants` a failing example need not be made smaller.
 settings.register_profile("daedalus", deadline=None)
 settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("daedalus")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Run the fastest tests first in `make mutants`, where the first failure ends the tests of a mutant."""
+    measured = config.rootpath / "mutmut-stats.json"
+    if measured.exists():
+        seconds = json.loads(measured.read_text("utf-8"))["duration_by_test"]
+        items.sort(key=lambda item: seconds.get(item.nodeid, 0.0))
 
 
 @pytest.fixture(autouse=True)
@@ -25,21 +37,11 @@ def _log_lines() -> Iterator[None]:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Function that starts `daedalus ARGUMENTS` in the folder of the test. Processes left are killed at the end."""
-    running: list[Running] = []
-
-    def start_one(*arguments: object, directory: Path = tmp_path) -> Running:
-        words = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-        running.append(Running(words + [str(argument) for argument in arguments], directory))
-        return running[-1]
-
-    yield start_one
-    for one in running:
-        one.end()
+    with starting(tmp_path) as start_one:
+        yield start_one
 
 
 @pytest.fixture
 def address() -> str:
     """Return a loopback address that no process listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_address()

@@ -6,12 +6,10 @@ The switch is in a namespace too, so that the network of the machine does not ch
 import secrets
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
-from processes import Running
+from processes import DAEDALUS, Running
 
-DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 _SWITCH = "switch"
 
 

@@ -2,13 +2,16 @@
 
 import os
 import re
+import socket
 import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 LIMIT = 120.0  # seconds; timeout of each step, long enough for a slow machine
 
 
@@ -68,6 +71,29 @@ class Running:
         self._reader.join(LIMIT)
         assert self.process.stdout is not None
         self.process.stdout.close()
+
+
+@contextmanager
+def starting(folder: Path) -> Iterator[Callable[..., Running]]:
+    """Give a function that starts `daedalus ARGUMENTS` in the folder. Processes left are killed at the end."""
+    running: list[Running] = []
+
+    def start(*arguments: object, directory: Path = folder) -> Running:
+        running.append(Running(DAEDALUS + [str(argument) for argument in arguments], directory))
+        return running[-1]
+
+    try:
+        yield start
+    finally:
+        for one in running:
+            one.end()
+
+
+def free_address() -> str:
+    """Return a loopback address that no process listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def until(condition: Callable[[], object]) -> None:

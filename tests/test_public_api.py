@@ -24,8 +24,10 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import NoPolicyError, find_policy, pretrained
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import EnvironmentSpec
 
-BUDGET = {"env_steps": 20_000, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
+BUDGET = {"env_steps": 5_000, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
 
 
 def test_importing_daedalus_loads_no_other_package() -> None:
@@ -70,7 +72,7 @@ def test_train_returns_the_result_in_another_thread(tmp_path: Path, capfd: pytes
     summary = json.loads((directory / "summary.json").read_text())
     assert (result.directory, result.exit_status) == (directory, 3)  # the budget was used up before the target
     assert (result.solved, result.finished) == (False, True)
-    assert result.env_steps == summary["env_steps"] >= 20_000
+    assert result.env_steps == summary["env_steps"] >= 5_000
     assert result.evaluation_return_mean == summary["evaluation_return_mean"] > 0
     assert result.summary == summary
     assert (summary["seed"], summary["algorithm"]) == (3, "impala")
@@ -275,3 +277,35 @@ def test_invalid_arguments_of_load_policy_and_act_are_refused(tmp_path: Path) ->
         daedalus.load_policy(pretrained="car_race")
     with pytest.raises(ValueError, match="has shape"):
         daedalus.load_policy(tmp_path).act(np.zeros(5))
+
+
+def test_a_policy_with_masks_names_the_mask_that_the_caller_left_out(tmp_path: Path) -> None:
+    save(tmp_path, EnvironmentSpec(id="nested_environment:NestedMasked-v0"), 1)
+    policy = daedalus.load_policy(tmp_path, allow_modules=["nested_environment"])
+    observation, info = gymnasium.make("NestedMasked-v0").reset(seed=1)
+    with pytest.raises(ValueError, match=r"trained with masks.*: call act\(observation, action_mask=MASK\), with info"):
+        policy.act(observation)
+    action = policy.act(observation, action_mask=info["action_mask"])
+    assert info["action_mask"]["0"][action[0]] == 1
+
+
+def test_a_policy_without_masks_does_not_ignore_a_mask(tmp_path: Path) -> None:
+    save(tmp_path, CARTPOLE, 1)
+    policy = daedalus.load_policy(tmp_path)
+    with pytest.raises(ValueError, match=r"trained without masks .*: call act\(observation\) without action_mask"):
+        policy.act(np.zeros(4), action_mask=np.ones(2))
+
+
+def test_a_policy_takes_the_mask_of_the_observation(tmp_path: Path) -> None:
+    observation_space = gymnasium.spaces.Dict(
+        {"seen": gymnasium.spaces.Box(0, 9, (1,)), "action_mask": gymnasium.spaces.Box(0, 1, (3,), np.int8)}
+    )
+    spaces = Spaces(
+        observations={"seen": ArraySpace(shape=(1,), dtype="float32")},
+        actions={"action": DiscreteSpace(counts=(3,), masked=True)},
+    )
+    save(tmp_path, CARTPOLE, 1, spaces=spaces)
+    policy = daedalus.load_policy(
+        tmp_path, observation_space=observation_space, action_space=gymnasium.spaces.Discrete(3)
+    )
+    assert policy.act({"seen": np.zeros(1), "action_mask": np.array([0, 1, 0], np.int8)}) == 1

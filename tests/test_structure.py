@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "bridge", "cli")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "bridge", "gateway", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
     "transport": {"protocol", "transport"},
@@ -17,6 +17,7 @@ ALLOWED = {
     "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
     "bridge": {"protocol", "transport", "bridge"},
+    "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
     "cli": set(PACKAGES),
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
@@ -85,6 +86,8 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are valid between two dates
         ("credentials.py", "time.time"),
         ("credentials.py", "time.strftime"),
+        ("tokens.py", "time.time"),  # tokens of clients expire on a date
+        ("client_tokens.py", "time.time"),
     }
 
 
@@ -100,6 +103,8 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("cli.commands.router", {"torch", "daedalus.actor", "gymnasium", "onnxruntime"}),
         ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),
         ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
+        ("gateway.server", {"torch", "daedalus.learner", "daedalus.algorithms"}),
+        ("gateway.gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
         ("bridge.service", {"torch", "daedalus.actor", "daedalus.learner", "numpy", "gymnasium"}),
     ],
 )

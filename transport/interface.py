@@ -65,6 +65,14 @@ class Inbox(Protocol):
         ...
 
 
+class Declaration(Protocol):
+    """What a transport declared to the network."""
+
+    def close(self) -> None:
+        """Withdraw it. Idempotent."""
+        ...
+
+
 class Transport(Protocol):
     """Connection of one process to the network. Safe to use from several threads.
 
@@ -99,8 +107,8 @@ class Transport(Protocol):
         """Subscribe to a key; `on_news` is called when the inbox may hold a new value."""
         ...
 
-    def declare_presence(self, key: str) -> None:
-        """Declare presence under `key` until this transport is closed or its process dies."""
+    def declare_presence(self, key: str) -> Declaration:
+        """Declare presence under `key` until the result or this transport is closed, or the process dies."""
         ...
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:

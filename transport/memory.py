@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 from daedalus.protocol import keys
-from daedalus.transport.interface import Inbox, OnAnswer, Request
+from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request
 
 
 class _MemoryRequest:
@@ -43,6 +43,16 @@ class _MemoryInbox:
 
     def close(self) -> None:
         self.key = ""
+
+
+class _MemoryPresence:
+    """A declared presence."""
+
+    def __init__(self, withdraw: Callable[[], None]) -> None:
+        self._withdraw = withdraw
+
+    def close(self) -> None:
+        self._withdraw()
 
 
 class MemoryNetwork:
@@ -131,10 +141,20 @@ class MemoryTransport:
         self._inboxes.append(inbox)
         return inbox
 
-    def declare_presence(self, key: str) -> None:
+    def declare_presence(self, key: str) -> Declaration:
         """See Transport."""
         self._present_keys.add(key)
         self._report(key, True)
+        return _MemoryPresence(lambda: self._withdraw(key))
+
+    def _withdraw(self, key: str) -> None:
+        if key in self._present_keys:
+            self._present_keys.remove(key)
+            self._report_if_gone(key)
+
+    def _report_if_gone(self, key: str) -> None:
+        if not any(key in end._present_keys for end in self._ends()):
+            self._report(key, False)
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
@@ -161,5 +181,4 @@ class MemoryTransport:
                 return
             self._network.ends.remove(self)
         for key in self._present_keys:
-            if not any(key in end._present_keys for end in self._ends()):
-                self._report(key, False)
+            self._report_if_gone(key)

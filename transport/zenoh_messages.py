@@ -1,4 +1,4 @@
-"""Queries and values as Zenoh delivers them: the payload stays in Zenoh's buffers until it is read."""
+"""Queries, values and presence in Zenoh: the payload stays in Zenoh's buffers until it is read."""
 
 import threading
 from collections.abc import Callable
@@ -58,3 +58,14 @@ class ZenohInbox:
     def close(self) -> None:
         """See Inbox."""
         self.undeclare()
+
+
+class ZenohPresence:
+    """A declared presence."""
+
+    def __init__(self, undeclare: Callable[[], None]) -> None:
+        self._undeclare = undeclare
+
+    def close(self) -> None:
+        """See Declaration."""
+        self._undeclare()

@@ -18,16 +18,17 @@ import zenoh
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.credentials_watch import CredentialsWatch
-from daedalus.transport.interface import Inbox, OnAnswer, Request, Transport, TransportError
+from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request, Transport, TransportError
 from daedalus.transport.linger import linger_removal
 from daedalus.transport.zenoh_callbacks import Callbacks
-from daedalus.transport.zenoh_messages import ZenohInbox, ZenohRequest
+from daedalus.transport.zenoh_messages import ZenohInbox, ZenohPresence, ZenohRequest
 from daedalus.transport.zenoh_session import OpenSession, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
 
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
+_MAX_QUERIERS = 2048  # kept for further queries; a process may ask under many names
 _RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
 
@@ -150,10 +151,12 @@ class ZenohTransport:
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
         with self._lock:
-            querier = self._queriers.get((key, timeout))
+            querier = self._queriers.pop((key, timeout), None)
             if querier is None:
+                if len(self._queriers) >= _MAX_QUERIERS:
+                    self._queriers.pop(next(iter(self._queriers)))
                 querier = self._session.declare_querier(key, timeout=timeout, express=True)
-                self._queriers[key, timeout] = querier
+            self._queriers[key, timeout] = querier  # the last one used is the last
             return querier
 
     def publish(self, key: str, payload: bytes) -> None:
@@ -199,15 +202,20 @@ class ZenohTransport:
         return inbox
 
     def _undeclare(self, declaration: Callable[[zenoh.Session], object]) -> None:
-        subscriber = self._declared.pop(declaration, None)
-        if isinstance(subscriber, zenoh.Subscriber):
-            with contextlib.suppress(zenoh.ZError):  # its session was closed, and the subscription with it
-                subscriber.undeclare()
+        declared = self._declared.pop(declaration, None)
+        if isinstance(declared, (zenoh.Subscriber, zenoh.LivelinessToken)):
+            with contextlib.suppress(zenoh.ZError):  # its session was closed, and the declaration with it
+                declared.undeclare()
 
-    def declare_presence(self, key: str) -> None:
+    def declare_presence(self, key: str) -> Declaration:
         """See Transport."""
+
+        def declaration(session: zenoh.Session) -> object:
+            return session.liveliness().declare_token(key)
+
         with _as_transport_error(f"declare presence under {key}"):
-            self._declare(lambda session: session.liveliness().declare_token(key))
+            self._declare(declaration)
+        return ZenohPresence(lambda: self._undeclare(declaration))
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""

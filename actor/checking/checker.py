@@ -1,12 +1,21 @@
 """Gymnasium's own environment checker."""
 
+import functools
 import re
 import warnings
+from contextlib import suppress
+from typing import Any
 
+import gymnasium
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 
-from daedalus.actor.checking.single import make_one
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
+from daedalus.actor.checking.random_actions import RandomActions
+from daedalus.actor.checking.texts import Texts
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors, first_line
+from daedalus.actor.environments.gymnasium_backend import registration
+from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
+from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -16,16 +25,25 @@ _COLOURS = re.compile(r"\x1b\[[0-9;]*m|^WARN: ")
 def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, ...]:
     """Return what gymnasium's checker says about an environment: its advice, then the check that failed, if one did.
 
-    It also checks what training does not need, such as equal episodes for equal seeds.
+    It also checks what training does not need, such as equal episodes for equal seeds. Only environments that gymnasium
+    makes one at a time are checked, without wrappers and without what training changes in them.
     """
+    if spec.backend not in ("gymnasium", "fast"):
+        return ()
     try:
-        environment, _ = make_one(spec, modules)
+        with creation_errors(spec.id):
+            registered = registration(spec.id, modules)
+            if registered.entry_point is None:
+                return ()
+            kwargs: dict[str, Any] = {**spec.kwargs}
+            environment = gymnasium.make(registered, disable_env_checker=True, **kwargs).unwrapped
     except EnvironmentSetupError:
         return ()  # reported before
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            check_env(environment.unwrapped, skip_render_check=True)
+            _play_legally(environment)
+            check_env(environment, skip_render_check=True)
             failed = ()
         except Exception as error:  # of its assertions, or of the user's code
             failed = (f"gymnasium's checker: {first_line(error)}",)
@@ -33,6 +51,49 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
             environment.close()
     said = dict.fromkeys(_plain(str(each.message)) for each in caught)
     return (*(f"gymnasium's checker: {text}" for text in said), *failed)
+
+
+def _play_legally(environment: gymnasium.Env) -> None:
+    """Replace the checker's actions by legal ones if the environment has masks: the checker knows none."""
+    with suppress(EnvironmentSetupError, ValueError):  # reported before
+        first = _Masks(environment, *environment.reset(seed=0))
+        if not first.spaces.masks:
+            return
+        newest = [first]
+        reset, step = environment.reset, environment.step
+
+        @functools.wraps(reset)
+        def reset_and_look(*arguments: Any, **keywords: Any) -> Any:
+            result = reset(*arguments, **keywords)
+            newest[0] = _Masks(environment, *result)
+            return result
+
+        @functools.wraps(step)
+        def step_legally(action: Any) -> Any:  # the checker's own action is replaced
+            result = step(newest[0].legal_action())
+            if not (result[2] or result[3]):
+                newest[0] = _Masks(environment, result[0], result[4])
+            return result
+
+        environment.reset, environment.step = reset_and_look, step_legally
+
+
+class _Masks:
+    """The legal actions after one observation of an environment."""
+
+    def __init__(self, environment: gymnasium.Env, observation: Any, info: dict[str, Any]) -> None:
+        given = environment.get_wrapper_attr("action_masks")() if hasattr(environment, "action_masks") else None
+        mask = info.get(MASK_KEY) if given is None else np.asarray(given, np.bool_)
+        space = environment.observation_space
+        spec = EnvironmentSpec(id="Any-v0", leave_out=Texts(space, ()).names)
+        example = None if mask is None else mask_of_one(mask)
+        self._transforms = Transforms(spec, space, environment.action_space, example)
+        self.spaces = self._transforms.spaces
+        self._masks = self._transforms.observe_one(observation, mask).masks
+
+    def legal_action(self) -> Any:
+        """Return a legal action of the environment, always the same one."""
+        return self._transforms.env_action(RandomActions(self.spaces.actions, 0).choose(self._masks))
 
 
 def _plain(text: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.report import EnvironmentReport
 from daedalus.actor.checking.single import make_one
+from daedalus.actor.checking.texts import Texts
 from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
@@ -29,6 +30,8 @@ def check_environment(
 ) -> EnvironmentReport:
     """Make one environment, play it with random actions, and close it.
 
+    Texts of the observation that never change are left out, and reported.
+
     Args:
       spec: the environment and its transforms.
       modules: the modules that may be imported for it.
@@ -42,8 +45,11 @@ def check_environment(
         return EnvironmentReport(problems=(f"{error}{_place(error.__cause__)}",))
     try:
         mask = _first_mask(environment, seed)
+        texts = Texts(environment.observation_space, rest.leave_out)
+        texts.watch(environment, seed)
+        rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
         transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
-        play = _Play(spec.id, environment, transforms, RandomActions(transforms.spaces.actions, seed))
+        play = _Play(spec.id, environment, transforms, RandomActions(transforms.spaces.actions, seed), texts)
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
         return play.report()
@@ -68,9 +74,14 @@ class _Play:
     """One environment in play, and what was found so far."""
 
     def __init__(
-        self, name: str, environment: gymnasium.Env, transforms: Transforms, random_actions: RandomActions
+        self,
+        name: str,
+        environment: gymnasium.Env,
+        transforms: Transforms,
+        random_actions: RandomActions,
+        texts: Texts,
     ) -> None:
-        self._name, self._environment = name, environment
+        self._name, self._environment, self._texts = name, environment, texts
         self._transforms, self._random_actions = transforms, random_actions
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
@@ -99,9 +110,11 @@ class _Play:
 
     def report(self) -> EnvironmentReport:
         """Return what was found."""
+        problems = [*self._problems, *([self._texts.problem] if self._texts.problem else [])]
         return EnvironmentReport(
             spaces=self._transforms.spaces,
-            problems=tuple(f"environment {self._name}: {problem}" for problem in self._problems),
+            constant_texts=self._texts.constant,
+            problems=tuple(f"environment {self._name}: {problem}" for problem in problems),
             warnings=tuple(f"environment {self._name}: {warning}" for warning in self._warnings.values()),
             env_steps=self._env_steps,
             step_seconds=self._step_seconds / max(self._env_steps, 1),
@@ -136,6 +149,7 @@ class _Play:
 
     def _observe(self, observation: Any, info: dict[str, Any], *, over: bool) -> None:
         """Take the masks of the next action. Raise _ProblemError if the run could not use the observation or them."""
+        self._texts.add(observation)
         try:
             self._masks = self._transforms.observe_one(observation, info.get(MASK_KEY), needed=not over).masks
         except ValueError as error:

@@ -1,6 +1,8 @@
 """What a check of an environment found, and what follows from it for a run."""
 
-from daedalus.protocol.spaces import Spaces
+from pydantic import Field
+
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.specification import Specification
 
@@ -12,6 +14,7 @@ class EnvironmentReport(Specification):
     """Result of a check. It crosses a pipe as JSON."""
 
     spaces: Spaces | None = None  # as a run has them; None if the environment cannot be made or is not supported
+    constant_texts: dict[str, str] = Field(default_factory=dict)  # components left out, and their content
     problems: tuple[str, ...] = ()  # training would fail
     warnings: tuple[str, ...] = ()  # training would run, perhaps not as intended
     notes: tuple[str, ...] = ()  # advice of gymnasium's own checker
@@ -22,6 +25,15 @@ class EnvironmentReport(Specification):
     time_limit: int | None = None  # at which gymnasium truncates episodes
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
+
+    def text_problem(self, spec: RunSpec) -> str:
+        """Return the problem of a run whose settings do not leave out a text, or an empty string."""
+        for name in self.constant_texts:
+            return (
+                f"environment {spec.environment.id}: observation component {name!r} is a text, which the policy cannot "
+                f"read: --set \"environment.leave_out=['{name}']\", or make numbers of it with --wrap MODULE:FUNCTION"
+            )
+        return ""
 
 
 def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str:
@@ -41,6 +53,21 @@ def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str
         f"a step takes {_duration(report.step_seconds)}, and an actor steps its {environments} environments in turn: "
         f"{_duration(row)} a row, {_duration(first)} a rollout; use --set environment.processes=true"
     )
+
+
+def float_images(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if an array of floats has the shape of an image, else an empty string."""
+    if report.spaces is None or spec.policy.encoder != "auto":
+        return ""
+    for name, space in report.spaces.observations.items():
+        if not isinstance(space, ArraySpace) or space.dtype != "float32" or len(space.shape) != 3:
+            continue
+        if space.model_copy(update={"dtype": "uint8"}).is_image:
+            return (
+                f"{name!r} is a {space}, which goes through a multilayer perceptron: if it is an image, "
+                "return bytes from 0 to 255 (Box of uint8), which get convolutions"
+            )
+    return ""
 
 
 def never_ends(report: EnvironmentReport, spec: RunSpec) -> str:

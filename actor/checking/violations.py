@@ -10,6 +10,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from daedalus.protocol.spaces import LARGEST_OBSERVATION
+
 Violation = tuple[str, str]  # "problem" or "warning", and the text
 
 
@@ -58,6 +60,10 @@ def _array_violations(space: gymnasium.spaces.Box, value: Any, what: str, where:
     elif array.dtype.kind == "f" and not np.isfinite(array).all():
         index = _first(~np.isfinite(array))
         yield "problem", f"{what} with the value {array[index]} at index {_index(index)}: it must be finite"
+    elif (large := np.abs(array.astype(np.float64)) > LARGEST_OBSERVATION).any():
+        index = _first(large)
+        limit = f"it must be within +-{LARGEST_OBSERVATION:g}: scale or clip it"
+        yield "problem", f"{what} with the value {array[index]:g} at index {_index(index)}: {limit}"
     elif (outside := (array < space.low) | (array > space.high)).any():
         index = _first(outside)
         bounds = f"from {space.low[index]:g} to {space.high[index]:g}"

@@ -37,6 +37,18 @@ class EpisodeCounter:
             self._returns[self._ended] = 0.0
             self._lengths[self._ended] = 0
 
+    def cut(self) -> None:
+        """Note that all episodes ended with the row that was counted last."""
+        self._finished.append((self._returns.copy(), self._lengths.copy()))
+        self.restart()
+        self._ended[:] = True
+
+    def restart(self) -> None:
+        """Forget the running episodes: others begin."""
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self._ended[:] = False
+
     def take_finished(self) -> FinishedEpisodes:
         """Return the episodes that ended since the last call."""
         finished, self._finished = self._finished, []

@@ -1,15 +1,25 @@
 """Rollouts, written row by row: actions from a policy, outcomes from the caller. No network, no threads."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from daedalus.actor.collecting.episode_counter import EpisodeCounter
 from daedalus.actor.environments.interface import Observed
 from daedalus.policy.acting.noise import draw_noise
-from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
+
+
+class RowInputs(NamedTuple):
+    """What a policy chooses one row's actions from."""
+
+    observations: dict[str, np.ndarray]  # of each component [E, *stacked_shape]
+    state: np.ndarray  # [E, S] float32, the policy's memory before the row
+    masks: dict[str, np.ndarray]  # of the masked actions [E, choices] bool
 
 
 class RolloutWriter:
@@ -76,19 +86,28 @@ class RolloutWriter:
 
     def act(self) -> dict[str, np.ndarray]:
         """Return the actions {name: [E, D]} that the policy chooses for the next row."""
-        row = self._row
-        if row == 0:
+        inputs = self.begin_row()
+        noise = draw_noise(self._runtime.noise_size, self._count, self._random)
+        choice = self._runtime.act(inputs.observations, inputs.state, noise, inputs.masks)
+        self.take_choice(choice)
+        return choice.actions
+
+    def begin_row(self) -> "RowInputs":
+        """Return what the policy chooses the next row's actions from. Call `take_choice` next, or `act` for both."""
+        if self._row == 0:
             for name, frames in self._stacks.frames.items():
                 self._frames[name][: self._depths[name]] = frames.swapaxes(0, 1)
             self._initial_state[:] = self._state
-        noise = draw_noise(self._runtime.noise_size, self._count, self._random)
-        choice = self._runtime.act(self._stacks.observations, self._state, noise, self._current_masks)
+        return RowInputs(self._stacks.observations, self._state, self._current_masks)
+
+    def take_choice(self, choice: Choice) -> None:
+        """Write what a policy chose from the inputs of this row."""
+        row = self._row
         self._log_probs[row], self._next_state = choice.log_probs, choice.state
         for name, actions in self._actions.items():
             actions[row] = choice.actions[name]
         for name, masks in self._masks.items():
             masks[row] = self._current_masks[name]
-        return choice.actions
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
@@ -106,6 +125,26 @@ class RolloutWriter:
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)
+
+    def cut(self) -> bool:
+        """End the episodes as truncated at the newest observations; return False if this rollout has no row of them.
+
+        The row that has begun is then a reset row: complete it with `record`, with the first observations of the next
+        episodes. After False call `restart`.
+        """
+        if not self._row or not self._valid[self._row - 1].all():
+            return False
+        self._truncated[self._row - 1] = True
+        self._episodes.cut()
+        return True
+
+    def restart(self, observed: Observed) -> None:
+        """Begin the row again, as the first of other episodes. See `start`."""
+        for name, frames in self._frames.items():
+            frames[self._depths[name] + self._row - 1] = observed.frames[name]
+        self._episodes.restart()
+        self._state = np.zeros_like(self._state)
+        self.start(observed)
 
     def finish(
         self, identity: RolloutIdentity, policy_version: int, episode_info: dict[str, np.ndarray] | None = None

@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import (
+    OTHER_BACKEND,
     EnvironmentSetupError,
     first_line,
     import_extra,
@@ -60,8 +61,8 @@ def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, Enviro
                 f"environment.backend=ale does not support environment.{field}: "
                 "leave it out, or use --set environment.backend=gymnasium"
             )
-    roms = import_extra("ale_py.roms", "atari", _PURPOSE)
-    vector = import_extra("ale_py.vector_env", "atari", _PURPOSE)
+    roms = import_extra("ale_py.roms", "atari", _PURPOSE, OTHER_BACKEND)
+    vector = import_extra("ale_py.vector_env", "atari", _PURPOSE, OTHER_BACKEND)
     height, width = spec.resize or _SIZE
     limit = {} if spec.max_episode_steps is None else {"max_num_frames_per_episode": spec.max_episode_steps}
     game = _game(spec.id, roms.get_all_rom_ids())

@@ -1,11 +1,9 @@
 """The environment's nested spaces as flat maps of named components, and values of one in the other. Pure functions.
 
-A component is named by the keys and indices that lead to it, joined by dots; a space that is not composite has the
-name `observation` or `action`.
+A component is a leaf of the nested space, see leaves.py.
 """
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -14,65 +12,29 @@ from gymnasium import spaces as gym
 from pydantic import ValidationError
 
 from daedalus.actor.environments.action_table import table_actions
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
+from daedalus.actor.environments.leaves import Leaf, LeftOut, leaves
 from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
 
 _UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
 _MAX_DIMENSIONS = 4
 
 
-class Leaf(NamedTuple):
-    """A space that is not composite, and where it is in the nested space."""
-
-    name: str
-    path: tuple[str | int, ...]
-    space: gymnasium.Space
-
-    def of(self, value: Any) -> np.ndarray:
-        """Return this component of a nested value; in a batch each component has the first axis E."""
-        for key in self.path:
-            value = value[key]
-        return np.asarray(value)
-
-
-def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
-    """Return all leaves of a nested space, in gymnasium's order. `whole` is the name of a space that is not composite.
-
-    Raises EnvironmentSetupError if there are none, or two get the same name.
-    """
-    found = tuple(Leaf(".".join(map(_cleaned, path)) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
-    names = [leaf.name for leaf in found]
-    if not found:
-        raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
-    if len(set(names)) < len(names):
-        raise EnvironmentSetupError(
-            f"{whole} space {described(space)} has components with like names: {', '.join(names)}"
-        )
-    return found
-
-
-def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    if isinstance(space, gym.Dict):
-        for key, part in space.spaces.items():
-            yield from _walk(part, (*path, key))
-    elif isinstance(space, gym.Tuple):
-        for index, part in enumerate(space.spaces):
-            yield from _walk(part, (*path, index))
-    else:
-        yield path, space
-
-
-def _cleaned(key: str | int) -> str:
-    return re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII)[:48]
+def is_text(space: gymnasium.Space) -> bool:
+    """Return whether the values of a space are texts: gymnasium's Text, or MiniGrid's missions."""
+    return space.dtype is not None and space.dtype.kind == "U"
 
 
 def unsupported(kind: str, leaf: Leaf) -> EnvironmentSetupError:
-    """Return the error for a leaf of a kind that has no component."""
+    """Return the error for a leaf that has no component: of another kind, or a Box without numbers or of five axes."""
     where = f" (component {leaf.name!r})" if leaf.path else ""
-    return EnvironmentSetupError(
-        f"{kind} space {described(leaf.space)}{where} is not supported: use Box, Discrete, MultiDiscrete or "
-        "MultiBinary, or a Dict or Tuple of these"
-    )
+    remedy = "use Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of these"
+    if isinstance(leaf.space, gym.Box | gym.MultiBinary):
+        axes = f"with one to {_MAX_DIMENSIONS} axes" if kind == "observation" else "of numbers"
+        remedy = f"use an array {axes} that is not empty"
+    if kind == "observation" and leaf.path:
+        remedy += f"; or leave the component out: --set \"environment.leave_out=['{leaf.name}']\""
+    return EnvironmentSetupError(f"{kind} space {described(leaf.space)}{where} is not supported: {remedy}")
 
 
 # ------------------------------------------------------------------------------------------------ observations
@@ -96,16 +58,24 @@ class ObservationComponent(NamedTuple):
         if self.first is not None:
             values = values - self.first
             if ((values < 0) | (values >= self.counts)).any():
+                where = f" in component {self.leaf.name!r}" if self.leaf.path else ""
                 raise EnvironmentSetupError(
-                    f"the environment returned an observation outside its space {described(self.leaf.space)}"
+                    f"the environment returned an observation outside its space{where}: "
+                    f"{described(values + self.first)} for {described(self.leaf.space)}"
                 )
             return values
-        return values if values.dtype in (np.uint8, np.float32) else values.astype(np.float32)
+        if values.dtype in (np.uint8, np.float32):
+            return values
+        with np.errstate(over="ignore"):  # the learner names a value that is not finite
+            return values.astype(np.float32)
 
 
 def observation_components(space: gymnasium.Space) -> tuple[ObservationComponent, ...]:
     """Return the components of an observation space. Raises EnvironmentSetupError for a space without any."""
-    return tuple(_observation(leaf) for leaf in leaves(space, "observation"))
+    kept = [leaf for leaf in leaves(space, "observation") if not isinstance(leaf.space, LeftOut)]
+    if not kept:
+        raise EnvironmentSetupError("environment.leave_out names every component of the observation: keep one")
+    return tuple(_observation(leaf) for leaf in kept)
 
 
 def _observation(leaf: Leaf) -> ObservationComponent:
@@ -138,7 +108,7 @@ class ActionComponents:
             self.spaces: dict[str, ActionSpace] = {leaf.name: self._component(leaf) for leaf in self._leaves}
         except ValidationError as error:
             raise EnvironmentSetupError(
-                f"action space {described(space)} is not supported: {error.errors()[0]['msg']}"
+                f"action space {described(space)} is not supported: {reason_of(error)}"
             ) from None
 
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
@@ -176,7 +146,7 @@ class ActionComponents:
 
 
 def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
-    return tuple(float(value) if abs(value) < _UNBOUNDED else None for value in values.ravel())
+    return tuple(float(value) if abs(value) < _UNBOUNDED else None for value in values.ravel().astype(np.float64))
 
 
 def _unscaled(values: np.ndarray, space: gym.Box) -> np.ndarray:
@@ -203,15 +173,18 @@ def _nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tup
 
 
 def batch_of_one(space: gymnasium.Space, value: Any, where: str = "the observation") -> Any:
-    """Return a value of a nested space with a first axis of 1 in each component.
+    """Return a value of a nested space with a first axis of 1 in each component; None for a part that is left out.
 
     Raises ValueError, naming the component, if it is not a finite value of the space.
     """
+    if isinstance(space, LeftOut):
+        return None
     if isinstance(space, gym.Dict):
-        missing = [key for key in space.spaces if not isinstance(value, Mapping) or key not in value]
+        parts = {key: part for key, part in space.spaces.items() if not isinstance(part, LeftOut)}
+        missing = [key for key in parts if not isinstance(value, Mapping) or key not in value]
         if missing:
-            raise ValueError(f"{where} lacks {missing[0]!r}: its space has {', '.join(map(str, space.spaces))}")
-        return {key: batch_of_one(part, value[key], f"{where}[{key!r}]") for key, part in space.spaces.items()}
+            raise ValueError(f"{where} lacks {missing[0]!r}: its space has {', '.join(map(str, parts))}")
+        return {key: batch_of_one(part, value[key], f"{where}[{key!r}]") for key, part in parts.items()}
     if isinstance(space, gym.Tuple):
         if not isinstance(value, Sequence) or len(value) != len(space.spaces):
             raise ValueError(f"{where} must be a tuple of {len(space.spaces)} components")

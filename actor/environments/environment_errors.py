@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from types import ModuleType
 
 import gymnasium
+from pydantic import ValidationError
 
+OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
 _MOST_CHARACTERS = 160  # of a space in a message
 
 
@@ -21,6 +23,14 @@ def first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
 
 
+def reason_of(error: ValidationError) -> str:
+    """Return why a space is not supported, in words."""
+    first = error.errors()[0]
+    if first["type"] == "less_than_equal":  # the count of a discrete variable
+        return f"{first['input']:,} choices of one variable: use at most {first.get('ctx', {}).get('le'):,}"
+    return first["msg"].removeprefix("Value error, ")
+
+
 def unknown_environment(name: str, known: Collection[str], otherwise: str) -> EnvironmentSetupError:
     """Return an error that suggests the known names closest to `name`, or says `otherwise` if none is close."""
     near = difflib.get_close_matches(name, known, 3, 0.5)
@@ -28,14 +38,23 @@ def unknown_environment(name: str, known: Collection[str], otherwise: str) -> En
     return EnvironmentSetupError(f"unknown environment {name!r}: {hint}")
 
 
-def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import a package that comes with one of our extras. Raises EnvironmentSetupError if it is not installed."""
+def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> ModuleType:
+    """Import a package that comes with one of our extras.
+
+    Args:
+      module: its name.
+      extra: name of the extra.
+      purpose: what needs the package.
+      otherwise: what else the user can do.
+
+    Raises EnvironmentSetupError if the package is not installed.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise EnvironmentSetupError(
-            f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]", '
-            "or use another backend (--set environment.backend=gymnasium)"
+            f'{purpose} needs a package that is not installed ({error}): pip install "daedalus-rl[{extra}]"'
+            f"{', ' if otherwise else ''}{otherwise}"
         ) from None
 
 
@@ -47,8 +66,8 @@ def creation_errors(environment: str) -> Iterator[None]:
     except EnvironmentSetupError:
         raise
     except gymnasium.error.DependencyNotInstalled as error:
-        box2d = "box2d" in str(error).lower()
-        remedy = 'pip install "daedalus-rl[box2d]"' if box2d else str(error).splitlines()[0]
+        extra = next((extra for extra in ("box2d", "mujoco") if extra in str(error).lower()), None)
+        remedy = first_line(error) if extra is None else f'pip install "daedalus-rl[{extra}]"'
         raise EnvironmentSetupError(
             f"environment {environment} needs a package that is not installed: {remedy}"
         ) from None

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
+from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
@@ -17,12 +18,15 @@ class EnvironmentProcesses(AsyncVectorEnv):
     _idle = False  # no call is in progress, so the processes can be asked to end
 
     def __init__(self, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
+        # Zenoh does not work after a fork.
+        options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
         with _interrupts_blocked():
-            super().__init__(
-                makers,
-                context="spawn",  # Zenoh does not work after a fork
-                autoreset_mode=AutoresetMode.NEXT_STEP,
-            )
+            try:
+                super().__init__(makers, **options)
+            except ValueError as error:
+                if not isinstance(error.__cause__, CustomSpaceError):
+                    raise
+                super().__init__(makers, **options, shared_memory=False)  # such as a text of a class of its own
         self._idle = True
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import (
+    OTHER_BACKEND,
     EnvironmentSetupError,
     first_line,
     import_extra,
@@ -119,7 +120,7 @@ def make_envpool(spec: EnvironmentSpec, count: int) -> tuple[EnvpoolEnvironments
     Raises EnvironmentSetupError; its message is one line.
     """
     with _no_warnings():
-        envpool = import_extra("envpool", "envpool", "environment.backend=envpool")
+        envpool = import_extra("envpool", "envpool", "environment.backend=envpool", OTHER_BACKEND)
     names = envpool.list_all_envs()
     if spec.id not in names:
         raise unknown_environment(spec.id, names, "envpool has none like it; use --set environment.backend=gymnasium")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
-import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
@@ -18,51 +17,14 @@ from daedalus.actor.environments.environment_errors import (
     unknown_environment,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.episode_info import EpisodeInfo
-from daedalus.actor.environments.interface import BackendStep
-from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
+# Packages that register environments when they are imported: beginning of the id -> module and extra.
+_PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
-
-
-class GymnasiumEnvironments:
-    """A BackendEnvironments over a gymnasium vector environment."""
-
-    def __init__(self, environment: Any) -> None:
-        """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them."""
-        self._environment = environment
-        self.count: int = environment.num_envs
-        self.observation_space: gymnasium.Space = environment.single_observation_space
-        self.action_space: gymnasium.Space = environment.single_action_space
-        self._episode_info = EpisodeInfo()
-        self.action_mask: Any = None
-        if not isinstance(self.action_space, gymnasium.spaces.Box):
-            self.reset(0)
-
-    def reset(self, seed: int) -> Any:
-        """See BackendEnvironments."""
-        observations, info = self._environment.reset(seed=seed)
-        self.action_mask = info.get(MASK_KEY)
-        return observations
-
-    def step(self, actions: Any) -> BackendStep:
-        """See BackendEnvironments."""
-        observations, rewards, terminated, truncated, info = self._environment.step(actions)
-        self.action_mask = info.get(MASK_KEY)
-        if info:
-            self._episode_info.add(info, terminated | truncated)
-        return observations, rewards, terminated, truncated
-
-    def take_episode_info(self) -> dict[str, np.ndarray]:
-        """See BackendEnvironments."""
-        return self._episode_info.take()
-
-    def close(self) -> None:
-        """See BackendEnvironments."""
-        self._environment.close()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,8 +139,10 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
             modules.load("environment.id", environment_id)
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from error
-    elif name.startswith("ALE/"):
-        gymnasium.register_envs(import_extra("ale_py", "atari", f"environment {name}"))  # importing it registers them
+    else:
+        for beginning, (module, extra) in _PACKAGES.items():
+            if name.startswith(beginning):
+                gymnasium.register_envs(import_extra(module, extra, f"environment {name}"))
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:

@@ -1,6 +1,7 @@
 """Which discrete actions are legal, as environments say it by the conventions that exist.
 
-- `info["action_mask"]` (gymnasium): an array over all choices, or a map of them by action component;
+- `info["action_mask"]` (gymnasium): an array over all choices, a list or tuple of arrays whose choices together are
+  these (as `sample(mask)` of gymnasium's spaces takes it), or a map of them by action component;
 - `action_masks()` of the environment (stable-baselines3's contributors), which the gymnasium backend puts into `info`;
 - an observation component named `action_mask` (PettingZoo), which the policy then does not observe.
 """
@@ -42,17 +43,24 @@ class Masks:
         return {name: self._checked(name, given.get(name), needed) for name in self._names}
 
     def _by_component(self, action_mask: Any) -> dict[str, np.ndarray]:
-        """Return masks {name: [E, choices]} bool from a map by component, or one array for the only discrete one."""
+        """Return masks {name: [E, choices]} bool from a map by component, or one array over all their choices."""
         if isinstance(action_mask, dict):
-            parts = {str(name): np.asarray(mask) for name, mask in action_mask.items() if str(name)[:1] != "_"}
+            parts = {str(name): _array(mask) for name, mask in action_mask.items() if str(name)[:1] != "_"}
         elif len(self._spaces) == 1:
-            parts = {next(iter(self._spaces)): np.asarray(action_mask)}
+            parts = {next(iter(self._spaces)): _array(action_mask)}
         else:
-            raise EnvironmentSetupError(
-                f"the {MASK_KEY} is one array, but the action has {len(self._spaces)} discrete components: "
-                "give a map of one mask for each"
-            )
+            parts = self._split(_array(action_mask))
         return {name: _flags(name, mask, self._spaces.get(name)) for name, mask in parts.items()}
+
+    def _split(self, masks: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the parts of one array over the choices of several components, or of none."""
+        sizes = [space.choices for space in self._spaces.values()]
+        if masks.ndim != 2 or masks.shape[1] != sum(sizes):
+            raise EnvironmentSetupError(
+                f"the {MASK_KEY} has shape {masks.shape[1:]}, but the discrete components of the action have "
+                f"{' + '.join(map(str, sizes)) or 'no'} choices: give a map of one mask for each"
+            )
+        return dict(zip(self._spaces, np.split(masks, np.cumsum(sizes)[:-1], axis=1), strict=True))
 
     def _checked(self, name: str, mask: np.ndarray | None, needed: np.ndarray) -> np.ndarray:
         if mask is None:
@@ -96,6 +104,25 @@ def _flags(name: str, mask: np.ndarray, space: DiscreteSpace | None) -> np.ndarr
     return flat.astype(np.bool_)
 
 
+def _array(masks: Any) -> np.ndarray:
+    """Return a batch of masks as one array [E, ...]. gymnasium batches lists and tuples as objects."""
+    array = masks if isinstance(masks, np.ndarray) else np.asarray(masks)
+    if array.dtype != np.object_:
+        return array
+    rows = [_joined(mask) for mask in array]
+    if len({len(row) for row in rows}) != 1:
+        raise EnvironmentSetupError(f"the {MASK_KEY} differs in size between environments: give it in every step")
+    return np.stack(rows)
+
+
+def _joined(mask: Any) -> np.ndarray:
+    """Return one mask [choices] for an array, or for lists and tuples of arrays, nested in any way."""
+    if isinstance(mask, list | tuple):
+        parts = [_joined(part) for part in mask if part is not None]  # None stands for a component without choices
+        return np.concatenate(parts) if parts else np.zeros(0, np.bool_)
+    return np.asarray(mask).ravel()
+
+
 def only_of_masks(action_mask: Any) -> Any:
     """Return the only mask, or map of masks, of a batch of one."""
     if isinstance(action_mask, dict):
@@ -106,5 +133,5 @@ def only_of_masks(action_mask: Any) -> Any:
 def mask_of_one(action_mask: Any) -> Any:
     """Return a mask, or a map of masks, with a first axis of 1."""
     if isinstance(action_mask, dict):
-        return {name: np.asarray(mask)[None] for name, mask in action_mask.items()}
-    return np.asarray(action_mask)[None]
+        return {name: _joined(mask)[None] for name, mask in action_mask.items()}
+    return _joined(action_mask)[None]

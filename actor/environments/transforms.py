@@ -13,8 +13,9 @@ from daedalus.actor.environments.components import (
     observation_components,
     only_of_batch,
 )
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
+from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -45,6 +46,7 @@ class Transforms:
 
         Raises EnvironmentSetupError if the specification does not fit the spaces.
         """
+        observation_space = without(observation_space, spec.leave_out)
         self._observation_space, self._action_space = observation_space, action_space
         self._actions = ActionComponents(spec.action_table, action_space)
         components = observation_components(observation_space)
@@ -65,8 +67,13 @@ class Transforms:
         except ValidationError as error:
             raise EnvironmentSetupError(
                 f"observation space {described(observation_space)} with action space {described(action_space)} is not "
-                f"supported: {error.errors()[0]['msg']}"
+                f"supported: {reason_of(error)}"
             ) from None
+
+    @property
+    def needs_mask(self) -> bool:
+        """Whether `observe` needs an action mask: the actions have masks, and the observation does not contain them."""
+        return bool(self.spaces.masks) and self._mask_source is None
 
     def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
         """Return batched observations of the environment as the run has them.

@@ -100,19 +100,21 @@ class Evaluator:
         runtime = OnnxRuntime(program[1], self._stop)
         runtime.load(snapshot.weights)
         wanted = welcome.spec.evaluation
+        sampled = wanted.actions == "sampled"
         evaluation = play_episodes(
             runtime,
             environments,
             wanted.episodes,
             seed,
-            sampled=wanted.actions == "sampled",
+            sampled=sampled,
             longest=wanted.max_episode_env_steps,
             progress=self._raise_if_ended,
         )
         _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
         if evaluation.cut.any() and not self._warned_of_cuts:
             self._warned_of_cuts = True
-            _logger.warning("%s", cut_note(int(evaluation.cut.sum()), wanted.episodes, wanted.max_episode_env_steps))
+            cut, longest = int(evaluation.cut.sum()), wanted.max_episode_env_steps
+            _logger.warning("%s", cut_note(cut, wanted.episodes, longest, sampled=sampled))
         self._queries.report_evaluation(
             welcome.run,
             EvaluationReport(

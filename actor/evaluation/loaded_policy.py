@@ -64,15 +64,29 @@ class Policy:
         Args:
           observation: one observation, of the environment's own shape and dtype.
           sampled: sample from the policy's distribution, as training does.
-          action_mask: the legal choices, if the environment has masks: an array, or a map of arrays by component.
+          action_mask: the legal choices, if the policy was trained with masks that are not part of the observation: as
+            the environment's info["action_mask"] or action_masks() has them.
 
-        Raises ValueError for an observation that is not of the space.
+        Raises ValueError for an observation that is not of the space, and for a mask that is missing or does not fit.
         """
+        self._check_mask(action_mask)
         if self._repeats_left == 0:
             self._action = self._choose(self._transforms.observe_one(observation, action_mask), sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
         return copy.deepcopy(self._action)
+
+    def _check_mask(self, action_mask: Any) -> None:
+        if action_mask is None and self._transforms.needs_mask:
+            raise ValueError(
+                "this policy was trained with masks of legal actions: call act(observation, action_mask=MASK), with "
+                "info['action_mask'] or action_masks() of the environment"
+            )
+        if action_mask is not None and not self._transforms.spaces.masks:
+            raise ValueError(
+                "this policy was trained without masks and may choose illegal actions: call act(observation) without "
+                "action_mask, or train it on an environment that gives masks"
+            )
 
     def _choose(self, observed: Observed, sampled: bool) -> Any:
         self._stacks.push(observed.frames, np.array([self._action is None]))

@@ -1,4 +1,4 @@
-"""`daedalus certs`: create a private CA, and certificates for routers, learners, actors and operators."""
+"""`daedalus certs`: create a private CA, certificates for its processes, and tokens for clients of a gateway."""
 
 import argparse
 import datetime
@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import command_parser
+from daedalus.cli.client_tokens import ClientTokens
 from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
 
 if TYPE_CHECKING:
     from daedalus.cli.certificate_folder import CertificateFolder, Identity
 
 _DAYS = 825
-_LISTENERS, _NAMED = ("learner", "router"), ("actor", "operator")
+_LISTENERS, _NAMED = ("learner", "router", "gateway"), ("actor", "operator", "client")
 
 _DESCRIPTION = """\
 Creates certificates, so that only authorised actors can join a run, over encrypted connections. The folder ca/ holds
@@ -30,11 +31,14 @@ examples:
   daedalus certs list
   daedalus certs renew                    (all that expire within {WARNING_DAYS} days)
   daedalus certs revoke actor arm-1
+  daedalus certs issue gateway --host play.example
+  daedalus certs issue client phone-1     (a token for a client of the gateway)
 
 The certificate of an actor allows it to play under its name NAME or NAME.ANYTHING. The certificate of an operator
 allows `daedalus status` and `daedalus exporter`. Learners and routers notice within seconds that a file in their folder
 has changed: after `issue` and `revoke`, copy {CLIENTS} to their folders if they run elsewhere. Nothing has to be
-restarted. A renewed certificate is used from the next connection on.
+restarted. A renewed certificate is used from the next connection on. A client of a gateway has a token in place of a
+certificate, valid for its name NAME and for NAME.ANYTHING; copy gateway/tokens.json if the gateway runs elsewhere.
 
 exit status: 0 done, 1 failed, 2 bad usage"""
 
@@ -46,18 +50,18 @@ def parser() -> argparse.ArgumentParser:
     init = verbs.add_parser("init", help="create a CA, and certificates for the learner, a router and one operator")
     init.add_argument("directory", type=Path, metavar="DIR", help="a new or empty folder")
     _add_host(init)
-    issue = verbs.add_parser("issue", help="create certificates for actors and operators, or new ones in their place")
+    issue = verbs.add_parser("issue", help="create certificates or tokens, or new ones in their place")
     issue.add_argument("role", choices=(*_NAMED, *_LISTENERS), help="kind of process that uses the certificate")
-    issue.add_argument("names", nargs="*", metavar="NAME", help="name of an actor or operator")
+    issue.add_argument("names", nargs="*", metavar="NAME", help="name of an actor, operator or client")
     _add_host(issue)
     renew = verbs.add_parser("renew", help="create new certificates in place of those that expire soon")
     renew.add_argument(
         "role", nargs="?", choices=(*_NAMED, *_LISTENERS), help="kind of process whose certificate is renewed now"
     )
-    renew.add_argument("names", nargs="*", metavar="NAME", help="name of an actor or operator (default: all)")
-    revoke = verbs.add_parser("revoke", help="withdraw the authorisation of actors and operators")
+    renew.add_argument("names", nargs="*", metavar="NAME", help="name of an actor, operator or client (default: all)")
+    revoke = verbs.add_parser("revoke", help="withdraw the authorisation of actors, operators and clients")
     revoke.add_argument("role", choices=_NAMED, help="kind of process that used the certificate")
-    revoke.add_argument("names", nargs="+", metavar="NAME", help="name of an actor or operator")
+    revoke.add_argument("names", nargs="+", metavar="NAME", help="name of an actor, operator or client")
     listed = verbs.add_parser("list", help="show all certificates and when they expire")
     for verb in (init, issue, renew):
         verb.add_argument(
@@ -130,12 +134,27 @@ def _init(parsed: argparse.Namespace) -> list[str]:
 
 
 def _issue(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    if parsed.role == "client":
+        return _issue_tokens(folder, [identity.name for identity in _named(parsed)], parsed.days)
     identities = _named(parsed)
     folder.issue(identities, _lifetime(parsed), parsed.host)
+    ClientTokens(folder.directory).copy_to_gateway()
     return _issued(folder, identities)
 
 
+def _issue_tokens(folder: "CertificateFolder", names: list[str], days: int) -> list[str]:
+    ClientTokens(folder.directory).issue(names, days)
+    lines = [f"{folder.directory}/client-{name}/token    give this token to the client" for name in names]
+    return [*lines, f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"]
+
+
 def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    if parsed.role == "client":
+        tokens = ClientTokens(folder.directory).days_left()
+        unknown = [name for name in parsed.names if name not in tokens]
+        if unknown:
+            raise CredentialsError(f"no token was issued for {', '.join(unknown)}: see `daedalus certs list`")
+        return _issue_tokens(folder, parsed.names or list(tokens), parsed.days)
     known = folder.identities()
     if parsed.role is None:
         identities = [identity for identity, issued in known.items() if issued.days_left < WARNING_DAYS]
@@ -153,6 +172,9 @@ def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
 
 
 def _revoke(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    if parsed.role == "client":
+        ClientTokens(folder.directory).revoke(parsed.names)
+        return [f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"]
     folder.revoke(_named(parsed))
     return [_copy_clients(folder)]
 
@@ -161,9 +183,14 @@ def _list(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
     lines = [f"{'certificate':<24} {'expires':<10} {'days':>5}"]
     for identity, issued in sorted(folder.identities().items(), key=lambda each: each[1].expires):
         days = issued.days_left
-        state = "  EXPIRED" if days < 0 else "  renew it soon" if days < WARNING_DAYS else ""
-        lines.append(f"{identity.folder:<24} {issued.expires:%Y-%m-%d} {math.floor(days):>5}{state}")
+        lines.append(f"{identity.folder:<24} {issued.expires:%Y-%m-%d} {math.floor(days):>5}{_state(days)}")
+    for name, days in sorted(ClientTokens(folder.directory).days_left().items(), key=lambda each: each[1]):
+        lines.append(f"{'client-' + name:<24} {'token':<10} {math.floor(days):>5}{_state(days)}")
     return lines
+
+
+def _state(days: float) -> str:
+    return "  EXPIRED" if days < 0 else "  renew it soon" if days < WARNING_DAYS else ""
 
 
 def _named(parsed: argparse.Namespace) -> "list[Identity]":

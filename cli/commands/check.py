@@ -8,7 +8,7 @@ from contextlib import redirect_stdout
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
@@ -74,13 +74,13 @@ def _checked(spec: RunSpec, parsed: argparse.Namespace) -> list[tuple[str, str]]
     seed = spec.training.seed
     report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
     notes = () if report.problems else gymnasium_notes(environment, modules)
-    spaces = report.spaces
+    chosen = report
     if parsed.env is not None:
-        spec = resolve_spec(parsed, default_settings(spaces))
+        spec = resolve_spec(parsed, default_settings(report.spaces, [*environment.leave_out, *report.constant_texts]))
         if spec.environment != environment:
-            spaces = check_environment(spec.environment, modules, seconds=0.0, env_steps=0).spaces
-    network, fault = _network(spec, spaces, modules)
-    problems = [*report.problems, *([fault] if fault else [])]
+            chosen = check_environment(spec.environment, modules, seconds=0.0, env_steps=0)
+    network, fault = _network(spec, chosen.spaces, modules)
+    problems = [*report.problems, *filter(None, (chosen.text_problem(spec), fault))]
     return [
         *_description(spec, report),
         *_choices(spec, network),
@@ -95,6 +95,8 @@ def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str
     yield "environment", f"{environment.id} of {environment.backend}"
     if report.spaces is not None:
         yield "spaces", str(report.spaces)
+    for name, text in report.constant_texts.items():
+        yield "left out", f"observation component {name!r}: it is always {text!r} (environment.leave_out)"
     if report.lengths:
         lengths, returns = np.array(report.lengths), np.array(report.returns)
         yield (
@@ -125,7 +127,8 @@ def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
 def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     if report.problems:
         return []
-    return [text for text in (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1)) if text]
+    advice = (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec))
+    return [text for text in advice if text]
 
 
 def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:

@@ -28,6 +28,7 @@ _PARSERS = {
     "router": ("commands.router", "parser"),
     "status": ("commands.status", "parser"),
     "drain": ("commands.drain", "parser"),
+    "gateway": ("commands.gateway", "parser"),
     "bridge": ("commands.bridge", "parser"),
     "exporter": ("commands.exporter", "parser"),
     "certs": ("commands.certs", "parser"),

@@ -108,7 +108,8 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
             filmed = {"video": str(arguments.video), "video_seconds": video.frames / video.frames_per_second}
     finally:
         progress.end()
-    return {**_result(policy, spec, evaluation), "seed": seed, "actions": _actions(policy, arguments), **filmed}
+    actions = _actions(policy, arguments)
+    return {**_result(policy, spec, evaluation, actions), "seed": seed, "actions": actions, **filmed}
 
 
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
@@ -186,8 +187,9 @@ def _actions(policy: SavedPolicy, arguments: argparse.Namespace) -> str:
     return arguments.actions or policy.spec.evaluation.actions
 
 
-def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) -> dict[str, Any]:
+def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation, actions: str) -> dict[str, Any]:
     returns = evaluation.returns.astype(np.float64)
+    note = _note(evaluation, policy.spec.evaluation.max_episode_env_steps, sampled=actions == "sampled")
     return {
         "environment": spec.id,
         "backend": spec.backend,
@@ -195,7 +197,7 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
         "best_checkpoint": is_best(policy.directory),
         "policy_version": policy.policy_version,
         "episodes": len(returns),
-        "notes": [note] if (note := _note(evaluation, policy.spec.evaluation.max_episode_env_steps)) else [],
+        "notes": [note] if note else [],
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "return_min": float(returns.min()),
@@ -206,11 +208,11 @@ def _result(policy: SavedPolicy, spec: EnvironmentSpec, evaluation: Evaluation) 
     }
 
 
-def _note(evaluation: Evaluation, longest: int) -> str:
+def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
     """Return a message about episodes that were cut, or an empty string."""
     cut = int((evaluation.cut & (evaluation.lengths == longest)).sum())
     if cut:
-        return cut_note(cut, len(evaluation.cut), longest)
+        return cut_note(cut, len(evaluation.cut), longest, sampled=sampled)
     return "the last episode was cut at the end of the video" if evaluation.cut.any() else ""
 
 

@@ -28,7 +28,7 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
-from daedalus.cli.quick_check import expected_spaces
+from daedalus.cli.quick_check import expected_defaults, expected_spaces
 from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser, resolve
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
@@ -36,7 +36,6 @@ from daedalus.learner.reporting.recorder import OpenWriter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
-from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_lock import RunLock
@@ -138,11 +137,13 @@ def _serve(
     restored = _newest_checkpoint(run.directory) if resumed else None
     spaces = arguments.spaces
     if restored is None and arguments.prepared is None:
-        spaces = expected_spaces(run.spec, run.modules, stop)
-        if arguments.env is not None and not run.exists and spaces is not None:
-            chosen, directory = resolve(arguments, default_settings(spaces))
+        if arguments.env is None or run.exists:
+            spaces = expected_spaces(run.spec, run.modules, stop)
+        else:
+            spaces, defaults = expected_defaults(run.spec, run.modules, stop)
+            chosen, directory = resolve(arguments, defaults)
             chosen = with_record(chosen, run.modules)
-            if chosen.environment != run.spec.environment:
+            if spaces is not None and chosen.environment != run.spec.environment:
                 spaces = expected_spaces(chosen, run.modules, stop)
             run = replace(run, spec=chosen, directory=directory)
     initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None

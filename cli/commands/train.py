@@ -12,12 +12,11 @@ from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, ru
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import process_started, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces, transformed_spaces
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.run_report import report
 from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
-from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.finished import FinishedRun, finished_run
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
@@ -80,9 +79,11 @@ def train(arguments: list[str]) -> int:
         spec, directory = resolve(parsed)
         if parsed.run_dir is not None:
             run_directory.check_free(directory)  # before the environment is made
-        spaces = checked_spaces(spec, fork=True)
-        if parsed.env is not None:
-            chosen, directory = resolve(parsed, default_settings(spaces))
+        if parsed.env is None:
+            spaces = checked_spaces(spec, fork=True)
+        else:
+            spaces, defaults = checked_defaults(spec, fork=True)
+            chosen, directory = resolve(parsed, defaults)
             spaces = transformed_spaces(chosen, spec, spaces, fork=True)
             spec = chosen
         spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))

@@ -8,7 +8,19 @@ import os
 from typing import Any
 from unittest.mock import patch
 
-from daedalus.cli.commands import bridge, certs, check, completion, drain, exporter, plot, router, status, train
+from daedalus.cli.commands import (
+    bridge,
+    certs,
+    check,
+    completion,
+    drain,
+    exporter,
+    gateway,
+    plot,
+    router,
+    status,
+    train,
+)
 from daedalus.cli.commands.actor_arguments import parser as actor_parser
 from daedalus.cli.commands.evaluate_arguments import parser as evaluate_parser
 from daedalus.cli.settings_arguments import learner_parser
@@ -27,6 +39,7 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
         "router": router.parser(),
         "status": status.parser(),
         "drain": drain.parser(),
+        "gateway": gateway.parser(),
         "bridge": bridge.parser(),
         "exporter": exporter.parser(),
         "certs": certs.parser(),

@@ -3,8 +3,8 @@
 import { hostname } from "node:os";
 import { setTimeout as sleep } from "node:timers/promises";
 import { Bridge, BridgeError } from "./bridge.ts";
-import { ID, SPACES, VectorCartPole } from "./cartpole.ts";
 import { Collector } from "./collector.ts";
+import { type Kind, kindOf, KINDS } from "./environments.ts";
 import * as link from "./link.ts";
 import { LearnerLostError, NameTakenError, RunOverError, RefusedError } from "./link.ts";
 import { Policy } from "./policy.ts";
@@ -88,7 +88,7 @@ export class Actor {
       const inquiry = { ...known, spaces: null, environments: 0 };
       const { run, spec, learner_epoch } = await link.join(bridge, this.#run, inquiry);
       this.#run = run;
-      checkSupported(spec.environment, spec.collection.upload);
+      const kind = supported(spec.environment, spec.collection.upload);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
         this.#publishedVersion = 0;
@@ -100,12 +100,12 @@ export class Actor {
       });
       bridge.announce(`daedalus/${run}/actors/${name}/${incarnation}`);
       const environments = this.#config.environments ?? spec.collection.envs_per_actor;
-      const welcome = await link.join(bridge, run, { ...known, spaces: SPACES, environments });
+      const welcome = await link.join(bridge, run, { ...known, spaces: kind.spaces, environments });
       if (welcome.learner_epoch !== learner_epoch) throw new LearnerLostError("the learner was restarted");
       this.#heardAt = performance.now();
       onJoined();
-      this.#log(`joined run '${run}' as '${name}': ${environments} x ${ID}`);
-      return await this.#collect(bridge, welcome, environments);
+      this.#log(`joined run '${run}' as '${name}': ${environments} x ${spec.environment.id}`);
+      return await this.#collect(bridge, welcome, kind, environments);
     } finally {
       bridge.close();
     }
@@ -114,7 +114,7 @@ export class Actor {
   // ----------------------------------------------------------------------------------------- collecting
 
   /** Collect and upload until an error ends the session. */
-  async #collect(bridge: Bridge, welcome: link.Welcome, environments: number): Promise<never> {
+  async #collect(bridge: Bridge, welcome: link.Welcome, kind: Kind, environments: number): Promise<never> {
     const { run, spec, seed, learner_epoch } = welcome;
     const uploader = this.#uploader;
     // The same learner epoch was joined again: send the rollouts without a final acknowledgement once more.
@@ -124,8 +124,9 @@ export class Actor {
     const hash = String(this.#snapshot!.fields.program);
     const policy = await Policy.load(await link.program(bridge, run, hash), hash);
     const random = seeded(seed);
-    const vector = new VectorCartPole(environments, random, spec.environment.max_episode_steps ?? undefined);
-    const collector = new Collector(vector, policy, spec.environment, spec.collection.rollout_length, random);
+    const vector = kind.make(environments, random, spec.environment.max_episode_steps ?? undefined);
+    const { rollout_length } = spec.collection;
+    const collector = new Collector(vector, kind.spaces, policy, spec.environment, rollout_length, random);
     // A synchronous algorithm uses one rollout of each policy version.
     const synchronous = spec.training.algorithm === "a2c" || spec.training.algorithm_record?.synchronous === true;
     for (let loaded = -1; ; ) {
@@ -245,22 +246,25 @@ export class Actor {
   }
 }
 
-/** Throw RefusedError unless the run requires CartPole without kwargs and transforms: this actor has none. */
-function checkSupported(spec: link.EnvironmentSpec, upload: string): void {
-  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, crop, grey, resize, frame_stack } = spec;
+/** Return the environment of a run. Throw RefusedError for another one, kwargs and transforms: this actor has none. */
+function supported(spec: link.EnvironmentSpec, upload: string): Kind {
+  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, leave_out } = spec;
+  const { crop, grey, resize, frame_stack } = spec;
+  const kind = kindOf(id);
   const settings = {
-    id: id !== ID,
+    id: kind === undefined,
     kwargs: Object.keys(kwargs).length > 0,
     action_repeat: action_repeat !== 1,
+    leave_out: leave_out.length > 0,
     frame_stack: frame_stack !== 1,
     ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
   if (upload !== "rollouts") unsupported.push("collection.upload");
-  if (unsupported.length === 0) return;
+  if (kind !== undefined && unsupported.length === 0) return kind;
   throw new RefusedError(
     `the run's environment ${id} has unsupported settings (${unsupported.join(", ")}): ` +
-      `this actor supports only ${ID} without kwargs and transforms; use a Python actor`,
+      `this actor supports only ${Object.keys(KINDS).join(", ")}, without kwargs and transforms; use a Python actor`,
   );
 }
 

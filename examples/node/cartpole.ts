@@ -3,10 +3,12 @@
  * constants, limits and rewards of gymnasium's CartPole-v1.
  */
 
-export const ID = "CartPole-v1";
+import type { Spaces, Step, VectorEnvironment } from "./environment.ts";
+import type { Choice, Components } from "./policy.ts";
+
 export const OBSERVATION = "observation"; // the name of the only component of an observation
 export const ACTION = "action"; // the name of the only component of an action
-export const SPACES = {
+export const SPACES: Spaces = {
   observations: { [OBSERVATION]: { kind: "array", shape: [4], dtype: "float32", frames: 1 } },
   actions: { [ACTION]: { kind: "discrete", counts: [2], masked: false } },
 };
@@ -22,19 +24,10 @@ const MAX_ANGLE = (12 * 2 * Math.PI) / 360; // 12 degrees, in radians
 const MAX_POSITION = 2.4;
 const MAX_STEPS = 500;
 
-/** Outcome of one step of E environments. */
-export interface Step {
-  rewards: Float32Array; // [E]
-  terminated: Uint8Array; // [E]
-  truncated: Uint8Array; // [E]
-}
-
-/**
- * E environments, reset by gymnasium's NEXT_STEP rule: the step after the end of an episode ignores its action and only
- * resets.
- */
-export class VectorCartPole {
-  readonly count: number; // E
+/** E environments with one component in observations and actions. */
+export class VectorCartPole implements VectorEnvironment {
+  readonly masks: Components = {};
+  readonly count: number;
   readonly #random: () => number; // uniform in [0, 1)
   readonly #maxSteps: number; // of an episode
   readonly #state: Float64Array; // [E, 4]
@@ -51,13 +44,12 @@ export class VectorCartPole {
     for (let e = 0; e < count; e++) this.#reset(e);
   }
 
-  /** The current observations [E, 4]. */
-  get observations(): Float32Array {
-    return Float32Array.from(this.#state);
+  get observations(): Components {
+    return { [OBSERVATION]: { dtype: "<f4", shape: [this.count, SIZE], data: Float32Array.from(this.#state) } };
   }
 
-  /** Step every environment with its action [E]: 1 pushes right, any other left. */
-  step(actions: ArrayLike<number>): Step {
+  /** Step every environment with its action: 1 pushes right, any other left. */
+  step({ [ACTION]: actions }: Choice["actions"]): Step {
     const step = {
       rewards: new Float32Array(this.count),
       terminated: new Uint8Array(this.count),

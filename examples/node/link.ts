@@ -12,6 +12,7 @@ export interface EnvironmentSpec {
   action_table: unknown;
   action_repeat: number;
   no_reward_limit: number | null;
+  leave_out: string[];
   crop: unknown;
   grey: boolean;
   resize: unknown;

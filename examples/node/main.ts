@@ -10,7 +10,7 @@ import { ProtocolError } from "./wire.ts";
 const USAGE = `\
 usage: node main.ts [--bridge HOST:PORT] [--run NAME] [--name NAME] [--envs E]
 
-Collect rollouts of CartPole for a learner, through \`daedalus bridge\`.
+Collect rollouts for a learner, through \`daedalus bridge\`.
 
   --bridge HOST:PORT  address of the bridge (default: 127.0.0.1:7448)
   --run NAME          the run to join; required if several learners share a network

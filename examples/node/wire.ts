@@ -53,6 +53,11 @@ export class ProtocolError extends Error {}
 /** The other end uses another version of the protocol. */
 export class VersionMismatchError extends ProtocolError {}
 
+/** Return an array of zeros. */
+export function zeros(dtype: Dtype, shape: number[]): WireArray {
+  return { dtype, shape, data: new TYPES[dtype](shape.reduce((product, side) => product * side, 1)) };
+}
+
 /** Encode a message. */
 export function encode(message: Message): Buffer {
   const arrays = Object.entries(message.arrays);

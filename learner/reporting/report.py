@@ -14,7 +14,8 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
 _STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
-_LONG_EPISODE = 10_000  # env_steps in each environment without the end of an episode: give a hint
+# env_steps in each environment without the end of an episode after which a hint is given; the least in a small budget.
+_LONG_EPISODE, _USUAL_EPISODE = 10_000, 2_000
 _NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
 
 
@@ -103,19 +104,21 @@ class RateMeter:
 
 
 class EpisodeHint:
-    """Hint that no episode has ended after many steps, given once."""
+    """Hint that no episode has ended after many steps, or after half of a small budget; given once."""
 
-    def __init__(self) -> None:
-        self._given = False
+    def __init__(self, budget: int) -> None:
+        """`budget` is in env_steps."""
+        self._budget, self._given = budget, False
 
     def take(self, counters: RunCounters, fleet: Fleet) -> str:
         """Return the hint if it is due, else an empty string."""
-        environments = sum(fleet.actors[name].environments for name in fleet.live)
-        if self._given or counters.episodes or counters.env_steps < max(environments, 1) * _LONG_EPISODE:
+        environments = max(sum(fleet.actors[name].environments for name in fleet.live), 1)
+        length = min(_LONG_EPISODE, max(_USUAL_EPISODE, self._budget // (2 * environments)))
+        if self._given or counters.episodes or counters.env_steps < environments * length:
             return ""
         self._given = True
         return (
-            f"no episode has ended after {_LONG_EPISODE:,} env_steps in each environment: "
+            f"no episode has ended after {length:,} env_steps in each environment: "
             "if the environment never ends them, set environment.max_episode_steps"
         )
 

@@ -41,7 +41,8 @@ class RunReporter:
         self._counters, self._annealing, self._fleet, self._lock = counters, annealing, fleet, lock
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
-        self._episode_hint, self._learning_hint = EpisodeHint(), LearningHint(spec.training.env_steps)
+        self._episode_hint = EpisodeHint(spec.training.env_steps)
+        self._learning_hint = LearningHint(spec.training.env_steps)
         self._user_metrics = user_metrics
 
     def begin(self, now: float) -> None:

@@ -2,6 +2,7 @@
 
 import importlib.resources
 import tomllib
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
@@ -11,17 +12,20 @@ _UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not k
 _LARGE = 128  # pixels of the longer side
 
 
-def default_settings(spaces: Spaces | None) -> dict[str, Any]:
+def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> dict[str, Any]:
     """Return the default settings for the spaces of an environment, as a preset has them.
 
     Args:
       spaces: of the environment without transforms; None if they are not known.
+      leave_out: components of the observation that are not in `spaces`.
     """
     kind = _UNKNOWN if spaces is None else kind_of(spaces)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and not all(map(_has_colours, _images(spaces))):
         del settings["environment"]["grey"]
+    if leave_out:
+        settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be higher, and float32 hold the noise
-_LARGEST_OBSERVATION = 1e15  # beyond it squares overflow float32
 _MAX_ACTION = 1e6  # of a continuous action: beyond it squares lose all precision
 
 
@@ -47,8 +46,8 @@ def _observation_violation(rollout: Rollout, frames: np.ndarray, space: ArraySpa
     low, high = float(frames.min()), float(frames.max())  # nan if there is a nan
     if not (np.isfinite(low) and np.isfinite(high)):
         return "has a value that is not finite"
-    if max(-low, high) > _LARGEST_OBSERVATION:
-        return f"has a value beyond +-{_LARGEST_OBSERVATION:g}: scale or clip the observations"
+    if max(-low, high) > LARGEST_OBSERVATION:
+        return f"has a value beyond +-{LARGEST_OBSERVATION:g}: scale or clip the observations"
     return ""
 
 

@@ -16,7 +16,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 
 from daedalus.learner.run.counters import RunCounters
@@ -169,7 +169,7 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
-    def count_trained(self, rollouts: list[Upload], left_out: list[Upload]) -> None:
+    def count_trained(self, rollouts: Sequence[Upload], left_out: Sequence[Upload]) -> None:
         """Count the rollouts of a batch for their senders, after its updates.
 
         Args:

@@ -3,6 +3,7 @@
 TorchRuntime (policy/acting/torch_runtime.py) runs the network itself, for actors that have torch installed.
 """
 
+import copy
 import hashlib
 import threading
 from typing import Any, NamedTuple, Protocol
@@ -97,7 +98,7 @@ class OnnxRuntime:
         `stop` ends a call that is in progress; it then raises PolicyError.
         """
         check_program(model, _is_input)
-        self._model = model
+        self._model, self._stop = model, stop
         self._watchdog = CallWatchdog(stop)
         self._session = ProgramSession(model, self._watchdog)
         onnx_inputs, onnx_outputs = self._session.onnx.get_inputs(), self._session.onnx.get_outputs()
@@ -112,6 +113,17 @@ class OnnxRuntime:
         self._shapes = {name: shape for name, shape in inputs.items() if name not in others}
         self._convolutional = any(len(shape) > 2 for shape in self._shapes.values())
         self._feed: dict[str, np.ndarray] = {}
+
+    def fork(self) -> "OnnxRuntime":
+        """Return another runtime of the same program, which loads weights of its own.
+
+        Several versions of a policy can so act in turn, on one thread, without loading weights again.
+        """
+        other = copy.copy(self)
+        other._feed = {}
+        if self._convolutional:  # it will have a session of its own, and may load it on another thread
+            other._watchdog = CallWatchdog(self._stop)
+        return other
 
     @property
     def state_size(self) -> int:

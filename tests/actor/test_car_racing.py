@@ -9,6 +9,7 @@ import pytest
 from allowed_modules import TEST_MODULES
 from plain import PlainEnvironments
 
+from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
@@ -134,3 +135,9 @@ def test_user_wrapper_receives_the_frames() -> None:
     finally:
         plain.close()
         wrapped.close()
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "fast"])
+def test_gymnasiums_checker_sees_frames(backend: str) -> None:
+    """Late rendering returns no frame before the wrapper that draws it."""
+    assert not [note for note in gymnasium_notes(_spec(backend=backend), TEST_MODULES) if "Error" in note]

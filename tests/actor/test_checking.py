@@ -1,16 +1,21 @@
 """actor/checking: what is found in environments with faults, and in good ones."""
 
+from typing import Literal
+
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from building import run_spec
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from plain import plain_spaces
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
-from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -119,11 +124,41 @@ def test_observations_of_several_parts_are_checked_part_by_part() -> None:
         ({**good, "camera": np.zeros((3, 2), np.uint8)}, "whose part 'camera' is of shape (3, 2), but observation_"),
         ({**good, "camera": np.zeros((2, 2), np.float32)}, "of dtype float32, but observation_space['camera'] has"),
         (np.zeros(2), "of type ndarray, but observation_space has the parts"),
+        ({**good, "joints": (2, np.array([-2e15]))}, "with the value -2e+15 at index 0: it must be within +-1e+15"),
     ]
     for value, message in bad:
         ((kind, text),) = observation_violations(space, value, "step")
         assert kind == "problem"
         assert message in text
+
+
+def mission(*missions: str, leave_out: tuple[str, ...] = (), seconds: float = 60.0) -> EnvironmentReport:
+    spec = EnvironmentSpec(
+        id="mission_environment:Mission-v0", kwargs={"missions": list(missions)}, leave_out=leave_out
+    )
+    return check_environment(spec, TEST_MODULES, seconds=seconds, env_steps=25)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 60.0])
+def test_text_that_never_changes_is_left_out_and_reported(seconds: float) -> None:
+    report = mission("open the door", seconds=seconds)
+    assert report.problems == ()
+    assert report.constant_texts == {"mission": "open the door"}
+    assert report.spaces is not None
+    assert list(report.spaces.observations) == ["step"]
+    assert (
+        "is a text, which the policy cannot read: --set \"environment.leave_out=['mission']\""
+        in report.text_problem(spec())
+    )
+    named = mission("open the door", leave_out=("mission",), seconds=seconds)
+    assert (named.spaces, named.constant_texts, named.text_problem(spec())) == (report.spaces, {}, "")
+
+
+def test_text_that_changes_is_a_problem() -> None:
+    (problem,) = mission("open the door", "close the door").problems
+    assert "observation component 'mission' is a text that changes ('" in problem
+    assert "--set \"environment.leave_out=['mission']\"" in problem
+    assert mission("open the door", "close the door", leave_out=("mission",)).problems == ()
 
 
 def test_gymnasiums_own_checker_adds_notes() -> None:
@@ -159,3 +194,20 @@ def test_an_environment_without_an_end_is_noted() -> None:
     assert "no episode ended within 25 env_steps of random actions" in never_ends(endless, spec())
     assert not never_ends(check(), spec())
     assert not never_ends(endless.model_copy(update={"time_limit": 500}), spec())
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "noted"),
+    [
+        ((3, 40, 40), "float32", True),
+        ((40, 40, 3), "float32", True),
+        ((40, 40, 3), "uint8", False),
+        ((40, 40), "float32", False),  # rather a matrix
+        ((3, 4, 40), "float32", False),
+    ],
+)
+def test_an_image_of_floats_is_noted(shape: tuple[int, ...], dtype: Literal["float32", "uint8"], noted: bool) -> None:
+    report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype=dtype), 2))
+    assert ("if it is an image, return bytes from 0 to 255" in float_images(report, spec())) is noted
+    chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "nature"})})
+    assert not float_images(report, chosen)

@@ -127,7 +127,11 @@ def test_masks_narrow_the_choices_to_the_legal_ones(connect: Connect) -> None:
         (MASK, {"0": np.ones(3)}, "the action_mask of '0' has shape (3,), but the action has 4 choices"),
         (MASK, {"1": np.ones(4)}, "the action_mask names '1', which is no discrete component of the action"),
         (MASK, {}, "the action_mask has no entry for '0'"),
-        (MASK, np.ones(4), "the action_mask is one array, but the action has 2 discrete components"),
+        (
+            MASK,
+            np.ones(4),
+            "the action_mask has shape (4,), but the discrete components of the action have 4 + 4 choices",
+        ),
     ],
 )
 def test_a_mask_that_does_not_fit_is_refused_and_changes_nothing(

@@ -171,7 +171,7 @@ VARIED = gym.Box(np.zeros((30, 9), np.float32), np.float32(np.eye(30, 9) + 1))  
         (gym.Box(0, 1, (0,)), gym.Discrete(2), "is not supported"),
         (gym.Dict({}), gym.Discrete(2), "is empty"),
         (gym.Dict({"a b": gym.Box(0, 1), "a_b": gym.Box(0, 1)}), gym.Discrete(2), "like names: a_b, a_b"),
-        (gym.Box(0, 1), gym.Discrete(70_000), "less than or equal to 65536"),
+        (gym.Box(0, 1), gym.Discrete(70_000), "70,000 choices of one variable: use at most 65,536"),
         (gym.Box(0, 1), gym.MultiDiscrete([40_000, 40_000]), "80,000 choices together"),
         (gym.Box(0, 1), gym.Tuple((VARIED,) * 40), "at most 8,192"),
         (gym.Dict({str(n): gym.Box(0, 1) for n in range(65)}), gym.Discrete(2), "at most 64 items"),
@@ -203,8 +203,66 @@ def test_value_that_does_not_fit_is_refused_with_its_component(value: Any, reaso
 
 def test_discrete_observation_outside_its_space_is_refused() -> None:
     (component,) = observation_components(gym.Discrete(3))
-    with pytest.raises(EnvironmentSetupError, match=r"outside its space Discrete\(3\)"):
+    with pytest.raises(
+        EnvironmentSetupError, match=r"an observation outside its space: \[\[0\] \[3\]\] for Discrete\(3\)"
+    ):
         component.values(np.array([0, 3]))
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "reason"),
+    [
+        (gym.Discrete(100_000), gym.Discrete(2), "100,000 choices of one variable: use at most 65,536"),
+        (gym.Discrete(2), gym.Discrete(100_000), "100,000 choices of one variable: use at most 65,536"),
+        (
+            gym.Discrete(2),
+            gym.Box(np.array([0, 1], np.float32), np.ones(2, np.float32)),
+            "the lower bound 1 is not below the upper bound 1: leave a number that cannot change out of the action",
+        ),
+        (gym.Box(-1, 1, (0,)), gym.Discrete(2), "use an array with one to 4 axes that is not empty"),
+        (gym.Discrete(2), gym.Box(-1, 1, (0,)), "use an array of numbers that is not empty"),
+    ],
+)
+def test_space_that_is_not_supported_is_refused_with_the_limit(
+    observation: gymnasium.Space, action: gymnasium.Space, reason: str
+) -> None:
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        Transforms(SPEC, observation, action)
+
+
+# ------------------------------------------------------------------------------------------------- leave_out
+
+
+PARTS = gym.Dict(
+    {"goal": gym.Tuple((gym.Text(9), gym.Discrete(3))), "empty": gym.Box(-1, 1, (0,)), "arm": gym.Box(-1, 1, (2,))}
+)
+
+
+def test_components_that_are_left_out_are_not_read() -> None:
+    spec = EnvironmentSpec(id="Any-v0", leave_out=("goal.0", "empty"))
+    transforms = Transforms(spec, PARTS, gym.Discrete(2))
+    assert list(transforms.spaces.observations) == ["arm", "goal.1"]
+    for observation in (
+        {"goal": ("left", np.int64(2)), "empty": np.zeros(0), "arm": np.ones(2)},
+        {"goal": (None, np.int64(2)), "arm": np.ones(2)},
+    ):
+        frames = transforms.observe_one(observation, None).frames
+        assert {name: values.tolist() for name, values in frames.items()} == {"arm": [[1.0, 1.0]], "goal.1": [[2]]}
+
+
+@pytest.mark.parametrize(
+    ("leave_out", "reason"),
+    [
+        ((), r"component 'arm5'\) is not supported: .*with one to 4 axes.*\"environment.leave_out=\['arm5'\]\""),
+        (("arm5", "word"), r"leave_out names 'word', but the components of the observation are arm5, text"),
+        (("arm5", "text"), "leave_out names every component of the observation: keep one"),
+        (("arm5",), r"component 'text'\) is not supported: use Box, .*\"environment.leave_out=\['text'\]\""),
+    ],
+)
+def test_component_that_is_not_supported_can_be_left_out(leave_out: tuple[str, ...], reason: str) -> None:
+    space = gym.Dict({"arm5": gym.Box(-1, 1, (2, 1, 1, 1, 1)), "text": gym.Text(9)})
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        Transforms(EnvironmentSpec(id="Any-v0", leave_out=leave_out), space, gym.Discrete(2))
 
 
 # --------------------------------------------------------------------------------------------- frame stacks

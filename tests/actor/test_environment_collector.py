@@ -3,6 +3,7 @@
 import copy
 import itertools
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 from collectors import collect, started_collector
 from plain import PlainPolicy, plain, vector_spaces
 
+from daedalus.actor.collecting import environment_collector
+from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.interface import Observed, Step
 from daedalus.policy.acting.noise import Noise
 from daedalus.protocol.messages import Rollout
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 
@@ -250,6 +253,7 @@ class Seeds(PlainPolicy):
     def __init__(self) -> None:
         self.seed = -1
         self.noise: Noise | None = None
+        self.closed = False
 
     def reset(self, seed: int) -> Observed:
         self.seed = seed
@@ -262,7 +266,7 @@ class Seeds(PlainPolicy):
         return {}
 
     def close(self) -> None:
-        pass
+        self.closed = True
 
     def choose(
         self, observations: np.ndarray, state: np.ndarray, noise: Noise
@@ -275,13 +279,43 @@ class Seeds(PlainPolicy):
         return Observed({"observation": np.zeros((1, 2), np.float32)}, {})
 
 
+def drawn(seed: int) -> tuple[list[float], list[float]]:
+    """Return the first random numbers of the environment and of the policy."""
+    both = Seeds()
+    collect(started_collector(COUNTING, both, rollout_length=1, seed=seed, environments=both))
+    assert both.noise is not None
+    return np.random.default_rng(both.seed).random(2, np.float32).tolist(), both.noise.uniform[0].tolist()
+
+
 def test_environments_and_actions_draw_from_different_random_numbers() -> None:
     """With one seed for both, the numbers that choose the actions would be those of the environment."""
-    drawn = []
-    for seed in (1, 2):
-        both = Seeds()
-        collect(started_collector(COUNTING, both, rollout_length=1, seed=seed, environments=both))
-        assert both.noise is not None
-        of_environment = np.random.default_rng(both.seed).random(2, np.float32).tolist()
-        drawn += [of_environment, both.noise.uniform[0].tolist()]
-    assert len({tuple(numbers) for numbers in drawn}) == 4
+    assert len({tuple(numbers) for seed in (1, 2) for numbers in drawn(seed)}) == 4
+
+
+def test_the_same_seed_gives_the_same_random_numbers() -> None:
+    assert drawn(1) == drawn(1)
+
+
+def test_environments_are_made_anew_for_another_specification_only() -> None:
+    made: list[Seeds] = []
+
+    def make(*_arguments: object, **_named: object) -> Seeds:
+        made.append(Seeds())
+        return made[-1]
+
+    run = RunSpec(environment=COUNTING)
+    collector = EnvironmentCollector()
+    with mock.patch.object(environment_collector, "make_environments", make):
+        assert collector.prepare(run) == (Seeds.spaces, 1)
+        collector.prepare(run.model_copy(update={"collection": CollectionSpec(rollout_length=7)}))
+        assert [each.closed for each in made] == [False]
+        collector.prepare(RunSpec(environment=STACKED))
+        assert [each.closed for each in made] == [True, False]
+        collector.prepare(RunSpec(environment=STACKED))
+        assert [each.closed for each in made] == [True, False]
+    collector.close()
+    assert [each.closed for each in made] == [True, True]
+
+
+def test_a_rollout_can_be_collected_at_any_time() -> None:
+    assert EnvironmentCollector().has_rollout()

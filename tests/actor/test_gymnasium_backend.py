@@ -254,19 +254,116 @@ def test_processes_ignore_interrupts() -> None:
         environments.close()
 
 
+# ------------------------------------------------------------------------------- observations outside their space
+
+
+class Drifting(gymnasium.Env):
+    """Environment that returns another observation in its second step."""
+
+    observation_space = gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(0, 255, (2,), np.uint8)})
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, later: Any) -> None:
+        self._later, self._step = later, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        return {"a": np.zeros(2, np.uint8)}, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        self._step += 1
+        if self._step == 2 and isinstance(self._later, Exception):
+            raise self._later
+        return self._later if self._step == 2 else self.reset()[0], 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("later", "reason"),
+    [
+        ({"b": 1}, r"an observation with the parts \['b'\], but observation_space has the parts \['a'\]"),
+        (
+            {"a": np.zeros(3, np.uint8)},
+            r"whose part 'a' is of shape \(3,\), but observation_space\['a'\] has shape \(2,\)",
+        ),
+        ({"a": np.array([1.5, 300.0])}, r"whose part 'a' is of dtype float64, but .* has dtype uint8"),
+    ],
+)
+def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch, later: Any, reason: str) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda **_: Drifting(later)))
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
+    environments.reset(1)
+    environments.step({"action": np.zeros((2, 1), np.int64)})
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
+def test_only_one_environment_is_reset_to_learn_whether_there_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    resets = []
+    monkeypatch.setattr(
+        Drifting, "reset", lambda self, **_: (resets.append(self), ({"a": np.zeros(2, np.uint8)}, {}))[1]
+    )
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda **_: Drifting(None)))
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 3)
+    assert len(resets) == 1
+    environments.reset(1)
+    assert len(resets) == 4
+
+
+def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = EnvSpec("Drifting-v0", lambda **_: Drifting(KeyError("gripper")))
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", failing)
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
+    environments.reset(1)
+    environments.step({"action": np.zeros((2, 1), np.int64)})
+    with pytest.raises(KeyError, match="gripper"):
+        environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
 # ----------------------------------------------------------------------------------------------- missing packages
 
 
-def test_missing_package_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("extra", ["Box2D", "MuJoCo"])
+def test_missing_package_is_reported_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch, extra: str) -> None:
     def fails(**_kwargs) -> gymnasium.Env:
-        raise gymnasium.error.DependencyNotInstalled('Box2D is not installed, run `pip install "gymnasium[box2d]"`')
+        raise gymnasium.error.DependencyNotInstalled(f"{extra} is not installed, run `pip install ...`")
 
     monkeypatch.setitem(gymnasium.registry, "Fails-v0", EnvSpec("Fails-v0", fails))
-    with pytest.raises(EnvironmentSetupError, match=r'pip install "daedalus-rl\[box2d\]"'):
+    with pytest.raises(EnvironmentSetupError, match=rf'pip install "daedalus-rl\[{extra.lower()}\]"$'):
         make_environments(EnvironmentSpec(id="Fails-v0"), 1)
-    monkeypatch.setitem(sys.modules, "ale_py", None)
-    with pytest.raises(EnvironmentSetupError, match=r'ALE/Pong-v5.*pip install "daedalus-rl\[atari\]"'):
-        make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [
+        ("ALE/Pong-v5", "ale_py", "atari"),
+        ("MiniGrid-DoorKey-5x5-v0", "minigrid", "minigrid"),
+        ("BabyAI-GoToLocal-v0", "minigrid", "minigrid"),
+    ],
+)
+def test_missing_package_that_registers_environments_is_reported_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(EnvironmentSetupError, match=rf'{name} needs .*pip install "daedalus-rl\[{extra}\]"$'):
+        make_environments(EnvironmentSpec(id=name), 1)
+
+
+def test_minigrid_is_registered_by_its_names() -> None:
+    pytest.importorskip("minigrid")
+    spec = EnvironmentSpec(id="MiniGrid-DoorKey-5x5-v0", leave_out=("mission",))
+    environments = created(spec, 2)
+    frames = environments.reset(1).frames
+    assert {part: values.shape for part, values in frames.items()} == {"direction": (2, 1), "image": (2, 7, 7, 3)}
+    environments.close()
+
+
+def test_text_of_a_class_of_its_own_can_be_left_out_in_processes() -> None:
+    spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True)
+    environments = created(spec, 2)
+    try:
+        assert environments.reset(1).frames["step"].tolist() == [[0.0], [0.0]]
+        assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [0.0, 1.0]
+    finally:
+        environments.close()
 
 
 def test_atari_games_of_gymnasium_have_their_own_frames() -> None:

@@ -6,12 +6,18 @@ import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from collectors import collect, started_collector
 from gymnasium import spaces as gym
+from plain import PlainPolicy
 
+from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.acting.noise import Noise
+from daedalus.policy.acting.runtime import Choice
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
@@ -39,6 +45,7 @@ class Narrowing(gymnasium.Env):
         return np.arange(3) == self._step % 3
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
         self._step = 0
         return self._shown()
 
@@ -77,6 +84,30 @@ def test_masks_accompany_their_observations(convention: str) -> None:
         assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
     finally:
         environments.close()
+
+
+class LegalPolicy(PlainPolicy):
+    """A policy that takes the first legal choice."""
+
+    def act(
+        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+    ) -> Choice:
+        actions = masks["action"].argmax(1)[:, None]
+        return Choice({"action": actions}, np.zeros(len(actions), np.float32), state)
+
+
+def test_rollout_holds_the_mask_of_each_row() -> None:
+    """Two episodes, each with the row that only resets, whose mask has no meaning."""
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "info"})
+    collector = started_collector(spec, LegalPolicy(), count=2, rollout_length=6)
+    try:
+        for legal in ([0, 1, 2, 0, 0, 1], [2, 0, 0, 1, 2, 0]):
+            masks = collect(collector).masks["action"]
+            assert masks.dtype == np.bool_
+            for environment in range(2):
+                assert masks[:, environment].tolist() == np.eye(3, dtype=np.bool_)[legal].tolist()
+    finally:
+        collector.close()
 
 
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])
@@ -146,7 +177,49 @@ def test_mask_that_does_not_fit_is_refused(mask: Any, reason: str) -> None:
         observe(mask)
 
 
-def test_one_mask_for_several_discrete_components_is_refused() -> None:
-    action = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
-    with pytest.raises(EnvironmentSetupError, match="the action has 2 discrete components: give a map"):
-        Transforms(SPEC, gym.Box(0, 1), action, np.ones((1, 5)))
+BOTH = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
+
+
+@pytest.mark.parametrize(
+    "mask", [np.array([1, 0, 0, 1, 1]), [1, 0, 0, 1, 1], ([1, 0], np.array([0, 1, 1])), ((1, 0), [0, 1, 1], None)]
+)
+def test_one_mask_covers_the_choices_of_all_components(mask: Any) -> None:
+    """Also lists and tuples, as `sample(mask)` of gymnasium's spaces takes them."""
+    transforms = Transforms(SPEC, gym.Box(0, 1), BOTH, mask_of_one(mask))
+    masks = transforms.observe_one(np.zeros(1), mask).masks
+    assert {name: part.tolist() for name, part in masks.items()} == {"0": [[True, False]], "1": [[False, True, True]]}
+
+
+def test_one_mask_of_another_size_is_refused() -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"has shape \(4,\), but .* have 2 \+ 3 choices: give a map"):
+        Transforms(SPEC, gym.Box(0, 1), BOTH, np.ones((1, 4)))
+    both = np.empty(2, np.object_)
+    both[:] = [[1, 0], None]  # gymnasium's batch where one environment gives no mask
+    with pytest.raises(EnvironmentSetupError, match="differs in size between environments: give it in every step"):
+        Transforms(SPEC, gym.Box(0, 1), gym.Discrete(2), both)
+
+
+@pytest.mark.parametrize("make", [list, tuple])
+def test_masks_of_an_environment_may_be_lists(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
+    masked = Narrowing.mask
+    monkeypatch.setattr(
+        Narrowing, "_shown", lambda self: (np.zeros(1, np.float32), {"action_mask": make(masked(self))})
+    )
+    environments = make_environments(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "list"}), 2)
+    observed = environments.reset(1)
+    for _ in range(4):
+        observed, *_ = environments.step({"action": observed.masks["action"].argmax(1)[:, None]})
+    assert observed.masks["action"].tolist() == [[True, False, False]] * 2
+    environments.close()
+
+
+def narrowing_notes(convention: str) -> tuple[str, ...]:
+    return gymnasium_notes(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention}), NO_MODULES)
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation"])
+def test_gymnasiums_checker_plays_legal_actions(convention: str) -> None:
+    """Only choice 0 is legal at first, and the checker would sample another."""
+    assert not [note for note in narrowing_notes(convention) if "Error" in note]
+    (note,) = [note for note in narrowing_notes("none") if "Error" in note]
+    assert "an illegal action was taken" in note

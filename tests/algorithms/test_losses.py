@@ -12,11 +12,13 @@ from daedalus.algorithms.losses import (
     explained_variance,
     mean,
     normalized,
+    policy_factors,
     policy_gradient_loss,
     shares_of,
     value_loss,
     variance,
 )
+from daedalus.algorithms.returns import Targets
 from daedalus.policy.network.distributions.categorical import Categorical
 from daedalus.protocol.spaces import DiscreteSpace
 
@@ -51,7 +53,8 @@ def test_mean_is_the_mean_over_the_valid_rows(random: torch.Generator, valid: Te
     assert mean(values, shares_of(valid)).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_mean_without_valid_rows_is_0() -> None:
+def test_mean_of_one_valid_row_is_its_value_and_of_none_0() -> None:
+    assert mean(torch.tensor([[3.0, 5.0]]), shares_of(torch.tensor([[1.0, 0.0]]))).item() == 3.0
     assert mean(torch.ones(2, 2), shares_of(torch.zeros(2, 2))).item() == 0.0
 
 
@@ -133,6 +136,12 @@ def test_huge_ratio_does_not_overflow_the_clipped_loss(log_ratio: float) -> None
     assert gradient[:, 1].all()
 
 
+@pytest.mark.parametrize("clip_range", [0.3, 0.0])
+def test_ratios_of_1_are_not_clipped(valid: Tensor, clip_range: float) -> None:
+    zeros = torch.zeros(ROWS, COLUMNS)
+    assert clipped_policy_loss(zeros, zeros, shares_of(valid), clip_range)[1].item() == 0.0
+
+
 def test_advantages_and_targets_are_constants(random: torch.Generator, valid: Tensor) -> None:
     values = normal(random).requires_grad_()
     log_probs = normal(random).requires_grad_()
@@ -170,8 +179,25 @@ def test_normalized_has_mean_0_and_deviation_1_over_the_valid_rows(random: torch
     assert kept.std(correction=0).item() == pytest.approx(1.0, rel=1e-5)
 
 
+def test_policy_factors_are_weighted_after_the_advantages_are_normalised(
+    random: torch.Generator, valid: Tensor
+) -> None:
+    advantages, weights = normal(random), normal(random).abs()
+    targets = Targets(values=normal(random), advantages=advantages, weights=weights)
+    assert torch.equal(policy_factors(targets, valid, normalize=False), weights * advantages)
+    assert torch.equal(policy_factors(targets, valid, normalize=True), weights * normalized(advantages, valid))
+
+
 def test_normalized_of_equal_advantages_is_0() -> None:
     assert torch.equal(normalized(torch.full((2, 2), 3.0), torch.ones(2, 2)), torch.zeros(2, 2))
+    assert normalized(torch.tensor([[3.0, 5.0]]), torch.tensor([[1.0, 0.0]]))[0, 0].item() == 0.0  # one valid row
+
+
+def test_normalized_does_not_amplify_differences_that_are_only_rounding() -> None:
+    tiny = torch.tensor([[1e-9, -1e-9]])
+    positive, negative = normalized(tiny, torch.ones(1, 2))[0].tolist()
+    assert 0.0 < positive < 0.2
+    assert negative == -positive
 
 
 def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_for_worse(
@@ -191,7 +217,8 @@ def test_explained_variance_equals_its_definition_over_the_valid_rows(random: to
     kept = valid == 1.0
     residual = (targets - values)[kept]
     expected = 1.0 - residual.var(correction=0) / targets[kept].var(correction=0)
-    assert_close(explained_variance(values, targets, shares_of(valid)), expected)
+    for scale in (1.0, 0.01):  # it does not depend on the unit of the rewards
+        assert_close(explained_variance(scale * values, scale * targets, shares_of(valid)), expected)
     assert_close(variance(values, shares_of(valid)), values[kept].var(correction=0))
 
 

@@ -9,15 +9,18 @@ from pathlib import Path
 import pytest
 from building import run_spec
 from log_lines import LINES
-from plain import array_space
+from plain import array_space, vector_spaces
 
 from daedalus.cli import quick_check as module
 from daedalus.cli.quick_check import (
     CheckTimeoutError,
     EnvironmentProblemError,
+    checked_defaults,
     checked_spaces,
+    expected_defaults,
     expected_spaces,
     quick_check,
+    transformed_spaces,
 )
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -91,3 +94,29 @@ def test_a_learner_expects_the_spaces_of_an_environment_that_it_can_make() -> No
     assert expected_spaces(run(faulty("")), NO_MODULES, stop) is None
     assert "the first actor decides the spaces of the run" in LINES[-1]
     assert "may not be imported here" in LINES[-1]
+
+
+def mission(**settings: object) -> RunSpec:
+    return run(EnvironmentSpec.model_validate({"id": "mission_environment:Mission-v0", **settings}))
+
+
+def test_default_settings_leave_out_a_text_that_never_changes() -> None:
+    modules, stop = UserModules(frozenset({"mission_environment"})), threading.Event()
+    for spaces, defaults in (checked_defaults(mission()), expected_defaults(mission(), modules, stop)):
+        assert spaces is not None
+        assert list(spaces.observations) == ["step"]
+        assert defaults["environment"]["leave_out"] == ["mission"]
+        assert LINES.pop() == (
+            "observation component 'mission' is left out (environment.leave_out): it is always 'open the door'"
+        )
+
+
+def test_settings_of_a_preset_must_leave_out_a_text_themselves() -> None:
+    with pytest.raises(EnvironmentProblemError, match=r"component 'mission' is a text.*environment.leave_out"):
+        checked_spaces(mission())
+    with pytest.raises(EnvironmentProblemError, match=r"component 'mission' is a text.*environment.leave_out"):
+        transformed_spaces(mission(), mission(frame_stack=2), vector_spaces(1, 2))
+    stop = threading.Event()
+    assert expected_spaces(mission(), UserModules(frozenset({"mission_environment"})), stop) is None
+    assert "component 'mission' is a text" in LINES[-1]
+    assert checked_spaces(mission(leave_out=["mission"])) is not None

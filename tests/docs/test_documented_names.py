@@ -11,7 +11,10 @@ from pydantic import BaseModel
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import CERTIFICATE, CLIENTS, KEY
 
-FOLDERS = "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|learner|policy|protocol|tests|transport"
+FOLDERS = (
+    "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests"
+    "|transport"
+)
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
 FILE_ENDINGS = {"py", "ts", "md", "toml"}
 

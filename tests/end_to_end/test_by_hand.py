@@ -8,25 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from learner_status import actor_status, env_steps, learner_status
 from processes import Running, until
 
 Start = Callable[..., Running]
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-
-
-@pytest.fixture
-def status(start: Start, address: str) -> Callable[[], dict | None]:
-    """Function that returns the status of the learner, or None while it does not answer."""
-
-    def ask() -> dict | None:
-        running = start("status", "--connect", address, "--json")
-        return json.loads(running.output) if running.wait() == 0 else None
-
-    return ask
-
-
-def env_steps(status: dict | None, actor: str) -> int:
-    return next((entry["env_steps"] for entry in (status or {"actors": []})["actors"] if entry["actor"] == actor), 0)
 
 
 def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, address: str) -> None:
@@ -47,36 +33,32 @@ def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, addr
     learner.expect(r"epoch=\w+ actor=early: joined with 128 environments \(.*daedalus-rl ")
 
 
-def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str, status: Callable[[], dict | None]) -> None:
+def test_an_actor_that_joins_late_is_trained_on(start: Start, address: str) -> None:
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
     start("actor", "--connect", address, "--name", "first")
     learner.expect(r"updates .*/s")
     start("actor", "--connect", address, "--name", "late", "--envs", 8, "--runtime", "torch")
-    until(lambda: env_steps(status(), "late") > 0)
+    until(lambda: env_steps(learner_status(address), "late") > 0)
     start("status", "--connect", address, "--events").expect("joined  *late  *joined with 8 environments")
-    report = status()
-    assert report is not None
+    asked = start("status", "--connect", address, "--json")
+    assert asked.wait() == 0
+    report = json.loads(asked.output)
     assert {entry["actor"]: entry["environments"] for entry in report["actors"]} == {"first": 128, "late": 8}
     learner.process.terminate()
     assert learner.wait() == 0
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "impala"])
-def test_a_killed_actor_does_not_stop_the_others(
-    start: Start, address: str, status: Callable[[], dict | None], algorithm: str
-) -> None:
+def test_a_killed_actor_does_not_stop_the_others(start: Start, address: str, algorithm: str) -> None:
     learner = start("learner", "cartpole", "--algorithm", algorithm, "--listen", address, "--run-dir", "run", *ENDLESS)
     victim = start("actor", "--connect", address, "--name", "victim")
     start("actor", "--connect", address, "--name", "other")
-    until(lambda: env_steps(status(), "victim") > 0 and env_steps(status(), "other") > 0)
+    until(lambda: all(env_steps(learner_status(address), name) > 0 for name in ("victim", "other")))
     os.kill(victim.process.pid, signal.SIGKILL)
     victim.wait()
-    before = status()
-    assert before is not None
-    until(lambda: env_steps(status(), "other") > env_steps(before, "other") + 10_000)
-    after = status()
-    assert after is not None
-    assert [entry["alive"] for entry in after["actors"] if entry["actor"] == "victim"] == [False]
+    before = env_steps(learner_status(address), "other")
+    until(lambda: env_steps(learner_status(address), "other") > before + 10_000)
+    assert actor_status(learner_status(address), "victim")["alive"] is False
     assert learner.process.poll() is None
 
 

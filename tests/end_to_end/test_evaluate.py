@@ -247,14 +247,14 @@ def test_episodes_that_never_end_are_cut_and_the_result_says_so(
 ) -> None:
     endless = COUNTING.model_copy(update={"kwargs": {"ends": [10**9]}})
     run = save(tmp_path / "run", endless, 1, evaluation={"max_episode_env_steps": 30})
-    note = (
-        "2 of 2 episodes were cut after 30 env_steps (evaluation.max_episode_env_steps): if the environment never ends "
-        "them, set environment.max_episode_steps"
-    )
+    cut = "2 of 2 episodes were cut after 30 env_steps (evaluation.max_episode_env_steps): "
+    remedy = "if the environment never ends them, set environment.max_episode_steps"
+    note = f"{cut}greedy actions may go in circles where sampled ones do not (--actions sampled); {remedy}"
     result = evaluate(run, "--episodes", 2)
     assert (result["lengths"], result["notes"]) == ([30, 30], [note])
     assert main([str(run), "--episodes", "2", "--allow-module", "counting_environment"]) == 0
     assert capsys.readouterr().out.endswith(f" greedy episodes\n{note}\n")
+    assert evaluate(run, "--episodes", 2, "--actions", "sampled")["notes"] == [cut + remedy]
 
 
 def test_render_needs_a_screen(

@@ -27,10 +27,11 @@ def test_a_learner_trains_from_a_loop_that_the_caller_owns(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
     slow = ("--set", "collection.rollout_length=64", "--set", "training.batch_rollouts=4")
-    learner = start("learner", "cartpole", "--actors", 1, "--listen", address, "--run-dir", "run", *slow)
+    words = ("learner", "cartpole", "--env-steps", 4000, "--actors", 1, "--listen", address, "--run-dir", "run")
+    learner = start(*words, *slow)
     loop = example("--name", "robot")
     loop.expect("joined run 'run' as 'robot': 1 x CartPole-v1")
-    assert learner.wait() == 0, learner.output
+    assert learner.wait() == 3, learner.output  # the budget ended without the target
     assert loop.wait() == 0, loop.output
     loop.expect("the run is over")
 

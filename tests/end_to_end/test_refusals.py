@@ -1,6 +1,7 @@
 """Test of a real learner with mismatching actors and with arbitrary bytes."""
 
 import re
+import shutil
 import socket
 import struct
 from collections.abc import Callable, Iterator
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from plain import vector_spaces
-from processes import Running, until
+from processes import Running, free_address, starting, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
@@ -22,18 +23,21 @@ CARTPOLE = vector_spaces(4, 2)
 Start = Callable[..., Running]
 
 
-@pytest.fixture
-def client(start: Start, address: str) -> Iterator[Transport]:
-    """Transport of a client that is connected to a running learner."""
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
-    learner.expect("actors join with")
-    transport = connect([address])
-    try:
-        until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))  # the key that the learner serves last
-        yield transport
-        assert learner.process.poll() is None, learner.output
-    finally:
-        transport.close()
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Transport]:
+    """Transport of a client that is connected to a running learner, which the tests share."""
+    address = free_address()
+    with starting(tmp_path_factory.mktemp("learner")) as start:
+        learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run")
+        learner.expect("actors join with")
+        transport = connect([address])
+        try:
+            # The key that the learner serves last.
+            until(lambda: transport.query(keys.join("run", "client"), timeout=30.0))
+            yield transport
+            assert learner.process.poll() is None, learner.output
+        finally:
+            transport.close()
 
 
 def ask(transport: Transport, key: str, payload: bytes) -> Message:
@@ -47,11 +51,11 @@ def join(**kwargs: object) -> bytes:
 
 def test_another_protocol_version_is_refused_and_both_versions_are_named(client: Transport) -> None:
     other = bytearray(join())
-    struct.pack_into("<H", other, 4, 7)
+    struct.pack_into("<H", other, 4, PROTOCOL_VERSION + 1)
     answer = ask(client, keys.join("run", "client"), bytes(other))
     assert isinstance(answer, Refusal)
     assert answer.code == "mismatch"
-    assert "protocol version 7" in answer.reason
+    assert f"protocol version {PROTOCOL_VERSION + 1}" in answer.reason
     assert f"this one {PROTOCOL_VERSION}" in answer.reason
 
 
@@ -77,7 +81,7 @@ def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) ->
         ):
             ask(client, key, payload)
         client.publish(keys.snapshots("run"), payload)
-    answer = ask(client, keys.rollouts("run", "client"), b"\xff")
+    answer = ask(client, keys.rollouts("run", "x"), b"\xff")
     assert isinstance(answer, Acknowledgement)
     assert answer.verdict == "fenced"
     ask(client, keys.join("run", "client"), join(spaces=CARTPOLE, environments=2))
@@ -86,17 +90,21 @@ def test_the_learner_survives_arbitrary_bytes_on_every_key(client: Transport) ->
     assert answer.verdict == "rejected"
 
 
-def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(start: Start, address: str) -> None:
-    endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
+def test_a_second_actor_of_the_same_name_is_refused_while_the_first_takes_part(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    shutil.copy(Path(__file__).parent.parent / "slow_environment.py", tmp_path)
+    slow = ("--set", "environment.kwargs.seconds=0.1", "--set", "collection.envs_per_actor=1")
+    learner = start("learner", "--env", "slow_environment:Slow-v0", "--listen", address, "--run-dir", "run", *slow)
     learner.expect("actors join with")
-    first = start("actor", "--connect", address, "--name", "arm")
+    actor = ("actor", "--connect", address, "--name", "arm", "--allow-module", "slow_environment")
+    first = start(*actor)
     first.expect("joined run")
-    second = start("actor", "--connect", address, "--name", "arm")
+    second = start(*actor)
     second.expect("waiting for the other actor of this name to leave")
     assert second.wait() == 1
     second.expect("actor name 'arm' is already in use: choose another --name")
-    third = start("actor", "--connect", address, "--name", "arm")
+    third = start(*actor)
     third.expect("waiting for the other actor of this name to leave")
     first.end()
     third.expect("joined run 'run' as 'arm'")

@@ -1,10 +1,10 @@
 """Test of an actor on a slow link: 1 Mbit/s up, 4 Mbit/s down, 100 ms in each direction."""
 
-import json
 from collections.abc import Callable
 
 import pytest
 from faults import SlowProxy
+from learner_status import actor_status, learner_status
 from processes import Running, until
 
 Start = Callable[..., Running]
@@ -16,12 +16,7 @@ def far(start: Start, address: str) -> Callable[[], dict]:
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
 
-    def ask() -> dict:
-        running = start("status", "--connect", address, "--json")
-        actors = json.loads(running.output)["actors"] if running.wait() in (0, 3) else ()
-        return next((actor for actor in actors if actor["actor"] == "far"), {})
-
-    return ask
+    return lambda: actor_status(learner_status(address), "far")
 
 
 def test_an_actor_measures_that_its_link_is_slow_and_is_trained_on(

@@ -6,14 +6,13 @@ import os
 import re
 import signal
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import safetensors.numpy
-from processes import Running, listening_ports, processes_mentioning, until
+from processes import Running, listening_ports, processes_mentioning, starting, until
 
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
@@ -50,15 +49,11 @@ def is_free(directory: Path) -> bool:
 def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Train CartPole until it is solved. Several tests check this run."""
     folder = tmp_path_factory.mktemp("solved")
-    words = ["-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-    # More than the budget of the preset: asynchronous runs differ, and these tests do not check the speed of learning.
-    running = Running(
-        [sys.executable, *words, "train", "cartpole", "--env-steps", "4000000", "--run-dir", "solved-run"], folder
-    )
-    try:
+    with starting(folder) as start:
+        # More than the budget of the preset: asynchronous runs differ, and these tests do not check the speed of
+        # learning.
+        running = start("train", "cartpole", "--env-steps", 4_000_000, "--run-dir", "solved-run")
         assert running.wait() == 0, running.output
-    finally:
-        running.end()
     return folder / "solved-run", running.output
 
 
@@ -127,7 +122,8 @@ def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: 
 
 
 def test_resume_has_nothing_to_do_or_continues_with_new_settings(start: Start, tmp_path: Path) -> None:
-    first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run")
+    small = ("--actors", 1, "--set", "evaluation.final_episodes=2")
+    first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run", *small)
     assert first.wait() == 3, first.output  # the budget ended without the target
     before = newest_checkpoint(tmp_path / "run")
     rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
@@ -182,17 +178,15 @@ def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ende
 
 def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, tmp_path: Path) -> None:
     running = start(
-        "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 4_000_000
+        "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 1_000_000
     )
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
     running.expect(r"updates .*/s")
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
     os.kill(victim, signal.SIGKILL)
     running.expect("actor-1 was killed by signal 9; started again")
-    assert running.wait() == 0, running.output
-    result = summary(tmp_path / "run")
-    assert result["env_steps"] >= 4_000_000
-    assert result["solved"]
+    assert running.wait() in (0, 3), running.output
+    assert summary(tmp_path / "run")["env_steps"] >= 1_000_000
 
 
 def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> None:

@@ -1,17 +1,21 @@
 """Test of the TypeScript actor in examples/node: its own tests, a recording learner, and a real learner."""
 
 import json
+import shutil
 import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import gymnasium
+import nested_environment
 import node
 import numpy as np
 import pytest
 import torch
+from learner_status import actor_status, env_steps, learner_status
 from plain import ACTION, NAME, plain
 from processes import LIMIT, Running, until
 from recording_learner import ONE_AT_A_TIME, SPEC, RecordingLearner
@@ -46,12 +50,12 @@ def network() -> Iterator[tuple[MemoryNetwork, str]]:
 
 
 @pytest.fixture
-def begin() -> Iterator[Callable[[str], Running]]:
+def begin() -> Iterator[Callable[..., Running]]:
     """Function that starts an actor with the bridge at HOST:PORT. Actors left are killed at the end."""
     running: list[Running] = []
 
-    def begin_one(address: str) -> Running:
-        words = [node.program(), "main.ts", "--bridge", address, "--name", "wing-ts", "--envs", "6"]
+    def begin_one(address: str, environments: int = 6) -> Running:
+        words = [node.program(), "main.ts", "--bridge", address, "--name", "wing-ts", "--envs", str(environments)]
         running.append(Running(words, node.FOLDER))
         return running[-1]
 
@@ -248,17 +252,10 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
     actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1])
 
-    def status() -> dict:
-        asked = start("status", "--connect", address, "--json")
-        return json.loads(asked.output) if asked.wait() in (0, 3) else {"actors": [], "episode_return_mean": None}
-
-    def env_steps() -> int:
-        return next((one["env_steps"] for one in status()["actors"] if one["actor"] == "wing-ts"), 0)
-
-    until(lambda: env_steps() > 0)
-    before = env_steps()
-    until(lambda: env_steps() > before + 10_000)
-    report = status()
+    until(lambda: env_steps(learner_status(address), "wing-ts") > 0)
+    before = env_steps(learner_status(address), "wing-ts")
+    until(lambda: env_steps(learner_status(address), "wing-ts") > before + 10_000)
+    report = learner_status(address)
     (seen,) = report["actors"]
     assert seen["alive"]
     assert seen["environments"] == 6
@@ -266,8 +263,41 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     assert set(seen["rollouts_rejected"]) <= {"stale"}
     assert report["episode_return_mean"] > 5  # the statistics of its episodes arrived
     actor.process.kill()
-    until(lambda: not status()["actors"][0]["alive"])
+    until(lambda: actor_status(learner_status(address), "wing-ts").get("alive") is False)
     learner.process.terminate()
     learner.wait()
+    bridge.process.terminate()
+    assert bridge.wait() == 0, bridge.output
+
+
+def test_a_real_learner_learns_nested_spaces_with_masks_from_the_actor(
+    start: Start, begin: Callable[..., Running], address: str, tmp_path: Path
+) -> None:
+    """The observation is a nested Dict with an image, the action a Tuple; each part is learned from another part."""
+    node.program()
+    shutil.copy(nested_environment.__file__, tmp_path)
+    settings = (
+        "training.target_return=6.4",  # of 8; a policy that ignores a part of the observation has at most 6.3
+        "environment.frame_stack=1",
+        "policy.encoder=small",
+        "policy.initial_std=0.3",
+        "training.discount_factor=0.0",
+        "training.entropy_bonus=0.0",
+        "training.learning_rate=0.002",
+        "training.minibatches=8",
+        "training.batch_rollouts=2",
+        "collection.rollout_length=16",
+    )
+    words = [word for setting in settings for word in ("--set", setting)]
+    environment = ("--env", "nested_environment:NestedMasked-v0", "--env-steps", 400_000)
+    learner = start("learner", *environment, *words, "--listen", address, "--run-dir", "run")
+    learner.expect("actors join with")
+    bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
+    actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1], environments=32)
+    assert learner.wait() == 0, learner.output
+    assert actor.wait() == 0, actor.output
+    result = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert result["solved"] is True
+    assert result["rollouts_rejected"].keys() <= {"stale"}
     bridge.process.terminate()
     assert bridge.wait() == 0, bridge.output

@@ -61,3 +61,8 @@ def test_only_images_with_colours_are_made_grey(shape: tuple[int, ...], grey: bo
     environment = default_settings(spaces(CHOICES, image(*shape)))["environment"]
     assert environment.get("grey", False) is grey
     assert environment["resize"] == [84, 84]
+
+
+def test_components_to_leave_out_become_a_setting() -> None:
+    assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
+    assert "environment" not in default_settings(spaces(CHOICES, VECTOR))

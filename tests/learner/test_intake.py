@@ -9,16 +9,17 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from plain import ACTION, choices, plain, plain_spaces, vector_spaces
+from plain import ACTION, NAME, choices, plain, plain_spaces, vector_spaces
 
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot
-from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot, Upload
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
+FENCED = ("epoch", "unknown_actor")  # the causes for which an actor joins again
 
 
 class Harness:
@@ -28,7 +29,7 @@ class Harness:
         self.fleet = joined_fleet("a", "b")
         self.intake = Intake(run_spec(max_policy_lag=MAX_LAG, **training), EPOCH, self.fleet)
 
-    def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Rollout | Rejected:
+    def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Upload | Rejected:
         return self.intake.judge(sender, self.intake.read(sender, data), VERSION, now)
 
     def memory(self) -> list[Any]:
@@ -54,7 +55,7 @@ def assert_rejected(harness: Harness, data: bytes, cause: str, reason: str = "",
     before = harness.memory()
     verdict = harness.receive(data, sender)
     assert isinstance(verdict, Rejected)
-    assert verdict.cause == cause
+    assert (verdict.verdict, verdict.cause) == ("fenced" if cause in FENCED else "rejected", cause)
     assert reason in verdict.reason
     assert harness.memory() == before
     if sender in harness.fleet.actors:
@@ -111,7 +112,7 @@ def test_acknowledgement_cuts_a_long_reason_to_500_characters(harness: Harness) 
     ids=["empty", "too short", "nonsense", "cut", "too long"],
 )
 def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, data: bytes) -> None:
-    assert assert_rejected(harness, data, "malformed").verdict == "rejected"
+    assert_rejected(harness, data, "malformed")
 
 
 def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
@@ -120,13 +121,20 @@ def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> 
     assert_rejected(harness, data, "malformed", "36 arrays, the limit is 35")
 
 
+def test_each_component_adds_its_arrays_to_the_limit() -> None:
+    """A component of the observation has one array, a component of the action two, with its masks."""
+    observation, action = ArraySpace(shape=(3,), dtype="float32"), DiscreteSpace(counts=(4,))
+    spaces = Spaces(observations={"a": observation, "b": observation}, actions=dict.fromkeys("cde", action))
+    weights = {str(number): np.zeros(1, np.float32) for number in range(41)}
+    data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
+    verdict = stacked_harness(spaces).receive(data)
+    assert isinstance(verdict, Rejected)
+    assert verdict.reason == "41 arrays, the limit is 40"
+
+
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
-    assert_rejected(
-        harness,
-        encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason="")),
-        "malformed",
-        "the message is not a rollout",
-    )
+    data = encode(RunEnded(learner_epoch=EPOCH, outcome="finished", reason=""))
+    assert assert_rejected(harness, data, "malformed").reason == "the message is not a rollout"
 
 
 @pytest.mark.parametrize(
@@ -239,11 +247,12 @@ def test_recurrent_state_that_is_not_finite_is_rejected(harness: Harness, value:
 # ----------------------------------------------------------------------------------------------- stacks
 
 STACKED = ArraySpace(shape=(60, 80, 3), dtype="uint8", frames=4)
+PICTURES = plain_spaces(STACKED, 4)
 
 
-def stacked_harness(state_size: int = 0) -> Harness:
+def stacked_harness(spaces: Spaces = PICTURES, state_size: int = 0) -> Harness:
     harness = Harness()
-    harness.fleet = joined_fleet("a", spaces=plain_spaces(STACKED, 4))
+    harness.fleet = joined_fleet("a", spaces=spaces)
     harness.intake = Intake(run_spec(max_policy_lag=MAX_LAG), EPOCH, harness.fleet)
     harness.intake.state_size = state_size
     return harness
@@ -300,7 +309,7 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
         episode_returns=np.zeros(most, np.float32),
         episode_lengths=np.ones(most, np.int64),
     )
-    assert isinstance(stacked_harness(40_000).receive(encode(largest)), Rollout)
+    assert isinstance(stacked_harness(state_size=40_000).receive(encode(largest)), Rollout)
     too_many = good(frames=pixels(2 * (ROWS + 4)))
     verdict = stacked_harness().receive(encode(too_many))
     assert isinstance(verdict, Rejected)
@@ -337,10 +346,18 @@ def test_large_message_of_a_sender_that_has_not_joined_is_fenced(spaces: Spaces 
     )
 
 
-def test_size_limit_is_the_documented_one() -> None:
+@pytest.mark.parametrize(
+    ("action", "action_bytes"),
+    [
+        (DiscreteSpace(counts=(4, 2)), 2 * 8),
+        (DiscreteSpace(counts=(4, 2), masked=True), 2 * 8 + 6),
+        (ContinuousSpace(low=(0.0,) * 3, high=(1.0,) * 3), 3 * 4),
+    ],
+)
+def test_size_limit_is_the_documented_one(action: DiscreteSpace | ContinuousSpace, action_bytes: int) -> None:
     """E (T (23 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
-    harness = stacked_harness(state_size=7)
-    limit = ENVIRONMENTS * (ROWS * (23 + 8) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
+    harness = stacked_harness(Spaces(observations={NAME: STACKED}, actions={ACTION: action}), state_size=7)
+    limit = ENVIRONMENTS * (ROWS * (23 + action_bytes) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
     message = Limits(max_bytes=limit).message_bytes
     assert harness.intake.refuse_size("a", message) is None
     refused = harness.intake.refuse_size("a", message + 1)
@@ -366,7 +383,7 @@ def test_rollouts_of_too_many_environments_are_refused_before_they_are_decoded(
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=environments, spaces=spaces))
     verdict = intake.read("a", b"no message")
     assert isinstance(verdict, Rejected)
-    assert verdict.cause == ("unfit" if refused else "malformed")
+    assert (verdict.verdict, verdict.cause) == ("rejected", "unfit" if refused else "malformed")
     assert ("use fewer environments per actor (--envs)" in verdict.reason) == refused
 
 
@@ -384,14 +401,13 @@ def test_corrupted_bytes_always_get_a_verdict(data: st.DataObject) -> None:
 
 def test_rollout_for_another_learner_epoch_is_fenced(harness: Harness) -> None:
     verdict = assert_rejected(harness, encode(good(rollout_identity=identity(epoch=EPOCH - 1))), "epoch")
+    assert verdict.reason == "the rollout is for another learner epoch"
     assert acknowledgement(verdict, VERSION).verdict == "fenced"
 
 
 def test_rollout_of_an_actor_that_never_joined_is_fenced(harness: Harness) -> None:
-    assert (
-        assert_rejected(harness, encode(good(rollout_identity=identity("z"))), "unknown_actor", sender="z").verdict
-        == "fenced"
-    )
+    verdict = assert_rejected(harness, encode(good(rollout_identity=identity("z"))), "unknown_actor", sender="z")
+    assert verdict.reason == "actor 'z' has not joined"
     assert "z" not in harness.fleet.actors
 
 
@@ -404,10 +420,8 @@ def test_rollout_is_fenced_before_the_first_actor_has_joined() -> None:
 
 @pytest.mark.parametrize("incarnation", [0, 2])
 def test_rollout_of_an_incarnation_that_never_joined_is_fenced(harness: Harness, incarnation: int) -> None:
-    verdict = assert_rejected(
-        harness, encode(good(rollout_identity=identity(incarnation=incarnation))), "unknown_actor"
-    )
-    assert verdict.verdict == "fenced"
+    data = encode(good(rollout_identity=identity(incarnation=incarnation)))
+    assert_rejected(harness, data, "unknown_actor", f"incarnation {incarnation} of 'a' is not the current one of 'a'")
 
 
 def test_rollout_of_a_replaced_incarnation_is_fenced(harness: Harness) -> None:
@@ -438,21 +452,21 @@ def test_duplicate_is_rejected_after_the_incarnation_was_replaced_and_joined_aga
 
 
 def test_rollout_with_the_identity_of_another_actor_is_fenced(harness: Harness) -> None:
-    verdict = assert_rejected(harness, encode(good(rollout_identity=identity("b"))), "unknown_actor", sender="a")
-    assert verdict.verdict == "fenced"
+    assert_rejected(harness, encode(good(rollout_identity=identity("b"))), "unknown_actor", sender="a")
     assert not harness.fleet.actors["b"].rejected
     assert isinstance(harness.receive(encode(good(rollout_identity=identity("b"))), "b"), Rollout)
 
 
 def test_duplicate_rollout_is_rejected(harness: Harness) -> None:
     assert isinstance(harness.receive(encode(good())), Rollout)
-    assert assert_rejected(harness, encode(good()), "duplicate").verdict == "rejected"
+    assert assert_rejected(harness, encode(good()), "duplicate").reason == "the rollout was received before"
 
 
 def test_stale_rollout_is_rejected_as_stale_first_and_as_duplicate_afterwards(harness: Harness) -> None:
     data = encode(good(version=VERSION - MAX_LAG - 1))
     verdicts = [harness.receive(data), harness.receive(data)]
-    assert [verdict.cause for verdict in verdicts if isinstance(verdict, Rejected)] == ["stale", "duplicate"]
+    found = [(verdict.verdict, verdict.cause) for verdict in verdicts if isinstance(verdict, Rejected)]
+    assert found == [("rejected", "stale"), ("rejected", "duplicate")]
     assert harness.fleet.actors["a"].accepted == 0
 
 
@@ -477,8 +491,11 @@ def verdicts(harness: Harness, *messages: bytes) -> list[str]:
 
 def test_actor_is_quarantined_after_three_unfit_rollouts_in_a_row(harness: Harness) -> None:
     fit = encode(good(rollout_identity=identity(sequence=9)))
-    assert verdicts(harness, broken(0), broken(1), broken(2), fit) == ["rejected", "rejected", *["quarantined"] * 2]
+    assert verdicts(harness, broken(0), broken(1)) == ["rejected", "rejected"]
     actor = harness.fleet.actors["a"]
+    third, fourth = harness.receive(broken(2)), harness.receive(fit)
+    assert third == Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
+    assert fourth == Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
     assert actor.quarantined == "3 unfit rollouts in a row, the last: rewards has a value that is not finite"
     assert actor.rejected == {"unfit": 3, "quarantined": 1}
     assert harness.fleet.live == {"b"}
@@ -512,7 +529,7 @@ def test_rewards_outside_the_clip_range_are_rejected_as_unfit(harness: Harness) 
     spec = run_spec(max_policy_lag=MAX_LAG)
     environment = spec.environment.model_copy(update={"reward_clip": 1.0, "reward_scale": 0.5})
     harness.intake = Intake(spec.model_copy(update={"environment": environment}), EPOCH, harness.fleet)
-    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5, np.float32))
+    within = good(rewards=np.full((ROWS, ENVIRONMENTS), -0.5 * (1 + 1e-5), np.float32))  # by rounding
     beyond = good(rollout_identity=identity(sequence=1), rewards=np.full((ROWS, ENVIRONMENTS), 0.51, np.float32))
     assert isinstance(harness.receive(encode(within)), Rollout)
     verdict = harness.receive(encode(beyond))

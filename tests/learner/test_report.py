@@ -70,7 +70,7 @@ def test_two_measurements_at_the_same_time_do_not_divide_by_0() -> None:
 
 
 def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
-    counters, fleet, hint = RunCounters(100), joined_fleet("a", "b"), EpisodeHint()  # six environments
+    counters, fleet, hint = RunCounters(100), joined_fleet("a", "b"), EpisodeHint(10**6)  # six environments
     counters.env_steps = 59_999
     assert hint.take(counters, fleet) == ""
     counters.env_steps = 60_000
@@ -79,10 +79,20 @@ def test_a_run_without_the_end_of_an_episode_gets_a_hint_once() -> None:
         "set environment.max_episode_steps"
     )
     assert hint.take(counters, fleet) == ""
-    assert EpisodeHint().take(trained_counters(1.0), fleet) == ""
+    assert EpisodeHint(10**6).take(trained_counters(1.0), fleet) == ""
     ended = trained_counters(1.0)
     ended.env_steps = 10**9
-    assert EpisodeHint().take(ended, fleet) == ""
+    assert EpisodeHint(10**6).take(ended, fleet) == ""
+
+
+def test_the_hint_comes_after_half_of_a_small_budget() -> None:
+    counters, fleet = RunCounters(100), joined_fleet("a", "b")
+    for budget, due, length in ((60_000, 30_000, "5,000"), (12_000, 12_000, "2,000")):
+        hint = EpisodeHint(budget)
+        counters.env_steps = due - 1
+        assert hint.take(counters, fleet) == ""
+        counters.env_steps = due
+        assert hint.take(counters, fleet).startswith(f"no episode has ended after {length} env_steps in each")
 
 
 def test_episode_statistics_are_over_the_newest_episodes() -> None:

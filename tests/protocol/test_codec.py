@@ -123,7 +123,9 @@ def test_both_memory_orders_decode_to_the_same_array() -> None:
 def test_every_shape_of_at_least_two_dimensions_can_be_swapped(shape: tuple[int, ...]) -> None:
     values = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
     turned = np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
-    came = decode(encode(dataclasses.replace(SNAPSHOT, weights={"w": turned})), LIMITS)
+    data = encode(dataclasses.replace(SNAPSHOT, weights={"w": turned}))
+    assert unwire(data)[1]["arrays"][0][3] is not turned.flags.c_contiguous
+    came = decode(data, LIMITS)
     assert isinstance(came, Snapshot)
     np.testing.assert_array_equal(came.weights["w"], values)
 
@@ -155,6 +157,8 @@ def test_encoding_an_unsupported_dtype_raises_value_error(dtype: str) -> None:
 def test_threads_may_encode_and_decode_concurrently() -> None:
     """A zstd context shared by threads fails or crashes within a few of these operations."""
     failures: list[object] = []
+    rollouts = [some_rollout(), some_rollout(PIXELS)]
+    encoded = [encode(rollout) for rollout in rollouts]
 
     def work(value: int) -> None:
         model = np.tile(np.arange(value, value + 100, dtype=np.uint8), 5000)
@@ -163,6 +167,7 @@ def test_threads_may_encode_and_decode_concurrently() -> None:
                 came = decode(encode(Program(hash="h", model=model)), LIMITS)
                 assert isinstance(came, Program)
                 assert came.model.tobytes() == model.tobytes()
+            assert [encode(rollout) for rollout in rollouts] == encoded
         except Exception as error:
             failures.append(error)
 

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 from daedalus.protocol import keys
-from daedalus.transport.interface import Inbox, OnAnswer, Request, TransportError
+from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request, TransportError
 
 from .network import Network, matches
 from .process import Channel, Process
-from .traffic import LinkInbox, LinkRequest, Query, Watch
+from .traffic import LinkInbox, LinkPresence, LinkRequest, Query, Watch
 
 
 class Link:
@@ -202,9 +202,10 @@ class Link:
         self.inboxes.append(inbox)
         return inbox
 
-    def declare_presence(self, key: str) -> None:
+    def declare_presence(self, key: str) -> Declaration:
         self.tokens[key] = None
         self.network.presence_changed(key)
+        return LinkPresence(self, key)
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         watch = Watch(self, key, on_change)

@@ -111,3 +111,14 @@ class Watch:
             self.told[key] = present
             self._link.network.kernel.log("presence", self._link.process.name, key, present)
             self._channel.deliver(self._on_change, key, present)
+
+
+class LinkPresence:
+    """A declared presence. No simulated process withdraws one before it closes its link."""
+
+    def __init__(self, link: "Link", key: str) -> None:
+        self._link, self._key = link, key
+
+    def close(self) -> None:
+        if self._link.tokens.pop(self._key, self) is None:
+            self._link.network.presence_changed(self._key)

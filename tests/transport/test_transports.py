@@ -327,6 +327,21 @@ def test_presence_lasts_while_any_transport_declares_it(make_end: MakeEnd) -> No
     assert sorted((shared.next(), shared.next())) == [("d/r/actors/a", False), ("d/r/actors/b", False)]
 
 
+def test_presence_can_be_withdrawn_and_declared_again(make_end: MakeEnd) -> None:
+    learner, gateway = make_end(), make_end()
+    tape = Tape()
+    learner.watch_presence("d/r/actors/*", tape)
+    first, second = (gateway.declare_presence(f"d/r/actors/{name}") for name in "ab")
+    assert sorted((tape.next(), tape.next())) == [("d/r/actors/a", True), ("d/r/actors/b", True)]
+    first.close()
+    first.close()
+    assert tape.next() == ("d/r/actors/a", False)
+    gateway.declare_presence("d/r/actors/a")
+    assert tape.next() == ("d/r/actors/a", True)
+    second.close()
+    assert tape.next() == ("d/r/actors/b", False)
+
+
 def test_close_is_idempotent(make_end: MakeEnd) -> None:
     learner, actor = make_end(), make_end()
     tape = Tape()

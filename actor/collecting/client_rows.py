@@ -1,0 +1,187 @@
+"""The rows of a loop that somebody else owns, under one learner. State without threads or I/O."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+
+from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
+from daedalus.actor.environments.interface import Observed
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.policy.acting.runtime import Choice
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+
+
+class ClientRows:
+    """What the loop reports, written row by row, with E = 1.
+
+    For each action call `observe`, then `choose` until it returns actions. After that the loop reports rewards, and
+    perhaps the end of the episode. Where one call of the policy chooses for several clients, call `begin_row` and
+    `take_choice` in place of `choose`.
+    """
+
+    def __init__(
+        self,
+        transforms: Transforms,
+        writer: RolloutWriter,
+        *,
+        example_mask: Any,
+        bootstrap_terminations: bool,
+        on_full: Callable[[RolloutWriter], None],
+    ) -> None:
+        """Construct the rows.
+
+        Args:
+          transforms: of the loop's spaces to the run's.
+          writer: of one environment. It has not started.
+          example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
+          bootstrap_terminations: whether a terminated episode needs its last observation.
+          on_full: called when the rollout is full: it must call `writer.finish`.
+        """
+        self._transforms, self._writer, self._example_mask = transforms, writer, example_mask
+        self._bootstrap_terminations = bootstrap_terminations
+        self._on_full = on_full
+        self._last: Observed | None = None  # the newest observation
+        self._acted = False  # the current row has an action and no outcome yet
+        self._episode_ended = False  # the next row is a reset row
+        self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
+        self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
+
+    @property
+    def in_episode(self) -> bool:
+        """Whether the last action has no outcome yet: the episode has not ended."""
+        return self._acted
+
+    @property
+    def is_between_rollouts(self) -> bool:
+        """Whether the next row is the first of a rollout: only then may another policy version choose."""
+        return self._writer.is_between_rollouts
+
+    def observe(self, observation: Any, action_mask: Any = None) -> None:
+        """Note an observation to act on, which the last action, or the last episode's end, led to.
+
+        Raises ValueError if the observation or the mask does not fit the spaces; nothing has changed then.
+        """
+        if action_mask is None and self._example_mask is not None:
+            raise ValueError("this client was constructed with an action_mask: pass one to every act()")
+        if action_mask is not None and self._example_mask is None:
+            raise ValueError(
+                "this client was constructed without an action_mask: construct it with an example of one, or act() "
+                "would choose illegal actions"
+            )
+        observed = self._transforms.observe_one(observation, action_mask, needed=True)
+        if self._last is None:
+            self._writer.start(observed)
+        elif self._cut == "restarts":
+            self._writer.restart(observed)
+        elif self._acted or self._cut == "resets":
+            self._record(observed)
+        self._last, self._cut = observed, ""
+
+    def choose(self) -> dict[str, np.ndarray] | None:
+        """Return the policy's actions {name: [1, D]}; None after a reset row, whose action has no effect."""
+        actions = self._writer.act()
+        return actions if self._has_acted() else None
+
+    def begin_row(self) -> RowInputs:
+        """Return what the policy chooses from: see RolloutWriter."""
+        return self._writer.begin_row()
+
+    def take_choice(self, choice: Choice) -> bool:
+        """Write a choice; return False if it was for a reset row, whose action has no effect: choose once more."""
+        self._writer.take_choice(choice)
+        return self._has_acted()
+
+    def _has_acted(self) -> bool:
+        if self._episode_ended:
+            self._episode_ended = False
+            assert self._last is not None
+            self._record(self._last)
+            return False
+        self._acted = True
+        return True
+
+    def env_action(self, actions: dict[str, np.ndarray]) -> Any:
+        """Return the loop's action for the policy's {name: [1, D]}."""
+        return self._transforms.env_action(actions)
+
+    def reward(self, value: float) -> None:
+        """Add to the reward of the last action. Raises ValueError before an episode's first action."""
+        if not self._acted:
+            raise ValueError("a reward came before any action of this episode: call act() first")
+        if not np.isfinite(value):
+            raise ValueError(f"the reward is {value}: it must be finite")
+        self._reward += float(value)
+
+    def end_episode(self, observation: Any, *, terminated: bool) -> None:
+        """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""
+        if not self._acted:
+            raise ValueError("the episode ended without any action: call act() first")
+        if observation is not None:
+            self._last = self._transforms.observe_one(observation, self._example_mask, needed=False)
+        elif not terminated:
+            raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
+        elif self._bootstrap_terminations:
+            raise ValueError(
+                "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
+                "pass the last observation"
+            )
+        assert self._last is not None
+        self._terminated, self._truncated = terminated, not terminated
+        self._record(self._last)
+        self._episode_ended = True
+
+    def cut(self) -> None:
+        """End the episode as truncated at the newest observation: the loop was interrupted.
+
+        What followed the last action is not known, so its row is not learned from. The next `observe` begins another
+        episode.
+        """
+        if self._last is None or self._episode_ended or self._cut:
+            return
+        if not self._writer.cut():
+            self._cut = "restarts"
+        elif self._acted:
+            self._cut = "resets"
+        else:
+            self._episode_ended = True
+        self._acted, self._reward = False, 0.0
+
+    def _record(self, observed: Observed) -> None:
+        """Complete the row of the last action."""
+        full = self._writer.record(
+            observed, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated])
+        )
+        self._acted, self._reward, self._terminated, self._truncated = False, 0.0, False, False
+        if full:
+            self._on_full(self._writer)
+
+
+def check_run(spec: RunSpec) -> None:
+    """Raise ActorError if a loop that somebody else owns cannot take part in a run."""
+    if spec.algorithm.synchronous:
+        raise ActorError(
+            f"a run with {spec.training.algorithm} makes its actors wait for each update, but a client cannot "
+            "wait: use another algorithm"
+        )
+    if spec.uploads_gradients:
+        raise ActorError(
+            "this run takes gradients (collection.upload), and a client sends rollouts: set collection.upload=rollouts"
+        )
+    _refuse_unapplied_settings(spec.environment)
+
+
+def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
+    """Raise ActorError for settings about stepping and wrapping environments: here the loop belongs to the caller."""
+    defaults = {"wrap": None, "action_repeat": 1, "no_reward_limit": None, "max_episode_steps": None}
+    changed = [
+        f"environment.{name}={getattr(spec, name)}"
+        for name, default in defaults.items()
+        if getattr(spec, name) != default
+    ]
+    if changed:
+        raise ActorError(
+            f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop wraps its "
+            "environment, repeats actions and ends episodes; start the run without these settings"
+        )

@@ -1,0 +1,91 @@
+"""Nested spaces of gymnasium as flat lists of named leaves. Pure functions.
+
+A leaf is named by the keys and indices that lead to it, joined by dots; a space that is not composite has the name
+`observation` or `action`.
+"""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces as gym
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+
+
+class Leaf(NamedTuple):
+    """A space that is not composite, and where it is in the nested space."""
+
+    name: str
+    path: tuple[str | int, ...]
+    space: gymnasium.Space
+
+    def of(self, value: Any) -> np.ndarray:
+        """Return this component of a nested value; in a batch each component has the first axis E."""
+        for key in self.path:
+            value = value[key]
+        return np.asarray(value)
+
+
+def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
+    """Return all leaves of a nested space, in gymnasium's order. `whole` is the name of a space that is not composite.
+
+    Raises EnvironmentSetupError if there are none, or two get the same name.
+    """
+    found = tuple(Leaf(".".join(map(_cleaned, path)) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
+    names = [leaf.name for leaf in found]
+    if not found:
+        raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
+    if len(set(names)) < len(names):
+        raise EnvironmentSetupError(
+            f"{whole} space {described(space)} has components with like names: {', '.join(names)}"
+        )
+    return found
+
+
+def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    if isinstance(space, gym.Dict):
+        for key, part in space.spaces.items():
+            yield from _walk(part, (*path, key))
+    elif isinstance(space, gym.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from _walk(part, (*path, index))
+    else:
+        yield path, space
+
+
+def _cleaned(key: str | int) -> str:
+    return re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII)[:48]
+
+
+class LeftOut(gymnasium.Space):
+    """The place of a component that the policy does not see."""
+
+
+def without(space: gymnasium.Space, names: Sequence[str]) -> gymnasium.Space:
+    """Return an observation space whose components of these names are LeftOut.
+
+    Raises EnvironmentSetupError for a name that is no component.
+    """
+    if not names:
+        return space
+    components = {leaf.name: leaf.path for leaf in leaves(space, "observation")}
+    unknown = [name for name in names if name not in components]
+    if unknown:
+        raise EnvironmentSetupError(
+            f"environment.leave_out names {unknown[0]!r}, but the components of the observation are "
+            f"{', '.join(components)}"
+        )
+    return _without(space, (), {components[name] for name in names})
+
+
+def _without(space: Any, path: tuple[str | int, ...], paths: Collection[tuple[str | int, ...]]) -> gymnasium.Space:
+    if path in paths:
+        return LeftOut()
+    if isinstance(space, gym.Dict):
+        return gym.Dict({key: _without(part, (*path, key), paths) for key, part in space.spaces.items()})
+    if isinstance(space, gym.Tuple):
+        return gym.Tuple([_without(part, (*path, index), paths) for index, part in enumerate(space.spaces)])
+    return space

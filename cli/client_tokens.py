@@ -1,0 +1,78 @@
+"""The tokens of a gateway's clients, in the folder of `daedalus certs`.
+
+ca/tokens.json         what is kept of each token: its digest and when it expires
+gateway/tokens.json    a copy for the gateway, which reads it again when it changes
+client-NAME/           token and ca.pem, for the client
+"""
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+
+from daedalus.gateway.tokens import TOKENS, digest, new_token
+from daedalus.protocol import keys
+from daedalus.transport.credentials import CA, CredentialsError
+
+_DAY = 86_400.0
+
+
+class ClientTokens:
+    """The tokens of one network."""
+
+    def __init__(self, directory: Path) -> None:
+        """`directory` is a folder that `daedalus certs init` made."""
+        self.directory = directory
+        self._record = directory / "ca" / TOKENS
+
+    def days_left(self) -> dict[str, float]:
+        """Return the days until each client's token expires, by name."""
+        now = time.time()
+        return {name: (entry["expires"] - now) / _DAY for name, entry in self._read().items()}
+
+    def issue(self, names: list[str], days: int) -> None:
+        """Issue tokens, new or in place of those before. Raises ValueError or CredentialsError for a wrong name."""
+        for name in names:
+            keys.check_name(name, "client name")
+            if "." in name:
+                raise CredentialsError(f"{name!r} has a '.': a token for NAME is valid for NAME.ANYTHING too")
+        known = self._read()
+        for name in names:
+            token, folder = new_token(), self.directory / f"client-{name}"
+            known[name] = {"sha256": digest(token), "expires": time.time() + days * _DAY}
+            folder.mkdir(exist_ok=True)
+            shutil.copyfile(self.directory / "ca" / CA, folder / CA)
+            _replace(folder / "token", token + "\n")
+        self._write(known)
+
+    def revoke(self, names: list[str]) -> None:
+        """Withdraw tokens. Raises CredentialsError if one is not known."""
+        known = self._read()
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise CredentialsError(f"no client is named {', '.join(unknown)}: see `daedalus certs list`")
+        for name in names:
+            del known[name]
+            shutil.rmtree(self.directory / f"client-{name}", ignore_errors=True)
+        self._write(known)
+
+    def copy_to_gateway(self) -> None:
+        """Write the gateway's copy, if the folder has a gateway."""
+        if (self.directory / "gateway").exists():
+            _replace(self.directory / "gateway" / TOKENS, json.dumps(self._read(), indent=2) + "\n")
+
+    def _read(self) -> dict[str, dict]:
+        return json.loads(self._record.read_text("utf-8")) if self._record.exists() else {}
+
+    def _write(self, known: dict[str, dict]) -> None:
+        _replace(self._record, json.dumps(known, indent=2) + "\n")
+        self.copy_to_gateway()
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file that only its owner may read, at once."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
+        file.write(text)
+    os.replace(partial, path)

@@ -1,0 +1,81 @@
+"""The choice of actions for all clients that wait, in one call of the policy. For the gateway's event loop."""
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+
+from daedalus.actor.collecting.rollout_writer import RowInputs
+from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.policy_version import PolicyVersion
+from daedalus.policy.acting.noise import draw_noise
+from daedalus.policy.acting.runtime import Choice, PolicyError
+
+_MAX_ROWS = 64  # in one call: the event loop waits for it
+
+
+class Batcher:
+    """The clients that wait for an action.
+
+    The event loop reads what all clients sent before it calls `_choose_all`: the busier the gateway, the larger the
+    batches, and nobody waits for a batch to fill.
+    """
+
+    def __init__(self, current: Callable[[], PolicyVersion], on_failure: Callable[[PolicyError], None]) -> None:
+        """Construct the batcher.
+
+        Args:
+          current: returns the newest version; called when a client waits.
+          on_failure: called if the policy does not run.
+        """
+        self._current, self._on_failure = current, on_failure
+        self._random = np.random.default_rng()
+        self._waiting: dict[ClientActor, None] = {}
+        self._scheduled = False
+
+    def add(self, actor: ClientActor) -> None:
+        """Choose for an actor that has observed, soon."""
+        self._waiting[actor] = None
+        if not self._scheduled:
+            self._scheduled = True
+            asyncio.get_running_loop().call_soon(self._choose_all)
+
+    def remove(self, actor: ClientActor) -> None:
+        """Do not choose for an actor any more."""
+        self._waiting.pop(actor, None)
+
+    def _choose_all(self) -> None:
+        self._scheduled = False
+        waiting, self._waiting = self._waiting, {}
+        current = self._current()
+        batches: dict[PolicyVersion, list[ClientActor]] = {}
+        for actor in waiting:
+            batches.setdefault(actor.select_version(current), []).append(actor)
+        try:
+            for version, actors in batches.items():
+                for first in range(0, len(actors), _MAX_ROWS):
+                    self._choose(version, actors[first : first + _MAX_ROWS])
+        except PolicyError as error:
+            self._on_failure(error)
+
+    def _choose(self, version: PolicyVersion, actors: list[ClientActor]) -> None:
+        inputs = _joined([actor.rows.begin_row() for actor in actors])
+        noise = draw_noise(version.runtime.noise_size, len(actors), self._random)
+        choice = version.runtime.act(inputs.observations, inputs.state, noise, inputs.masks)
+        for row, actor in enumerate(actors):
+            actions = {name: values[row : row + 1] for name, values in choice.actions.items()}
+            one = Choice(actions, choice.log_probs[row : row + 1], choice.state[row : row + 1])
+            if not actor.take(one):
+                self.add(actor)
+
+
+def _joined(inputs: list[RowInputs]) -> RowInputs:
+    """Return the inputs of several clients, one row for each."""
+    first = inputs[0]
+    if len(inputs) == 1:
+        return first
+    return RowInputs(
+        {name: np.concatenate([each.observations[name] for each in inputs]) for name in first.observations},
+        np.concatenate([each.state for each in inputs]),
+        {name: np.concatenate([each.masks[name] for each in inputs]) for name in first.masks},
+    )

@@ -1,0 +1,201 @@
+"""One client as an actor towards the learner: its rows and its rollouts. For the gateway's event loop."""
+
+import asyncio
+import copy
+import time
+from collections import deque
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from daedalus.actor.collecting.client_rows import ClientRows, check_run
+from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.masks import mask_of_one
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.session.upload_session import UploadSession
+from daedalus.gateway.client_spaces import ClientSpaces
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.messages import Act, EndEpisode
+from daedalus.gateway.policy_version import PolicyVersion
+from daedalus.policy.acting.runtime import Choice
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Welcome
+from daedalus.protocol.spec import RunSpec
+
+_MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
+_NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # sending replaces it
+
+
+class ClientActor:
+    """The state of one client, across its connections and the learner's epochs."""
+
+    def __init__(self, join: Join, spaces: ClientSpaces, uploads: UploadSession) -> None:
+        """`join` names the actor and its incarnation."""
+        self.join, self.spaces, self._uploads = join, spaces, uploads
+        self.heard_at = time.monotonic()
+        self.version: PolicyVersion | None = None  # of the rollout that is being written
+        self.chosen: asyncio.Future[Any] | None = None  # the action that the client waits for
+        self._session: Welcome | None = None  # that it has joined
+        self._transforms: Transforms | None = None  # of that session
+        self._rows: ClientRows | None = None
+        self._rows_epoch = -1  # of the learner that the rows are for
+        self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
+        self._sequence = 0  # of the next rollout
+
+    @property
+    def name(self) -> str:
+        """The actor's name towards the learner."""
+        return self.join.actor
+
+    @property
+    def epoch(self) -> int:
+        """The learner epoch that it has joined; -1 before the first."""
+        return -1 if self._session is None else self._session.learner_epoch
+
+    # --------------------------------------------------------------------------------------------- joining
+
+    def prepare(self, spec: RunSpec) -> tuple[Join, Transforms]:
+        """Return the request to join a run, and the transforms of its spaces. Raises ClientError if they do not fit."""
+        mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
+        try:
+            check_run(spec)
+            transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
+        except (ActorError, EnvironmentSetupError) as error:
+            raise ClientError("refused", str(error)) from None
+        return replace(self.join, spaces=transforms.spaces, environments=1), transforms
+
+    def joined(self, session: Welcome, transforms: Transforms) -> None:
+        """Take part in a session from now on; the rollouts for an earlier one are dropped."""
+        if session.learner_epoch != self.epoch:
+            self._uploads.begin(session.run, session.spec.collection.window)
+            self._sequence = 0
+            self._full.clear()
+        else:
+            self._uploads.resume()
+        self._session, self._transforms = session, transforms
+
+    # ---------------------------------------------------------------------------------------------- acting
+
+    def observe(self, message: Act, current: PolicyVersion) -> None:
+        """Note an observation to act on. Raises ClientError if the message does not fit; nothing has changed then."""
+        values = self.spaces.observation(message.observation)
+        mask = self.spaces.action_mask(message.action_mask)
+        self._add_reward(message.reward)
+        epoch = current.session.learner_epoch
+        if self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch):
+            self._begin_rows(current)
+        try:
+            self.rows.observe(values, mask)
+        except ValueError as error:
+            raise ClientError("misfit", str(error)) from None
+
+    def _add_reward(self, value: float) -> None:
+        if value and (self._rows is None or not self._rows.in_episode):
+            raise ClientError("out_of_turn", "a reward came before any action of the episode: send an act first")
+        if value:
+            self.rows.reward(value)
+
+    def _begin_rows(self, current: PolicyVersion) -> None:
+        """Continue with the policy of another learner epoch; the unfinished rollout for the previous one is dropped."""
+        assert self._transforms is not None
+        spec = current.session.spec
+        writer = RolloutWriter(
+            self._transforms.spaces,
+            1,
+            current.runtime,
+            spec.environment,
+            rollout_length=spec.collection.rollout_length,
+            random=np.random.default_rng(),  # not used: the batcher draws the noise
+        )
+        self._rows_epoch, self.version = current.session.learner_epoch, current
+        self._rows = ClientRows(
+            self._transforms,
+            writer,
+            example_mask=self.spaces.example_mask,
+            bootstrap_terminations=spec.environment.bootstrap_terminations,
+            on_full=self._keep,
+        )
+
+    @property
+    def rows(self) -> ClientRows:
+        """The rows that are being written. Call `observe` before."""
+        assert self._rows is not None
+        return self._rows
+
+    def select_version(self, current: PolicyVersion) -> PolicyVersion:
+        """Return the version that chooses the next row: the current one if the row begins a rollout."""
+        if self.rows.is_between_rollouts and self._rows_epoch == current.session.learner_epoch:
+            self.version = current
+        assert self.version is not None
+        return self.version
+
+    def take(self, choice: Choice) -> bool:
+        """Take a choice; return False if the policy must choose once more, after a reset row."""
+        if not self.rows.take_choice(choice):
+            return False
+        if self.chosen is not None and not self.chosen.done():
+            self.chosen.set_result(self.spaces.action(self.rows.env_action(choice.actions)))
+        return True
+
+    def reward(self, value: float) -> None:
+        """Add to the reward of the last action."""
+        self._add_reward(value)
+
+    def end_episode(self, message: EndEpisode) -> None:
+        """End the episode. Raises ClientError if the message does not fit; nothing has changed then."""
+        if message.observation is None and not message.terminated:
+            raise ClientError("misfit", "a truncated episode needs its last observation for the bootstrap value")
+        values = None if message.observation is None else self.spaces.observation(message.observation)
+        if self._rows is None or not self._rows.in_episode:
+            return  # another learner has come since the last action, whose row is dropped
+        try:
+            self._add_reward(message.reward)
+            self.rows.end_episode(values, terminated=message.terminated)
+        except ValueError as error:
+            raise ClientError("misfit", str(error)) from None
+
+    def cut(self) -> None:
+        """End the episode as truncated: the client disconnected."""
+        if self._rows is not None:
+            self._rows.cut()
+
+    def release(self) -> None:
+        """Let go of the policy version: this actor will not act again."""
+        self.version = self._rows = None
+
+    # --------------------------------------------------------------------------------------------- sending
+
+    def _keep(self, writer: RolloutWriter) -> None:
+        assert self.version is not None
+        rollout = copy.deepcopy(writer.finish(_NO_IDENTITY, self.version.version))
+        if self._rows_epoch == self.epoch:  # otherwise it is meant for a previous learner
+            self._full.append(rollout)
+            self.send()
+
+    def send(self) -> None:
+        """Send full rollouts while there is room in the window, and again those that are due."""
+        session = self._session
+        while session is not None and self._full and self._uploads.in_flight.has_room:
+            identity = RolloutIdentity(
+                actor=self.join.actor,
+                incarnation=self.join.incarnation,
+                sequence=self._sequence,
+                learner_epoch=session.learner_epoch,
+            )
+            self._uploads.send(self._sequence, encode(replace(self._full.popleft(), identity=identity)))
+            self._sequence += 1
+        if self._uploads.in_flight.rollouts:
+            self._uploads.send_due()
+
+    @property
+    def newest_version(self) -> int:
+        """The newest policy version that an acknowledgement mentioned."""
+        return self._uploads.in_flight.newest_version
+
+    @property
+    def ended_by(self) -> tuple[str, str]:
+        """The verdict that ended this actor's session, and the reason; both empty while it goes on."""
+        return self._uploads.in_flight.ended_by, self._uploads.in_flight.reason

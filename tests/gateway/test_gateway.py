@@ -1,0 +1,379 @@
+"""The gateway over MemoryTransport: clients play, and their rollouts reach a learner."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from gateways import CARTPOLE, JsonClient, RunningGateway
+from processes import until
+from scripted_learner import SPEC, ScriptedLearner, acknowledge
+from websockets.exceptions import ConnectionClosed
+
+from daedalus.gateway import connection
+from daedalus.gateway import gateway as gateway_module
+from daedalus.gateway.gateway import Gateway
+from daedalus.gateway.messages import Act
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol import keys
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+Connect = Callable[..., JsonClient]
+ROWS = 4
+
+
+def fill_rollout(client: JsonClient, first: float = 0.0) -> list[int]:
+    """Act until a rollout is full, from an observation that counts; return the actions."""
+    answers = [
+        client.act([first + step, 0.0, 0.0, 0.0], **({"reward": 1.0} if step else {})) for step in range(ROWS + 1)
+    ]
+    return [answer["action"] for answer in answers]
+
+
+def ended(client: JsonClient) -> int:
+    """Return the code with which the gateway closes the connection."""
+    with pytest.raises(ConnectionClosed) as closed:
+        client.receive()
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd.code
+
+
+def test_rollouts_of_a_client_reach_the_learner_under_its_name(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    welcome = client.hello("arm-1")
+    assert welcome == {"type": "welcome", "version": 1, "run": "r", "environment": "CartPole-v1", "name": "arm-1"}
+    actions = []
+    for step in range(ROWS + 1):  # a rollout ends with a further observation
+        answer = client.act([float(step), 0.0, 0.0, 0.0])
+        actions.append(answer["action"])
+        client.send("reward", reward=1.5)
+        client.send("reward", reward=0.5)
+    rollout, request = learner.receive()
+    assert (rollout.identity.actor, rollout.identity.sequence) == ("arm-1", 0)
+    assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert rollout.actions["action"][:, 0, 0].tolist() == actions[:ROWS]
+    assert rollout.rewards.tolist() == [[2.0]] * ROWS
+    acknowledge(request, "accepted")
+    joins = [learner.joins.get(timeout=1), learner.joins.get(timeout=1)]
+    assert [(join.actor, join.environments) for join in joins] == [("gateway", 0), ("arm-1", 1)]
+    assert joins[1].origin.address.startswith("ws/127.0.0.1:")
+
+
+def test_end_of_an_episode_is_a_row_of_the_rollout(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    client.hello("arm-1")
+    client.act([0.0, 0.0, 0.0, 0.0])
+    client.send("end_episode", terminated=True, observation=[1.0, 0.0, 0.0, 0.0], reward=3.0)
+    client.act([5.0, 0.0, 0.0, 0.0])
+    client.act([6.0, 0.0, 0.0, 0.0], reward=1.0)
+    client.send("end_episode", terminated=False, observation=[7.0, 0.0, 0.0, 0.0])
+    rollout, _ = learner.receive()
+    assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 5.0, 6.0, 7.0]
+    assert rollout.terminated[:, 0].tolist() == [True, False, False, False]
+    assert rollout.truncated[:, 0].tolist() == [False, False, False, True]
+    assert rollout.valid[:, 0].tolist() == [True, False, True, True]
+    assert rollout.rewards[:, 0].tolist() == [3.0, 0.0, 1.0, 0.0]
+
+
+def test_msgpack_clients_may_send_bytes_for_arrays(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+
+    def ask(message: dict[str, Any]) -> dict[str, Any]:
+        client.socket.send(bytes(msgpack.packb(message) or b""))
+        answer = client.socket.recv(timeout=10)
+        assert isinstance(answer, bytes)
+        return msgpack.unpackb(answer)
+
+    assert ask({"type": "hello", "version": 1, "name": "m", **CARTPOLE})["type"] == "welcome"
+    for step in range(ROWS + 1):
+        observation = np.array([step, 0.5, 0, 0], "<f4").tobytes()
+        assert ask({"type": "act", "observation": observation})["action"] in (0, 1)
+    rollout, _ = learner.receive()
+    assert rollout.frames["observation"][3, 0].tolist() == [3.0, 0.5, 0.0, 0.0]
+
+
+def test_clients_that_wait_are_chosen_for_in_one_call(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clients = [connect() for _ in range(3)]
+    for number, client in enumerate(clients):
+        client.hello(f"c-{number}")
+    rows: list[int] = []
+    act = OnnxRuntime.act
+    monkeypatch.setattr(OnnxRuntime, "act", lambda self, *given: rows.append(len(given[1])) or act(self, *given))
+
+    async def act_together(inner: Gateway) -> list[Any]:
+        actors = [seat.actor for seat in inner._seats.values()]
+        return await asyncio.gather(*(inner.act(actor, Act([1, 2, 3, 4], None, 0.0)) for actor in actors))
+
+    together = asyncio.run_coroutine_threadsafe(act_together(gateway.gateway), gateway.loop)
+    assert set(together.result(30)) <= {0, 1}
+    assert rows == [3]
+
+
+def test_each_rollout_has_the_newest_version_at_its_start(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    client.hello("arm-1")
+    fill_rollout(client)
+    rollout, request = learner.receive()
+    assert rollout.policy_version == 0
+    learner.publish(7, push=False)
+    acknowledge(request, "accepted", version=7)  # the gateway fetches the version that it hears of
+    versions, sequence = [], 0
+    while 7 not in versions:
+        fill_rollout(client)
+        rollout, request = learner.receive()
+        acknowledge(request, "accepted", version=7)
+        versions.append(rollout.policy_version)
+        sequence += 1
+        assert rollout.identity.sequence == sequence
+    assert set(versions) <= {0, 7}
+
+
+def test_rollouts_wait_for_a_busy_learner_and_the_oldest_are_dropped(
+    learner: ScriptedLearner, connect: Connect
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+    for number in range(12):  # of which 2 are in flight, the window, and 8 wait
+        fill_rollout(client, 100.0 * number)
+    first, second = learner.receive(), learner.receive()
+    assert learner.rollouts.empty()
+    acknowledge(first[1], "busy")
+    again, request = learner.receive()
+    assert again.identity == first[0].identity
+    acknowledge(request, "accepted")
+    acknowledge(second[1], "accepted")
+    third, _ = learner.receive()
+    assert third.identity.sequence == 2
+    assert third.frames["observation"][0, 0, 0] >= 400.0
+
+
+def test_disconnected_client_is_absent_and_may_continue_its_rollout(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect
+) -> None:
+    present: dict[str, bool] = {}
+    learner.transport.watch_presence(keys.presence("r", "*", "*"), lambda key, there: present.update({key: there}))
+    client = connect()
+    client.hello("phone")
+    for step in range(3):
+        client.act([float(step), 0.0, 0.0, 0.0])
+    assert list(present.values()) == [True]
+    client.close()
+    until(lambda: not any(present.values()))
+    client = connect()
+    assert client.hello("phone")["type"] == "welcome"
+    assert list(present.values()) == [True], "the same incarnation"
+    client.act([5.0, 0.0, 0.0, 0.0])
+    client.act([6.0, 0.0, 0.0, 0.0])
+    rollout, _ = learner.receive()
+    assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 2.0, 5.0, 6.0]
+    assert rollout.truncated[:, 0].tolist() == [False, True, False, False]
+    assert rollout.valid[:, 0].tolist() == [True, True, False, True]
+
+
+def test_silent_client_holds_up_nobody_and_loses_its_version_when_memory_is_needed(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gateway_module, "_MIN_VERSIONS", 2)
+    monkeypatch.setattr(gateway_module, "_VERSION_BYTES", 0)
+    monkeypatch.setattr(gateway_module, "_SLOW_SECONDS", 0.5)
+    silent, busy = connect(), connect()
+    silent.hello("silent")
+    silent.act([0.0, 0.0, 0.0, 0.0])  # it now holds version 0
+    busy.hello("busy")
+    newest = version = 0
+    while version < 2:  # there is no room for version 2 before version 0 is given up
+        newest = version + 1
+        learner.publish(newest, push=False)
+        fill_rollout(busy)
+        rollout, request = learner.receive()
+        acknowledge(request, "accepted", version=newest)
+        version = rollout.policy_version
+    error = silent.receive()
+    assert (error["type"], error["code"]) == ("error", "unavailable")
+    assert ended(silent) == 1013
+
+
+def test_clients_join_the_learner_that_returns(
+    network: MemoryNetwork, learner: ScriptedLearner, connect: Connect
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+    client.act([0.0, 0.0, 0.0, 0.0])
+    learner.transport.close()
+    assert client.act([1.0, 0.0, 0.0, 0.0])["type"] == "action", "the last policy acts while no learner is there"
+    returned = ScriptedLearner(network, epoch=2)
+    returned.publish(5)
+    try:
+        until(lambda: "arm-1" in [join.actor for join in list(returned.joins.queue)])
+        while returned.rollouts.empty():
+            fill_rollout(client, 10.0)
+        rollout, _ = returned.receive()
+        assert (rollout.identity.learner_epoch, rollout.identity.sequence) == (2, 0)
+        assert rollout.policy_version == 5
+    finally:
+        returned.transport.close()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "text"),
+    [("quarantined", "the learner quarantined this client: why"), ("drained", "an operator drained this client")],
+)
+def test_verdict_on_a_client_ends_its_connection_and_says_why(
+    learner: ScriptedLearner, connect: Connect, verdict: Any, text: str
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+    fill_rollout(client)
+    learner.receive()[1].reply(encode(Acknowledgement(verdict=verdict, reason="why")))
+    error = client.receive()
+    assert (error["type"], error["code"]) == ("error", "refused")
+    assert text in error["reason"]
+    assert ended(client) == 1008
+
+
+def test_end_of_the_run_is_told_to_all_clients(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    client.hello("arm-1")
+    message = RunEnded(learner_epoch=1, outcome="finished", reason="solved")
+    learner.transport.publish(keys.run_end("r"), encode(message))
+    assert client.receive() == {"type": "run_ended", "reason": "the run is over: solved"}
+    assert ended(client) == 1000
+
+
+def test_client_waits_for_a_learner(network: MemoryNetwork, connect: Connect) -> None:
+    client = connect()
+    client.send("hello", version=1, name="early", **CARTPOLE)
+    learner = ScriptedLearner(network)
+    try:
+        until(lambda: learner.joins.qsize() >= 2)
+        learner.publish(0)
+        assert client.receive()["type"] == "welcome"
+        assert client.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
+    finally:
+        learner.transport.close()
+
+
+def test_client_is_told_that_no_learner_came(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_module, "_JOIN_SECONDS", 0.3)
+    client = connect()
+    error = client.hello("early")
+    assert error["code"] == "unavailable"
+    assert "no learner came" in error["reason"]
+
+
+def test_refusal_of_the_learner_reaches_the_client(learner: ScriptedLearner, connect: Connect) -> None:
+    until(lambda: not learner.joins.empty())
+    learner.refusal = Refusal(code="mismatch", reason="the actor has 2 choices, but this run has 3 choices")
+    client = connect()
+    error = client.hello("arm-1")
+    assert error["code"] == "refused"
+    assert "2 choices, but this run has 3" in error["reason"]
+    assert ended(client) == 1008
+
+
+def test_synchronous_run_refuses_clients(network: MemoryNetwork, connect: Connect) -> None:
+    training = SPEC.training.model_copy(update={"algorithm": "a2c"})
+    learner = ScriptedLearner(network, SPEC.model_copy(update={"training": training}))
+    try:
+        assert "a client cannot wait: use another algorithm" in connect().hello("arm-1")["reason"]
+    finally:
+        learner.transport.close()
+
+
+def test_name_belongs_to_one_client_at_a_time(learner: ScriptedLearner, connect: Connect) -> None:
+    first, second = connect(), connect()
+    first.hello("arm-1")
+    assert "a client named 'arm-1' is connected" in second.hello("arm-1")["reason"]
+    assert first.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "é", "x" * 65, "<b>"])
+def test_name_that_is_no_part_of_a_key_is_refused(learner: ScriptedLearner, connect: Connect, name: str) -> None:
+    assert "name must be 1 to 64 letters" in connect().hello(name)["reason"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"type": "act", "observation": [1, 2, 3]}, "the observation has 3 values, but its space is float32 array"),
+        ({"type": "act", "observation": ["a"] * 4}, "not an array of numbers"),
+        ({"type": "act", "observation": [1e300, 0, 0, 0]}, "not finite"),
+        ({"type": "act", "observation": [[1, 2], 3]}, "not an array of numbers"),
+        ({"type": "act"}, "act lacks the field 'observation'"),
+        ({"type": "act", "observation": [0] * 4, "action_mask": [1, 1]}, "no action is masked in the hello"),
+        ({"type": "act", "observation": [0] * 4, "reward": "1"}, "a reward must be a number"),
+        ({"type": "act", "observation": [0] * 4, "more": 1}, "act has an unknown field 'more'"),
+        ({"type": "hello", "version": 1, "name": "b", **CARTPOLE}, "hello is out of turn: a connection has one hello"),
+        ({"type": "end_episode", "terminated": False}, "a truncated episode needs its last observation"),
+        ({"type": "end_episode", "terminated": 1}, "terminated must be true or false"),
+        ({"type": "fly"}, "the message has no type that a client sends"),
+        ("nonsense", "the message has no type that a client sends"),
+    ],
+)
+def test_wrong_message_is_answered_and_nothing_is_lost(
+    learner: ScriptedLearner, connect: Connect, fields: Any, text: str
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+    client.act([0.0, 0.0, 0.0, 0.0])
+    client.socket.send(json.dumps(fields))
+    error = client.receive()
+    assert error["type"] == "error"
+    assert text in error["reason"]
+    for step in range(1, ROWS + 1):
+        client.act([float(step), 0.0, 0.0, 0.0], reward=1.0)
+    rollout, _ = learner.receive()
+    assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert rollout.rewards[:, 0].tolist() == [1.0] * ROWS
+
+
+def test_client_with_many_faults_is_disconnected(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    client.hello("arm-1")
+    for _ in range(10):
+        client.send("fly")
+        assert client.receive()["code"] == "malformed"
+    assert ended(client) == 1008
+
+
+@pytest.mark.parametrize("data", ["{", "[" * 100_000, b"\xc1", b"", '{"type": NaN}', "1" * 5000])
+def test_damaged_first_message_ends_the_connection(learner: ScriptedLearner, connect: Connect, data: Any) -> None:
+    client = connect()
+    client.socket.send(data)
+    answer = client.socket.recv(timeout=10)
+    decoded = msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
+    assert decoded["code"] == "malformed"
+    assert ended(client) == 1008
+
+
+def test_message_larger_than_the_spaces_need_ends_the_connection(learner: ScriptedLearner, connect: Connect) -> None:
+    client = connect()
+    client.hello("arm-1")
+    client.socket.send(" " * 10_000)
+    assert ended(client) == 1009
+
+
+def test_connection_without_a_hello_is_closed(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "HELLO_SECONDS", 0.2)
+    client = connect()
+    assert "no hello came" in client.receive()["reason"]
+    assert ended(client) == 1008
+
+
+def test_gateway_stops_while_clients_play(learner: ScriptedLearner, network: MemoryNetwork) -> None:
+    running = RunningGateway(MemoryTransport(network))
+    client = JsonClient(running.port)
+    client.hello("arm-1")
+    client.act([0.0, 0.0, 0.0, 0.0])
+    running.close()
+    assert client.receive() == {"type": "error", "code": "unavailable", "reason": "the gateway stops"}
+    client.close()

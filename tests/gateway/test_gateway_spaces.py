@@ -1,0 +1,201 @@
+"""Clients with composite spaces and masks: what the policy sees and what the rollouts hold, compared with a Client."""
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gateways import JsonClient, RunningGateway
+from gymnasium import spaces as gym
+from scripted_learner import Policy, ScriptedLearner
+
+from daedalus.actor.environments.transforms import Transforms
+from daedalus.gateway.client_spaces import ClientSpaces
+from daedalus.gateway.errors import ClientError
+from daedalus.protocol.messages import Rollout
+from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.transport.memory import MemoryNetwork
+
+STATED: dict[str, Any] = {
+    "observations": {
+        "camera.image": {"kind": "array", "shape": [2, 3], "dtype": "uint8"},
+        "sensors.level": {"kind": "array", "shape": [2], "dtype": "float32"},
+        "sensors.code": {"kind": "discrete", "counts": [3, 2]},
+        "mode": {"kind": "discrete", "counts": [4]},
+    },
+    "actions": {
+        "gear": {"kind": "discrete", "counts": [4], "masked": True},
+        "lights": {"kind": "discrete", "counts": [2, 2]},
+        "arm.push": {"kind": "continuous", "low": [-2.0, 0.0], "high": [2.0, 10.0]},
+        "arm.free": {"kind": "continuous", "low": [None], "high": [None]},
+    },
+}
+OBSERVATION = {
+    "camera.image": [[1, 2, 3], [4, 5, 255]],
+    "sensors.level": [0.5, -1.5],
+    "sensors.code": [2, 1],
+    "mode": 3,
+}
+MASK = {"gear": [True, False, False, True]}
+SAME = (
+    gym.Dict(
+        camera=gym.Dict(image=gym.Box(0, 255, (2, 3), np.uint8)),
+        sensors=gym.Dict(level=gym.Box(-np.inf, np.inf, (2,), np.float32), code=gym.MultiDiscrete([3, 2])),
+        mode=gym.Discrete(4),
+    ),
+    gym.Dict(
+        gear=gym.Discrete(4),
+        lights=gym.MultiDiscrete([2, 2]),
+        arm=gym.Dict(
+            push=gym.Box(np.array([-2, 0], np.float32), np.array([2, 10], np.float32)),
+            free=gym.Box(-np.inf, np.inf, (1,), np.float32),
+        ),
+    ),
+)
+
+
+def run_spec(**environment: Any) -> RunSpec:
+    return RunSpec.model_validate({"environment": {"id": "Any-v0", **environment}, "collection": {"rollout_length": 4}})
+
+
+def spaces_of(spec: RunSpec, observations: gymnasium.Space, actions: gymnasium.Space, mask: Any) -> Transforms:
+    batch = None if mask is None else {name: np.array(flags)[None] for name, flags in mask.items()}
+    return Transforms(spec.environment, observations, actions, batch)
+
+
+@pytest.fixture
+def play(network: MemoryNetwork, gateway: RunningGateway) -> Iterator[Callable[..., tuple[list[Any], Rollout]]]:
+    """Function that plays one rollout as a client; return the actions and the rollout."""
+    opened: list[Any] = []
+
+    def play_one(spec: RunSpec, transforms: Transforms, stated: dict[str, Any], **act: Any) -> tuple[list, Rollout]:
+        policy = Policy.of(PolicySpec(hidden=(8,), memory="gru", memory_units=4), transforms.spaces)
+        learner = ScriptedLearner(network, spec, policy=policy)
+        opened.append(learner.transport)
+        learner.publish(0)
+        client = JsonClient(gateway.port)
+        opened.append(client)
+        welcome = client.hello("c", stated)
+        assert welcome["type"] == "welcome", welcome
+        actions = []
+        for _ in range(5):
+            answer = client.act(**act)
+            assert answer["type"] == "action", answer
+            actions.append(answer["action"])
+        return actions, learner.receive()[0]
+
+    yield play_one
+    for one in reversed(opened):
+        one.close()
+
+
+def test_composite_spaces_with_masks_and_memory(play: Callable[..., tuple[list[Any], Rollout]]) -> None:
+    spec = run_spec()
+    transforms = spaces_of(spec, *SAME, MASK)
+    actions, rollout = play(spec, transforms, STATED, observation=OBSERVATION, action_mask=MASK)
+    for action in actions:
+        assert action.keys() == STATED["actions"].keys()
+        assert action["gear"] in (0, 3)
+        assert len(action["lights"]) == 2
+        assert set(action["lights"]) <= {0, 1}
+        assert -2.0 <= action["arm.push"][0] <= 2.0
+        assert 0.0 <= action["arm.push"][1] <= 10.0
+        assert len(action["arm.free"]) == 1
+    for name, value in OBSERVATION.items():
+        np.testing.assert_array_equal(rollout.frames[name][0, 0].reshape(-1), np.array(value).reshape(-1))
+    assert rollout.masks["gear"].all(axis=(0, 1)).tolist() == MASK["gear"]
+    assert rollout.actions["gear"][:, 0, 0].tolist() == [action["gear"] for action in actions[:4]]
+    pushed = -2.0 + (np.clip(rollout.actions["arm.push"][0, 0, 0], -1, 1) + 1.0) * 2.0
+    assert actions[0]["arm.push"][0] == pytest.approx(pushed, abs=1e-5)
+    assert rollout.initial_state.shape == (1, 4)
+
+
+def test_transforms_of_the_run_apply_to_clients(play: Callable[..., tuple[list[Any], Rollout]]) -> None:
+    """Stacked frames, and a table of discrete actions over a continuous space."""
+    spec = run_spec(frame_stack=3, action_table=[[-1.0], [0.5], [1.0]])
+    observations, action = gym.Box(-np.inf, np.inf, (2,), np.float32), gym.Box(-1, 1, (1,), np.float32)
+    stated = {
+        "observations": {"observation": {"kind": "array", "shape": [2], "dtype": "float32"}},
+        "actions": {"action": {"kind": "continuous", "low": [-1.0], "high": [1.0]}},
+    }
+    actions, rollout = play(spec, spaces_of(spec, observations, action, None), stated, observation=[1.0, 2.0])
+    assert {value for (value,) in actions} <= {-1.0, 0.5, 1.0}
+    assert rollout.frames["observation"].shape == (3 + 4, 1, 2)
+
+
+def test_spaces_of_a_client_equal_those_of_an_environment() -> None:
+    spec = run_spec()
+    client = ClientSpaces(STATED["observations"], STATED["actions"])
+    mask = {name: flags[None] for name, flags in (client.example_mask or {}).items()}
+    ours = Transforms(spec.environment, client.observation_space, client.action_space, mask)
+    assert ours.spaces == spaces_of(spec, *SAME, MASK).spaces
+
+
+PLAIN = {"kind": "array", "shape": [1], "dtype": "float32"}
+CHOICE = {"kind": "discrete", "counts": [2]}
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "text"),
+    [
+        ({}, {"action": CHOICE}, "observations"),
+        ("x", {"action": CHOICE}, "observations"),
+        ({"observation": PLAIN}, {"action": {"kind": "discrete", "counts": [10**9]}}, "actions"),
+        ({"observation": {**PLAIN, "shape": [1 << 20, 1 << 20]}}, {"action": CHOICE}, "bytes: use at most"),
+        ({"observation": {**PLAIN, "dtype": "float64"}}, {"action": CHOICE}, "dtype"),
+        ({"observation": {**PLAIN, "frames": 4}}, {"action": CHOICE}, "frames must be 1"),
+        ({"a": PLAIN, "a.b": PLAIN}, {"action": CHOICE}, "like names"),
+        ({"a.b": PLAIN, "a": PLAIN}, {"action": CHOICE}, "the name of others"),
+        ({"observation": PLAIN}, {"action": {"kind": "continuous", "low": [1.0], "high": [0.0]}}, "lower bound"),
+        ({"observation": {**CHOICE, "masked": True}}, {"action": CHOICE}, "masked is for actions"),
+        ({"<b>": PLAIN}, {"action": CHOICE}, "observations"),
+    ],
+)
+def test_wrong_spaces_are_named(observations: Any, actions: Any, text: str) -> None:
+    with pytest.raises(ClientError, match=text) as fault:
+        ClientSpaces(observations, actions)
+    assert fault.value.code == "misfit"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ({**OBSERVATION, "mode": 4}, "mode of the observation is outside its space"),
+        ({**OBSERVATION, "mode": 1.5}, "mode of the observation is not an array of integers"),
+        ({**OBSERVATION, "camera.image": [[0] * 3, [0, 0, 256]]}, "not from 0 to 255"),
+        ({**OBSERVATION, "camera.image": b"12345"}, "has 5 bytes"),
+        ({**OBSERVATION, "sensors.level": [10**400, 0]}, "not an array of numbers"),
+        ({**OBSERVATION, "sensors.level": [1e16, 0]}, "beyond"),
+        ({**OBSERVATION, "sensors.level": [1e300, 0]}, "not finite"),
+        ({**OBSERVATION, "more": 1}, "must be a map with"),
+        ([1, 2], "must be a map with"),
+    ],
+)
+def test_wrong_observations_are_named(value: Any, text: str) -> None:
+    spaces = ClientSpaces(STATED["observations"], STATED["actions"])
+    with pytest.raises(ClientError, match=text):
+        spaces.observation(value)
+
+
+@pytest.mark.parametrize(
+    ("mask", "text"),
+    [
+        (None, "act lacks the action_mask"),
+        ({"gear": [1, 0]}, "a list of 4 flags"),
+        ({"gear": [0, 0, 0, 0]}, "forbids every choice"),
+        ({"lights": [1, 1, 1, 1]}, "must be a map with gear"),
+        ({"gear": [2.5, 0, 0, 0]}, "a list of 4 flags"),
+    ],
+)
+def test_wrong_masks_are_named(mask: Any, text: str) -> None:
+    with pytest.raises(ClientError, match=text):
+        ClientSpaces(STATED["observations"], STATED["actions"]).action_mask(mask)
+
+
+def test_largest_legal_message_fits_the_limit() -> None:
+    spaces = ClientSpaces(STATED["observations"], STATED["actions"])
+    worst = {**OBSERVATION, "sensors.level": [-1.2345678901234567e-300] * 2, "camera.image": [[255] * 3] * 2}
+    message = json.dumps({"type": "act", "observation": worst, "action_mask": {"gear": [False] * 4}}, indent=4)
+    assert len(message) <= spaces.max_message_bytes < 10_000

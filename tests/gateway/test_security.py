@@ -1,0 +1,187 @@
+"""Who may use a gateway: tokens, TLS, origins and hosts; and the limits of one client."""
+
+import json
+import socket
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from gateways import JsonClient, RunningGateway
+from processes import LIMIT, Running
+from scripted_learner import ScriptedLearner
+from websockets.exceptions import InvalidStatus
+
+from daedalus.cli.commands.certs import certs
+from daedalus.gateway import server
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.rate_limit import RateLimit
+from daedalus.gateway.security import guard
+from daedalus.gateway.tokens import TOKENS, Tokens, digest
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+Connect = Callable[..., JsonClient]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates of a gateway, and tokens of two clients."""
+    made = tmp_path_factory.mktemp("certificates") / "certs"
+    assert certs(["init", str(made)]) == 0
+    assert certs(["issue", "gateway", "--directory", str(made)]) == 0
+    assert certs(["issue", "client", "phone", "arm", "--directory", str(made)]) == 0
+    return made
+
+
+@pytest.fixture
+def secured(folder: Path, network: MemoryNetwork, learner: ScriptedLearner) -> Iterator[RunningGateway]:
+    running = RunningGateway(MemoryTransport(network), folder / "gateway")
+    yield running
+    running.close()
+    assert running.failure is None
+
+
+def token(folder: Path, name: str) -> str:
+    return (folder / f"client-{name}" / "token").read_text().strip()
+
+
+def secure_client(gateway: RunningGateway, folder: Path) -> JsonClient:
+    """A client that trusts the CA in the folder of its token."""
+    context = ssl.create_default_context(cafile=folder / "client-phone" / "ca.pem")
+    return JsonClient(gateway.port, scheme="wss", ssl=context)
+
+
+def test_token_admits_its_own_name_only(secured: RunningGateway, folder: Path) -> None:
+    for name, given, expected in [
+        ("phone", token(folder, "phone"), "welcome"),
+        ("phone.2", token(folder, "phone"), "welcome"),
+        ("arm", token(folder, "phone"), "error"),
+        ("phonetic", token(folder, "phone"), "error"),
+        ("phone", "", "error"),
+        ("unknown", token(folder, "phone"), "error"),
+    ]:
+        client = secure_client(secured, folder)
+        answer = client.hello(name, token=given)
+        client.close()
+        assert answer["type"] == expected, (name, answer)
+        if expected == "error":
+            assert "daedalus certs issue client NAME" in answer["reason"]
+
+
+def test_connection_without_tls_is_not_served(secured: RunningGateway) -> None:
+    with pytest.raises(Exception, match=r"did not receive a valid HTTP response|connection|closed"):
+        JsonClient(secured.port)
+
+
+def test_revoked_and_expired_tokens_are_refused_without_a_restart(tmp_path: Path) -> None:
+    made = tmp_path / "certs"
+    assert certs(["init", str(made)]) == 0
+    assert certs(["issue", "client", "phone", "--directory", str(made)]) == 0
+    assert certs(["issue", "gateway", "--directory", str(made)]) == 0  # tokens of before are its own too
+    tokens, given = Tokens(made / "gateway"), token(made, "phone")
+    tokens.check("phone", given)
+    record = made / "gateway" / TOKENS
+    record.write_text(json.dumps({"phone": {"sha256": digest(given), "expires": 1.0}}))
+    with pytest.raises(ClientError, match="the token has expired"):
+        tokens.check("phone", given)
+    assert certs(["renew", "client", "phone", "--directory", str(made)]) == 0
+    with pytest.raises(ClientError, match="not one of this name"):
+        tokens.check("phone", given)
+    renewed = token(made, "phone")
+    tokens.check("phone", renewed)
+    assert certs(["revoke", "client", "phone", "--directory", str(made)]) == 0
+    with pytest.raises(ClientError, match="not one of this name"):
+        tokens.check("phone", renewed)
+    assert not (made / "client-phone").exists()
+    record.unlink()
+    with pytest.raises(ClientError, match="cannot read its tokens"):
+        tokens.check("phone", renewed)
+
+
+@pytest.mark.parametrize("content", ["[]", "{", '{"a": {"sha256": "00", "expires": 1}}', '{"a": {"sha256": 1}}'])
+def test_damaged_tokens_are_refused_at_the_start(tmp_path: Path, content: str) -> None:
+    (tmp_path / TOKENS).write_text(content)
+    with pytest.raises(ValueError, match=r"damaged|not a map|Expecting"):
+        Tokens(tmp_path)
+
+
+def test_token_files_are_readable_by_their_owner_only_and_keep_no_token(folder: Path) -> None:
+    for path in (folder / "client-phone" / "token", folder / "gateway" / TOKENS, folder / "ca" / TOKENS):
+        assert path.stat().st_mode & 0o077 == 0
+    assert token(folder, "phone") not in (folder / "gateway" / TOKENS).read_text()
+
+
+def test_list_shows_tokens(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert certs(["list", "--directory", str(folder)]) == 0
+    listed = capsys.readouterr().out
+    assert "client-phone" in listed
+    assert "gateway " in listed
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Origin": "http://localhost:PORT"}, 200),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "http://localhost:1"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "evil.example:PORT", "Origin": "http://evil.example:PORT"}, 403),
+    ],
+)
+def test_requests_of_other_pages_and_under_other_names_are_refused(
+    learner: ScriptedLearner, gateway: RunningGateway, headers: dict[str, str], status: int
+) -> None:
+    filled = {name: value.replace("PORT", str(gateway.port)) for name, value in headers.items()}
+    request = urllib.request.Request(f"http://127.0.0.1:{gateway.port}/protocol.json", headers=filled)
+    try:
+        with urllib.request.urlopen(request, timeout=LIMIT) as answer:
+            found, policy = answer.status, answer.headers["Content-Security-Policy"]
+    except urllib.error.HTTPError as error:
+        found, policy = error.code, error.headers["Content-Security-Policy"]
+        error.close()
+    assert found == status
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+
+
+def test_page_of_another_site_cannot_open_a_websocket(learner: ScriptedLearner, connect: Connect) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        connect(origin="http://evil.example")
+    assert refused.value.response.status_code == 403
+    assert b"allow them with --allow-origin" in refused.value.response.body
+
+
+def test_allowed_origins_and_names_are_the_gateways_and_those_of_the_user() -> None:
+    rules = guard(["localhost", "play.example"], 443, ["https://other.example/"], tokens=object())  # type: ignore[arg-type] - not used
+    assert rules.refusal([(b"host", b"play.example"), (b"origin", b"https://play.example")]) == ""
+    assert rules.refusal([(b"host", b"Play.Example:443"), (b"origin", b"https://other.example")]) == ""
+    assert "may not connect" in rules.refusal([(b"host", b"play.example"), (b"origin", b"http://play.example")])
+    assert "does not serve the host" in rules.refusal([])
+
+
+def test_client_that_sends_too_fast_waits() -> None:
+    limit = RateLimit(rate=10.0, burst=3.0)
+    assert [limit.take(100.0) for _ in range(3)] == [0.0] * 3
+    assert limit.take(100.0) == pytest.approx(0.1)
+    assert limit.take(100.0) == pytest.approx(0.2)
+    assert limit.take(100.5) == 0.0
+
+
+def test_connection_without_a_request_is_closed(
+    learner: ScriptedLearner, gateway: RunningGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
+    with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as silent:
+        silent.sendall(b"GET /actor HTTP/1.1\r\nHost:")
+        assert silent.recv(1) == b""
+
+
+def test_gateway_beyond_loopback_needs_tls(start: Callable[..., Running]) -> None:
+    process = start("gateway", "--connect", "tcp/127.0.0.1:1", "--listen", "0.0.0.0:0")
+    process.expect(r"0\.0\.0\.0:0 is unencrypted .* use --serve-tls")
+    assert process.wait() == 2
