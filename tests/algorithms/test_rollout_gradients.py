@@ -52,11 +52,14 @@ def snapshot(learner: Learner, progress: float = 0.0) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("memory", ["none", "gru"])
 @pytest.mark.parametrize("optimizer", ["adam", "rmsprop"])
-def test_the_gradients_of_one_actor_make_the_updates_of_its_rollouts_to_the_bit(memory: str, optimizer: str) -> None:
+def test_gradients_of_single_rollouts_make_the_updates_of_the_rollouts_to_the_bit(memory: str, optimizer: str) -> None:
+    """Two actors take turns: each needs the statistics of the returns of both, which snapshots bring."""
     spec = spec_of(memory=memory, optimizer=optimizer, **NORMALISED, **ANNEALED)
-    by_rollouts, by_gradients, actor = learner_of(spec), learner_of(spec), RolloutGradients(spec, SPACES)
-    for sequence in range(4):
-        progress, rollout = sequence / 4, played("a", sequence, by_rollouts.state_size)
+    by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
+    actors = {name: RolloutGradients(spec, SPACES) for name in "ab"}
+    for turn in range(4):
+        name, progress = "ab"[turn % 2], turn / 4
+        actor, rollout = actors[name], played(name, turn // 2, by_rollouts.state_size)
         actor.load(snapshot(by_gradients, progress))
         by_gradients.apply([sent(actor, rollout)], progress)
         assert by_rollouts.step([rollout], progress) == []
