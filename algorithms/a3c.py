@@ -1,8 +1,8 @@
-"""A3C: asynchronous advantage actor-critic, from rollouts.
+"""A3C: asynchronous advantage actor-critic.
 
 In the paper a worker computes the gradient at the weights that chose the actions, and only the application of the
-gradient is delayed. Here the learner computes the gradient at its newest weights, from a rollout of older weights, and
-does not correct for the policy lag.
+gradient is delayed. So it is with `collection.upload = "gradients"`. With rollouts, the learner computes the gradient
+at its newest weights, from a rollout of older weights, and does not correct for the policy lag.
 """
 
 from daedalus.algorithms.policy_gradient import PolicyGradient
@@ -10,6 +10,6 @@ from daedalus.protocol.algorithms import ALGORITHMS
 
 
 class A3c(PolicyGradient):
-    """Mnih et al. (2016), algorithm S3, with the gradient computed by the learner (see the top of this file)."""
+    """Mnih et al. (2016), algorithm S3 (see the top of this file for who computes the gradient)."""
 
     record = ALGORITHMS["a3c"]

@@ -5,6 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.losses import explained_variance, mean, shares_of, variance
+
+BATCH_METRICS = ("explained_variance", "value_mean", "advantage_std")
 VALUE_ERROR_QUANTILES = {"value_error_p05": 0.05, "value_error_p50": 0.5, "value_error_p95": 0.95}
 
 
@@ -17,6 +20,18 @@ class FirstPass(NamedTuple):
     targets: Tensor  # value targets
     advantages: Tensor  # before they are normalised
     valid: Tensor  # float32, 1 or 0
+
+
+def batch_metrics(first: FirstPass) -> Tensor:
+    """Return BATCH_METRICS [3] of a batch."""
+    shares = shares_of(first.valid)
+    return torch.stack(
+        [
+            explained_variance(first.values, first.targets, shares),
+            mean(first.values, shares),
+            variance(first.advantages, shares).sqrt(),
+        ]
+    )
 
 
 def diagnostics(first: FirstPass, rho_clip: float | None) -> dict[str, float]:

@@ -148,7 +148,7 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     """Return the options of this machine's actors and of the evaluator."""
     # The learner reports the progress of all actors: the records of each one are for debugging.
     level = "debug" if run.log_level == "debug" else "warning"
-    return *_logging_options(level, run.log_json), *allow_settings(run.spec.environment.user_modules)
+    return *_logging_options(level, run.log_json), *allow_settings(run.spec.actor_modules)
 
 
 def _listening(run: LocalRun, own: str) -> list[str]:

@@ -56,7 +56,7 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
 
 def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import EnvironmentReport, slow_steps
+    from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps
 
     try:
         report = quick_check(spec.environment, UserModules(frozenset(modules_of(spec.user_modules))), fork=fork)
@@ -67,8 +67,9 @@ def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
         raise EnvironmentProblemError(report.problems[0])
     for warning in report.warnings:
         _logger.warning("%s", warning)
-    if advice := slow_steps(report, spec, os.cpu_count() or 1):
-        _logger.info("%s", advice)
+    for advice in (slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec)):
+        if advice:
+            _logger.info("%s", advice)
     return report
 
 

@@ -28,6 +28,7 @@ from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.messages import Gradient, Rollout, Upload
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
@@ -173,7 +174,8 @@ class LearnerService:
 
         program, spaces = learner.program(), self._server.fleet.spaces
         assert spaces is not None
-        self._server.offer_policy(program, learner.state_size)
+        self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
+        self._add_gradient_inputs(learner)
         self._server.publisher.publish(learner.policy_version, learner.weights())
         return Checkpointer(
             self._directory,
@@ -251,7 +253,8 @@ class LearnerService:
         if not rollouts:
             return
         skipped = learner.updates_skipped
-        left_out = learner.step(rollouts, progress)
+        left_out = self._learn_from(rollouts, learner, progress)
+        self._add_gradient_inputs(learner)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
         self._server.rollouts.count_trained(rollouts, left_out)
         self._health.updated = self._health.actor_seen = time.monotonic()
@@ -260,6 +263,21 @@ class LearnerService:
             _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
+
+    @staticmethod
+    def _learn_from(uploads: Sequence[Upload], learner: "Learner", progress: float) -> list[Upload]:
+        """Train on one batch. Return the rollouts that were left out; gradients were checked before."""
+        gradients = [upload for upload in uploads if isinstance(upload, Gradient)]
+        if gradients:
+            learner.apply(gradients, progress)
+            return []
+        return [*learner.step([upload for upload in uploads if isinstance(upload, Rollout)], progress)]
+
+    def _add_gradient_inputs(self, learner: "Learner") -> None:
+        """Let the next snapshots carry what actors need to compute gradients, if they do."""
+        if self._spec.uploads_gradients:
+            progress = self._annealing.at(self._counters.env_steps)
+            self._server.publisher.extras = learner.gradient_inputs(progress)
 
     def _status(self) -> RunStatus:
         return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())

@@ -34,7 +34,7 @@ class AlgorithmRecord(Specification):
 ALGORITHMS = {
     "a2c": AlgorithmRecord(summary="synchronous", synchronous=True),
     "a3c": AlgorithmRecord(
-        summary="asynchronous, uncorrected: not the paper's, see docs/concepts.md",
+        summary="asynchronous, uncorrected; the paper's with --set collection.upload=gradients",
         batch_rollouts=1,
         max_lag_batches=8,  # measured: docs/results.md
     ),

@@ -30,7 +30,7 @@ from pydantic import ValidationError
 
 from daedalus.protocol import schema
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program, Rollout
+from daedalus.protocol.messages import CompactSnapshot, Gradient, Message, Origin, Program, Rollout
 
 PROTOCOL_VERSION = 7
 
@@ -38,9 +38,9 @@ _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")
 _PLAIN, _ZSTD = 0, 1
 _ALIGNMENT = 8
-_DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")}
+_DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8", "<f8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
-_COMPRESSED = (Rollout, Program, CompactSnapshot)  # zstd cannot compress weights; other messages are small
+_COMPRESSED = (Rollout, Gradient, Program, CompactSnapshot)  # zstd cannot compress weights; other messages are small
 _LEVEL, _BYTES_LEVEL = (
     -1,
     1,
@@ -80,7 +80,7 @@ def encode(message: Message) -> bytes:
     header = cast(bytes, msgpack.packb(content))
     flags = _PLAIN
     if isinstance(message, _COMPRESSED) and body:
-        in_bytes = isinstance(message, CompactSnapshot) or any(
+        in_bytes = isinstance(message, (CompactSnapshot, Gradient)) or any(
             array.dtype == np.uint8 and array.ndim > 3 for _, array in arrays
         )
         smaller = (_zstd.bytes_compressor if in_bytes else _zstd.compressor).compress(body)

@@ -6,6 +6,7 @@ messages, keys.py names the keys that they use, and the learner's intake decides
 Time first: row t holds observation t, the action chosen from it and the reward that action earned.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,6 +18,21 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
 
 MAX_INFO_NAMES, MAX_INFO_VALUES = 16, 256  # of Rollout.episode_info
+LARGEST_GRADIENT_NORM = 1e12  # no healthy actor comes near it, and the mean of many gradients stays finite
+# Names in Gradient.metrics: the terms of the loss (algorithms/gradients.py), and the diagnostics that an algorithm
+# gives of a rollout (algorithms/diagnostics.py).
+LOSS_TERMS = ("policy_loss", "value_loss", "entropy", "clipped_fraction")
+DIAGNOSTICS = (
+    "explained_variance",
+    "value_mean",
+    "advantage_std",
+    "behaviour_kl",
+    "rho_mean",
+    "rho_effective_share",
+    "value_error_p05",
+    "value_error_p50",
+    "value_error_p95",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,23 +151,9 @@ class Rollout:
             if shape != (rows, environments):
                 raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {shape}")
         self._check_dtypes()
-        if self.episode_returns.ndim != 1 or self.episode_returns.shape != self.episode_lengths.shape:
-            raise ValueError("episode_returns and episode_lengths must both be [K]")
+        _check_episodes(self)
         if len(self.episode_returns) > rows * environments:
             raise ValueError("more episodes ended than the rollout has rows")
-        self._check_episode_info()
-
-    def _check_episode_info(self) -> None:
-        if len(self.episode_info) > MAX_INFO_NAMES:
-            raise ValueError(f"episode_info has {len(self.episode_info)} names, at most {MAX_INFO_NAMES} are allowed")
-        most = min(len(self.episode_returns), MAX_INFO_VALUES)
-        for name, values in self.episode_info.items():
-            check_name(name, "the name in episode_info")
-            if values.ndim != 1 or values.dtype != np.float32 or not 1 <= len(values) <= most:
-                raise ValueError(
-                    f"episode_info {name!r} must be float32 [n], with n from 1 to {most}, "
-                    f"not {values.dtype} {values.shape}"
-                )
 
     def _check_dtypes(self) -> None:
         masks = {f"masks/{name}": mask for name, mask in self.masks.items()}
@@ -159,14 +161,12 @@ class Rollout:
         for name, array in (flags | masks).items():
             if array.dtype != np.bool_:
                 raise ValueError(f"{name} must be bool, not {array.dtype}")
-        for name in ("initial_state", "behaviour_log_probs", "rewards", "episode_returns"):
+        for name in ("initial_state", "behaviour_log_probs", "rewards"):
             if getattr(self, name).dtype != np.float32:
                 raise ValueError(f"{name} must be float32, not {getattr(self, name).dtype}")
         for name, actions in self.actions.items():
             if actions.dtype != np.float32 and actions.dtype.kind not in "iu":
                 raise ValueError(f"actions/{name} must be float32 or integers, not {actions.dtype}")
-        if self.episode_lengths.dtype.kind not in "iu":
-            raise ValueError("episode_lengths must be integers")
 
     @property
     def rows(self) -> int:
@@ -177,6 +177,82 @@ class Rollout:
     def environments(self) -> int:
         """E, the number of environments."""
         return self.rewards.shape[1]
+
+    @property
+    def env_steps(self) -> int:
+        """Number of valid rows, over all environments."""
+        return int(np.count_nonzero(self.valid))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gradient:
+    """Gradient of one rollout at the weights that played it. Actor -> learner, on `rollouts/{actor}`.
+
+    Actors send it in place of the rollout if `collection.upload` is `gradients`. With it come the results that the
+    learner would compute from the rows.
+    """
+
+    identity: RolloutIdentity  # of the rollout
+    policy_version: int  # of the weights
+    # By parameter that has a gradient: float32 [*shape], or the planes of its bfloat16 (protocol/compact.py), uint8
+    # [2, *shape]. The mean over the valid rows; not clipped.
+    gradient: dict[str, np.ndarray]
+    env_steps: int  # valid rows of the rollout
+    metrics: dict[str, np.ndarray]  # each of LOSS_TERMS, and those of DIAGNOSTICS that are known: float32 scalars []
+    # Mean and sum of squared deviations over the valid rows, float64 [2, *shape]: `observations/NAME` of each component
+    # that is normalised, and `returns` of the discounted returns if rewards are normalised.
+    moments: dict[str, np.ndarray]
+    action_counts: dict[str, np.ndarray]  # of each discrete component [choices] int64
+    episode_returns: np.ndarray  # as in Rollout, like the next two
+    episode_lengths: np.ndarray
+    episode_info: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.gradient:
+            raise ValueError("a gradient must have parameters")
+        for name, values in self.gradient.items():
+            planes = values.dtype == np.uint8 and values.ndim > 0 and len(values) == 2
+            if values.dtype != np.float32 and not planes:
+                raise ValueError(f"gradient/{name} must be float32 or uint8 [2, ...], not {values.dtype}")
+        for name, values in self.metrics.items():
+            if values.shape or values.dtype != np.float32:
+                raise ValueError(f"metrics/{name} must be float32 [], not {values.dtype} {values.shape}")
+        for name, values in self.moments.items():
+            if values.dtype != np.float64 or values.ndim < 1 or len(values) != 2:
+                raise ValueError(f"moments/{name} must be float64 [2, ...], not {values.dtype} {values.shape}")
+        for name, values in self.action_counts.items():
+            if values.dtype != np.int64 or values.ndim != 1:
+                raise ValueError(f"action_counts/{name} must be int64 [choices], not {values.dtype} {values.shape}")
+        _check_episodes(self)
+
+    @property
+    def norm(self) -> float:
+        """Norm of a float32 gradient; nan or inf if a value is not finite."""
+        flat = (values.ravel().astype(np.float64) for values in self.gradient.values())
+        return math.sqrt(sum(float(values @ values) for values in flat))
+
+
+Upload = Rollout | Gradient
+
+
+def _check_episodes(upload: Upload) -> None:
+    """Raise ValueError if the results of episodes are inconsistent."""
+    returns, lengths = upload.episode_returns, upload.episode_lengths
+    if returns.ndim != 1 or returns.shape != lengths.shape:
+        raise ValueError("episode_returns and episode_lengths must both be [K]")
+    if returns.dtype != np.float32:
+        raise ValueError(f"episode_returns must be float32, not {returns.dtype}")
+    if lengths.dtype.kind not in "iu":
+        raise ValueError("episode_lengths must be integers")
+    if len(upload.episode_info) > MAX_INFO_NAMES:
+        raise ValueError(f"episode_info has {len(upload.episode_info)} names, at most {MAX_INFO_NAMES} are allowed")
+    most = min(len(returns), MAX_INFO_VALUES)
+    for name, values in upload.episode_info.items():
+        check_name(name, "the name in episode_info")
+        if values.ndim != 1 or values.dtype != np.float32 or not 1 <= len(values) <= most:
+            raise ValueError(
+                f"episode_info {name!r} must be float32 [n], with n from 1 to {most}, not {values.dtype} {values.shape}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -340,6 +416,7 @@ Message = (
     | Refusal
     | Program
     | Rollout
+    | Gradient
     | Acknowledgement
     | Snapshot
     | SnapshotRequest

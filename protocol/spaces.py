@@ -135,7 +135,10 @@ class ContinuousSpace(Specification):
             if not all(bound is None or math.isfinite(bound) for bound in (low, high)):
                 raise ValueError("a bound is not finite: leave it out")
             if low is not None and high is not None and not low < high:
-                raise ValueError(f"the lower bound {low:g} is not below the upper bound {high:g}")
+                raise ValueError(
+                    f"the lower bound {low:g} is not below the upper bound {high:g}: "
+                    "leave a number that cannot change out of the action"
+                )
         return self
 
     @property

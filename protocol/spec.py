@@ -137,6 +137,9 @@ class CollectionSpec(Specification):
     """Rows of a rollout (T): env_steps of each environment under one snapshot."""
     window: Annotated[int, Field(ge=1, le=64)] = 2
     """Maximum number of rollouts of one actor that are being played or not yet acknowledged."""
+    upload: Literal["rollouts", "gradients"] = "rollouts"
+    """What actors send: their `rollouts`, or the `gradients` of their rollouts at the weights that played them. Actors
+    then need torch. For `a2c`, `a3c`, and algorithms of your own that are neither corrected nor make several passes."""
 
 
 class TrainingSpec(Specification):
@@ -317,6 +320,16 @@ class RunSpec(Specification):
         return self
 
     @model_validator(mode="after")
+    def _actors_can_compute_the_gradient(self) -> "RunSpec":
+        if self.uploads_gradients and (self.algorithm.corrected or self.algorithm.passes_over_batch):
+            kind = "makes several updates of" if self.algorithm.passes_over_batch else "corrects the policy lag of"
+            raise ValueError(
+                f"collection.upload is gradients, but {self.training.algorithm} {kind} a batch, which only the learner "
+                "can do: use a3c or a2c, or set collection.upload=rollouts"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _stack_fits_the_rollout(self) -> "RunSpec":
         sizes, rows = self.environment.frame_stack, self.collection.rollout_length
         stack = sizes if isinstance(sizes, int) else max(sizes.values(), default=1)
@@ -347,6 +360,16 @@ class RunSpec(Specification):
     def learner_modules(self) -> dict[str, str]:
         """Those of `user_modules` that the learner imports."""
         return {**self.policy.user_modules, **self.training.user_modules}
+
+    @property
+    def actor_modules(self) -> dict[str, str]:
+        """Those of `user_modules` that an actor imports: with gradients, also the learner's."""
+        return self.user_modules if self.uploads_gradients else self.environment.user_modules
+
+    @property
+    def uploads_gradients(self) -> bool:
+        """Whether actors upload gradients instead of rollouts."""
+        return self.collection.upload == "gradients"
 
     @property
     def algorithm(self) -> AlgorithmRecord:

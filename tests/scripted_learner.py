@@ -67,6 +67,7 @@ class ScriptedLearner:
         self.rollouts: queue.Queue[Request] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.extras: dict[str, np.ndarray] = {}  # in snapshots, besides the weights
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.compact_fetches: list[SnapshotRequest] = []
         self._compact = CompactSnapshotCache(epoch)
@@ -105,7 +106,7 @@ class ScriptedLearner:
         weights = {name: parameter.detach().numpy() for name, parameter in self.policy.network.named_parameters()}
         name = program_hash(self.policy.model)
         self.snapshot = encode(
-            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights)
+            Snapshot(learner_epoch=self.epoch, policy_version=version, program=name, weights=weights | self.extras)
         )
         if push:
             self.transport.publish(keys.snapshots(self.run), self.snapshot)

@@ -14,7 +14,7 @@ ALLOWED = {
     "transport": {"protocol", "transport"},
     "policy": {"protocol", "policy"},
     "algorithms": {"protocol", "policy", "algorithms"},
-    "actor": {"protocol", "transport", "policy", "actor"},
+    "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
     "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
     "cli": set(PACKAGES),

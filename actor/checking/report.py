@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.specification import Specification
 
@@ -53,6 +53,21 @@ def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str
         f"a step takes {_duration(report.step_seconds)}, and an actor steps its {environments} environments in turn: "
         f"{_duration(row)} a row, {_duration(first)} a rollout; use --set environment.processes=true"
     )
+
+
+def float_images(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if an array of floats has the shape of an image, else an empty string."""
+    if report.spaces is None or spec.policy.encoder != "auto":
+        return ""
+    for name, space in report.spaces.observations.items():
+        if not isinstance(space, ArraySpace) or space.dtype != "float32" or len(space.shape) != 3:
+            continue
+        if space.model_copy(update={"dtype": "uint8"}).is_image:
+            return (
+                f"{name!r} is a {space}, which goes through a multilayer perceptron: if it is an image, "
+                "return bytes from 0 to 255 (Box of uint8), which get convolutions"
+            )
+    return ""
 
 
 def never_ends(report: EnvironmentReport, spec: RunSpec) -> str:

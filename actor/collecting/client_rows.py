@@ -165,6 +165,10 @@ def check_run(spec: RunSpec) -> None:
             f"a run with {spec.training.algorithm} makes its actors wait for each update, but a client cannot "
             "wait: use another algorithm"
         )
+    if spec.uploads_gradients:
+        raise ActorError(
+            "this run takes gradients (collection.upload), and a client sends rollouts: set collection.upload=rollouts"
+        )
     _refuse_unapplied_settings(spec.environment)
 
 

@@ -31,7 +31,7 @@ def unsupported(kind: str, leaf: Leaf) -> EnvironmentSetupError:
     remedy = "use Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of these"
     if isinstance(leaf.space, gym.Box | gym.MultiBinary):
         axes = f"with one to {_MAX_DIMENSIONS} axes" if kind == "observation" else "of numbers"
-        remedy = f"an array {axes}, none of them empty, is"
+        remedy = f"use an array {axes} that is not empty"
     if kind == "observation" and leaf.path:
         remedy += f"; or leave the component out: --set \"environment.leave_out=['{leaf.name}']\""
     return EnvironmentSetupError(f"{kind} space {described(leaf.space)}{where} is not supported: {remedy}")

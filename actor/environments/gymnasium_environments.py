@@ -6,26 +6,35 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import SyncVectorEnv
 
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
-from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 
 
 class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
     def __init__(self, environment: Any) -> None:
-        """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them."""
+        """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them.
+
+        Of environments that are stepped in turn only the first is reset: a reset may be slow.
+        """
         self._environment = environment
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
         self._episode_info = EpisodeInfo()
         self.action_mask: Any = None
-        if not isinstance(self.action_space, gymnasium.spaces.Box):
+        if isinstance(self.action_space, gymnasium.spaces.Box):
+            return
+        if isinstance(environment, SyncVectorEnv):
+            mask = environment.envs[0].reset(seed=0)[1].get(MASK_KEY)
+            self.action_mask = None if mask is None else mask_of_one(mask)
+        else:
             self.reset(0)
 
     def reset(self, seed: int) -> Any:

@@ -21,6 +21,7 @@ from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.snapshot_source import FIRST_PUSH_SECONDS, MISSED_PUSH_SECONDS, SnapshotSource
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
+from daedalus.actor.session.uploads import RolloutUploads, Uploads, make_uploads
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
@@ -91,6 +92,7 @@ class ActorService:
         self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, self._end)
         self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
         self._snapshots = SnapshotSource(self._feed, self._monitor, self._uploads)
+        self._contents: Uploads = RolloutUploads()  # what is uploaded of the rollouts
         self._runs: set[str] = set()  # in which this actor's presence is declared
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout in this learner epoch
@@ -150,6 +152,7 @@ class ActorService:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
         self._collector.begin(self._make_runtime(confirmed, spaces), confirmed.spec, confirmed.seed)
+        self._contents = make_uploads(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
             self._feed.subscribe()
         self._collect_and_upload(confirmed)
@@ -215,7 +218,7 @@ class ActorService:
             self._warn_of_rejections()
             self._load(snapshot if synchronous else self._snapshots.newest(waited))
             began = time.monotonic()
-            payload = encode(self._collect(welcome.learner_epoch))
+            payload = encode(self._contents.compute(self._collect(welcome.learner_epoch)))
             if self._config.link == "auto" and self._snapshots.rollouts_are_slow:
                 self._feed.use_differences()
             if self._feed.is_slow:
@@ -235,6 +238,7 @@ class ActorService:
     def _load(self, snapshot: Snapshot) -> None:
         if snapshot.policy_version != self._loaded_version:
             self._collector.load(snapshot)
+            self._contents.load(snapshot.weights)
             self._loaded_version = snapshot.policy_version
 
     def _collect(self, learner_epoch: int) -> Rollout:

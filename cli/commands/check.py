@@ -8,7 +8,7 @@ from contextlib import redirect_stdout
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
@@ -127,7 +127,8 @@ def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
 def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     if report.problems:
         return []
-    return [text for text in (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1)) if text]
+    advice = (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec))
+    return [text for text in advice if text]
 
 
 def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:

@@ -212,7 +212,7 @@ def how_to_join(listening: list[str], credentials: Credentials | None, spec: Run
     """Return the command of an actor, with the other addresses that it may use."""
     address, *others = reachable(listening, credentials.hosts() if credentials else ())
     tls = ["--tls", "DIR"] if credentials else []
-    command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.environment.user_modules)]
+    command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.actor_modules)]
     return " ".join([*command, *([f"(or at {', '.join(others)})"] if others else [])])
 
 

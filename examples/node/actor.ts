@@ -88,7 +88,7 @@ export class Actor {
       const inquiry = { ...known, spaces: null, environments: 0 };
       const { run, spec, learner_epoch } = await link.join(gateway, this.#run, inquiry);
       this.#run = run;
-      const kind = supported(spec.environment);
+      const kind = supported(spec.environment, spec.collection.upload);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
         this.#publishedVersion = 0;
@@ -247,7 +247,7 @@ export class Actor {
 }
 
 /** Return the environment of a run. Throw RefusedError for another one, kwargs and transforms: this actor has none. */
-function supported(spec: link.EnvironmentSpec): Kind {
+function supported(spec: link.EnvironmentSpec, upload: string): Kind {
   const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, leave_out } = spec;
   const { crop, grey, resize, frame_stack } = spec;
   const kind = kindOf(id);
@@ -260,6 +260,7 @@ function supported(spec: link.EnvironmentSpec): Kind {
     ...{ wrap, action_table, no_reward_limit, crop, grey, resize },
   };
   const unsupported = Object.entries(settings).flatMap(([name, isSet]) => (isSet ? [name] : []));
+  if (upload !== "rollouts") unsupported.push("collection.upload");
   if (kind !== undefined && unsupported.length === 0) return kind;
   throw new RefusedError(
     `the run's environment ${id} has unsupported settings (${unsupported.join(", ")}): ` +

@@ -29,7 +29,7 @@ export interface Welcome {
   seed: number;
   spec: {
     environment: EnvironmentSpec;
-    collection: { envs_per_actor: number; rollout_length: number; window: number };
+    collection: { envs_per_actor: number; rollout_length: number; window: number; upload: string };
     training: { algorithm: string; algorithm_record: { synchronous: boolean } | null };
   };
 }

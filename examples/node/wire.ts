@@ -18,7 +18,7 @@ const MAX_ARRAYS = 4096;
 const MAX_DIMENSIONS = 8;
 const PLAIN = 0; // flags of a message
 const ZSTD = 1;
-const COMPRESSED_KINDS = new Set(["Rollout", "Program", "CompactSnapshot"]);
+const COMPRESSED_KINDS = new Set(["Rollout", "Gradient", "Program", "CompactSnapshot"]);
 
 const TYPES = {
   "<f4": Float32Array,
@@ -27,9 +27,10 @@ const TYPES = {
   "<u2": Uint16Array,
   "<i4": Int32Array,
   "<i8": BigInt64Array,
+  "<f8": Float64Array,
 };
 export type Dtype = keyof typeof TYPES;
-type Data = Float32Array | Uint8Array | Uint16Array | Int32Array | BigInt64Array;
+type Data = Float32Array | Uint8Array | Uint16Array | Int32Array | BigInt64Array | Float64Array;
 
 /** An array of a message. If it is swapped, `data` has the second axis first. */
 export interface WireArray {

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.protocol.messages import MAX_INFO_NAMES, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Upload
 
 _SAVED = (
     "env_steps",
@@ -50,13 +50,13 @@ class RunCounters:
         self.returns = deque(maxlen=self.target_episodes)
         self.lengths = deque(maxlen=self.target_episodes)
 
-    def accepted(self, rollout: Rollout, size: int) -> None:
+    def accepted(self, rollout: Upload, size: int) -> None:
         """Count an accepted rollout that came in a message of `size` bytes."""
         self.rollouts_accepted += 1
         self.rollout_bytes += size
-        self.accepted_env_steps += int(np.count_nonzero(rollout.valid))
+        self.accepted_env_steps += rollout.env_steps
 
-    def trained(self, rollouts: Sequence[Rollout], policy_version: int, updates: int) -> None:
+    def trained(self, rollouts: Sequence[Upload], policy_version: int, updates: int) -> None:
         """Count a batch that the learner is about to train on.
 
         Args:
@@ -71,12 +71,12 @@ class RunCounters:
             self.returns.extend(rollout.episode_returns.tolist())
             self.lengths.extend(rollout.episode_lengths.tolist())
             self.episodes += len(rollout.episode_returns)
-            self.env_steps += int(np.count_nonzero(rollout.valid))
+            self.env_steps += rollout.env_steps
             self._add_info(rollout)
         self.rollouts_trained += len(rollouts)
         self.updates += updates
 
-    def _add_info(self, rollout: Rollout) -> None:
+    def _add_info(self, rollout: Upload) -> None:
         for name, values in rollout.episode_info.items():
             if name in self.info or len(self.info) < MAX_INFO_NAMES:
                 self.info.setdefault(name, deque(maxlen=self.target_episodes)).extend(values.tolist())

@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import Rollout, Upload
 from daedalus.protocol.spec import TrainingSpec
 
 
-def updates_of(training: TrainingSpec, rollouts: Sequence[Rollout], *, memory: bool) -> int:
-    """Return the number of policy versions that a batch of these rollouts makes; `memory`: the policy has one."""
-    if memory:
-        return training.updates_from(sum(rollout.environments for rollout in rollouts))
-    return training.updates_from(sum(int(np.count_nonzero(rollout.valid)) for rollout in rollouts))
+def updates_of(training: TrainingSpec, uploads: Sequence[Upload], *, memory: bool) -> int:
+    """Return the number of policy versions that a batch of these uploads makes; `memory`: the policy has one."""
+    if memory:  # gradients make one, whatever their number
+        return training.updates_from(sum(upload.environments for upload in uploads if isinstance(upload, Rollout)))
+    return training.updates_from(sum(upload.env_steps for upload in uploads))

@@ -13,12 +13,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from types import MappingProxyType
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page
+from daedalus.learner.serving.gradient_checks import Shapes
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.rollout_intake import HEARTBEAT_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import SessionWatchdog
@@ -200,9 +202,9 @@ class ActorServer:
                     hint_at = None
             return self.fleet.has_had_actors
 
-    def offer_policy(self, program: bytes, state_size: int) -> None:
-        """Make the policy program available to actors. `state_size` is the size of the recurrent state in rollouts."""
-        self.rollouts.expect_state_size(state_size)
+    def offer_policy(self, program: bytes, state_size: int, gradient_shapes: Shapes = MappingProxyType({})) -> None:
+        """Make the policy program available to actors. See RolloutIntake.expect for the sizes."""
+        self.rollouts.expect(state_size, gradient_shapes)
         self.publisher.offer_program(program)
         self.evaluations.open()
 

@@ -12,9 +12,10 @@ import numpy as np
 
 from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.gradient_checks import Shapes, first_violation, gradient_limits, restored
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Rollout
+from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Gradient, Rollout, Upload
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -60,7 +61,9 @@ class Intake:
         self._envs_per_actor = spec.collection.envs_per_actor
         # A synchronous algorithm accepts only rollouts of the newest version.
         self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
-        self.state_size = 0  # size of the recurrent state; set before any actor has the program
+        # Set before any actor has the program:
+        self.state_size = 0  # size of the recurrent state
+        self.gradient_shapes: Shapes = {}  # of the parameters that have gradients
 
     def refuse_size(self, sender: str, size: int) -> Rejected | None:
         """Return the verdict on a message of `size` bytes that no rollout of `sender` has, or None. Reads no message.
@@ -84,7 +87,7 @@ class Intake:
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         return None
 
-    def read(self, sender: str, data: bytes) -> Rollout | Rejected:
+    def read(self, sender: str, data: bytes) -> Upload | Rejected:
         """Decode a message of `sender`, and check its content against the specification.
 
         Call this method without the lock: decoding is slow and changes no state. `judge` repeats the checks whose
@@ -104,18 +107,21 @@ class Intake:
             )
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         try:
-            rollout = decode(data, limits)
+            upload = decode(data, limits)
         except ProtocolError as error:
             return Rejected(verdict="rejected", cause="malformed", reason=str(error))
-        if not isinstance(rollout, Rollout):
-            return Rejected(verdict="rejected", cause="malformed", reason="the message is not a rollout")
-        wrong_identity = self._check_identity(sender, rollout)
+        if not isinstance(upload, Gradient if self._spec.uploads_gradients else Rollout):
+            kind = "gradient, which this run takes (collection.upload)" if self._spec.uploads_gradients else "rollout"
+            return Rejected(verdict="rejected", cause="malformed", reason=f"the message is not a {kind}")
+        wrong_identity = self._check_identity(sender, upload)
         if wrong_identity is not None:
             return wrong_identity
-        violation = self._first_violation(rollout, spaces, actor)
-        return Rejected(verdict="rejected", cause="unfit", reason=violation) if violation else rollout
+        if isinstance(upload, Gradient):
+            upload = restored(upload)
+        violation = self._first_violation(upload, spaces, actor)
+        return Rejected(verdict="rejected", cause="unfit", reason=violation) if violation else upload
 
-    def judge(self, sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
+    def judge(self, sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
         """Decide on a result of `read`, count the verdict, and return it. The caller holds the lock.
 
         Args:
@@ -141,7 +147,7 @@ class Intake:
                     verdict = Rejected(verdict="quarantined", cause="unfit", reason=actor.quarantined)
         return verdict
 
-    def _judge(self, sender: str, rollout: Rollout, policy_version: int) -> Rollout | Rejected:
+    def _judge(self, sender: str, rollout: Upload, policy_version: int) -> Upload | Rejected:
         wrong_identity = self._check_identity(sender, rollout)
         if wrong_identity is not None:
             return wrong_identity
@@ -161,7 +167,7 @@ class Intake:
             )
         return rollout
 
-    def _check_identity(self, sender: str, rollout: Rollout) -> Rejected | None:
+    def _check_identity(self, sender: str, rollout: Upload) -> Rejected | None:
         """Return a rejection if a rollout is for another learner epoch or from another incarnation, else None."""
         identity = rollout.identity
         if identity.learner_epoch != self._epoch:
@@ -172,7 +178,9 @@ class Intake:
         return None
 
     def _limits(self, spaces: Spaces, environments: int) -> Limits:
-        """Return the size limits of a rollout, from the specification and the actor's number of environments."""
+        """Return the size limits of an upload, from the specification and the actor's number of environments."""
+        if self._spec.uploads_gradients:
+            return gradient_limits(self._spec, self.gradient_shapes, spaces, environments)
         row = _ROW_BYTES + sum(spaces.masks.values())
         for space in spaces.actions.values():
             row += space.size * (_INTEGER_BYTES if isinstance(space, DiscreteSpace) else 4)
@@ -183,8 +191,10 @@ class Intake:
         arrays = _OTHER_ARRAYS + len(spaces.observations) + 2 * len(spaces.actions) + MAX_INFO_NAMES
         return Limits(max_bytes=environments * size + _SLACK_BYTES, max_arrays=arrays)
 
-    def _first_violation(self, rollout: Rollout, spaces: Spaces, actor: Actor) -> str:
+    def _first_violation(self, rollout: Upload, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
+        if isinstance(rollout, Gradient):
+            return first_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
         return (
             self._shape_violation(rollout, actor)
             or first_component_violation(rollout, spaces)
@@ -244,8 +254,8 @@ def _episode_violation(rollout: Rollout) -> str:
     return ""
 
 
-def acknowledgement(verdict: Rollout | Rejected, policy_version: int) -> Acknowledgement:
+def acknowledgement(verdict: Upload | Rejected, policy_version: int) -> Acknowledgement:
     """Return the answer to the sender. A long reason is cut to 500 characters."""
-    if isinstance(verdict, Rollout):
-        return Acknowledgement(verdict="accepted", policy_version=policy_version)
-    return Acknowledgement(verdict=verdict.verdict, reason=verdict.reason[:500], policy_version=policy_version)
+    if isinstance(verdict, Rejected):
+        return Acknowledgement(verdict=verdict.verdict, reason=verdict.reason[:500], policy_version=policy_version)
+    return Acknowledgement(verdict="accepted", policy_version=policy_version)

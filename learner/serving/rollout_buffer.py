@@ -1,4 +1,7 @@
-"""Buffers of accepted rollouts: a barrier for synchronous algorithms, a queue for the others. No I/O, no threads."""
+"""Buffers of accepted rollouts or gradients: a barrier for synchronous algorithms, a queue for the others.
+
+No I/O, no threads.
+"""
 
 from collections import deque
 from collections.abc import Set
@@ -6,25 +9,25 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from daedalus.learner.serving.stragglers import Stragglers
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import Upload
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TakenRollouts:
     """Rollouts of one batch, and rollouts that became stale in the buffer."""
 
-    rollouts: list[Rollout]
-    stale: list[Rollout]
+    rollouts: list[Upload]
+    stale: list[Upload]
 
 
 class RolloutBuffer(Protocol):
     """Interface of a buffer that holds rollouts until a batch is complete."""
 
-    def has_room_for(self, rollout: Rollout) -> bool:
+    def has_room_for(self, rollout: Upload) -> bool:
         """Return whether `add` may be called with this rollout now."""
         ...
 
-    def add(self, rollout: Rollout) -> None:
+    def add(self, rollout: Upload) -> None:
         """Add a rollout. The caller has checked `has_room_for`."""
         ...
 
@@ -59,13 +62,13 @@ class BarrierBuffer:
         self._first = first
         self._started = False
         self._stragglers = Stragglers()
-        self._waiting: dict[str, Rollout] = {}
+        self._waiting: dict[str, Upload] = {}
 
-    def has_room_for(self, rollout: Rollout) -> bool:
+    def has_room_for(self, rollout: Upload) -> bool:
         """Return whether the batch has no rollout of this actor yet. See RolloutBuffer."""
         return rollout.identity.actor not in self._waiting
 
-    def add(self, rollout: Rollout) -> None:
+    def add(self, rollout: Upload) -> None:
         """See RolloutBuffer."""
         self._waiting[rollout.identity.actor] = rollout
         self._stragglers.delivered(rollout.identity.actor)
@@ -102,13 +105,13 @@ class StreamBuffer:
     def __init__(self, batch_rollouts: int, max_policy_lag: int) -> None:
         self._batch_rollouts = batch_rollouts
         self._max_policy_lag = max_policy_lag
-        self._waiting: deque[Rollout] = deque()
+        self._waiting: deque[Upload] = deque()
 
-    def has_room_for(self, rollout: Rollout) -> bool:
+    def has_room_for(self, rollout: Upload) -> bool:
         """Return whether the buffer is below its capacity. See RolloutBuffer."""
         return len(self._waiting) < max(self._batch_rollouts, 2)
 
-    def add(self, rollout: Rollout) -> None:
+    def add(self, rollout: Upload) -> None:
         """See RolloutBuffer."""
         self._waiting.append(rollout)
 

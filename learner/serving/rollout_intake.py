@@ -16,15 +16,14 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
-
-import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.learner.serving.gradient_checks import Shapes
 from daedalus.learner.serving.held_answers import HeldAnswers
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.learner.serving.request_queue import RequestQueue
@@ -32,7 +31,7 @@ from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import Acknowledgement, Upload
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.interface import Request
 
@@ -111,9 +110,14 @@ class RolloutIntake:
         with self._lock:
             return self._buffer.left_out
 
-    def expect_state_size(self, state_size: int) -> None:
-        """Set the size of the recurrent state in a rollout. Call before any actor has the program."""
-        self._intake.state_size = state_size
+    def expect(self, state_size: int, gradient_shapes: Shapes) -> None:
+        """Set the sizes that uploads have. Call before any actor has the program.
+
+        Args:
+          state_size: of the recurrent state in a rollout.
+          gradient_shapes: shapes of the parameters that have gradients, by name.
+        """
+        self._intake.state_size, self._intake.gradient_shapes = state_size, gradient_shapes
 
     def offer(self, request: Request) -> None:
         """Queue a rollout, or answer busy. Does not block."""
@@ -143,7 +147,7 @@ class RolloutIntake:
 
     # ------------------------------------------------------------------------------------ the learner's thread
 
-    def take_batch(self, version: int) -> list[Rollout]:
+    def take_batch(self, version: int) -> list[Upload]:
         """Return the rollouts of the next batch, or an empty list if no batch is complete within a heartbeat.
 
         The rollouts are counted as trained. From now on the policy lag is relative to the version after this batch,
@@ -165,7 +169,7 @@ class RolloutIntake:
             self._lock.notify_all()
         return taken.rollouts
 
-    def count_trained(self, rollouts: list[Rollout], left_out: list[Rollout]) -> None:
+    def count_trained(self, rollouts: Sequence[Upload], left_out: Sequence[Upload]) -> None:
         """Count the rollouts of a batch for their senders, after its updates.
 
         Args:
@@ -213,7 +217,7 @@ class RolloutIntake:
         self._counters.trained(taken.rollouts, version, updates)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
-                actors[rollout.identity.actor].env_steps += int(np.count_nonzero(rollout.valid))
+                actors[rollout.identity.actor].env_steps += rollout.env_steps
         self._version = version + updates
 
     # --------------------------------------------------------------------------------------- the intake thread
@@ -250,19 +254,19 @@ class RolloutIntake:
         for request, answer in answers:
             request.reply(encode(replace(answer, policy_version=self._published_version())))
 
-    def _judge(self, sender: str, content: Rollout | Rejected, size: int) -> Acknowledgement:
+    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
             content = Rejected(
                 verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
             )
-        if isinstance(content, Rollout):
+        if not isinstance(content, Rejected):
             self._buffer.heard(sender)
         verdict = self._intake.judge(sender, content, self._version, time.monotonic())
         self._fleet.received(sender, size)
-        if isinstance(verdict, Rollout):
-            self._store(verdict, size)
-        else:
+        if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
+        else:
+            self._store(verdict, size)
         return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
     def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
@@ -279,15 +283,15 @@ class RolloutIntake:
             text = f"rollout rejected as {rejected.cause}: {rejected.reason}"
             self._events.add("rejected", text, actor=sender, cause=rejected.cause)
 
-    def _is_surplus(self, content: Rollout | Rejected) -> bool:
+    def _is_surplus(self, content: Upload | Rejected) -> bool:
         """Return whether the barrier already holds a rollout of the actor.
 
         Such a rollout is rejected: waiting for room would block the intake thread, and with it all other actors.
         """
         synchronous = self._spec.algorithm.synchronous
-        return synchronous and isinstance(content, Rollout) and not self._buffer.has_room_for(content)
+        return synchronous and not isinstance(content, Rejected) and not self._buffer.has_room_for(content)
 
-    def _store(self, rollout: Rollout, size: int) -> None:
+    def _store(self, rollout: Upload, size: int) -> None:
         """Put a rollout into the buffer, and wait for room first. The late answer slows the sender down."""
         while not self._buffer.has_room_for(rollout) and self._ending is None:
             self._lock.wait(HEARTBEAT_SECONDS)

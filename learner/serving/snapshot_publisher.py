@@ -57,6 +57,7 @@ class SnapshotPublisher:
         self._unpublished_rollouts = 0  # trained on since the last snapshot
         self._program_hash = ""
         self.version = start_version  # the newest published version
+        self.extras: dict[str, np.ndarray] = {}  # what the next snapshots carry besides the weights
 
     def open(self) -> None:
         """Start to answer requests for compact snapshots."""
@@ -116,7 +117,7 @@ class SnapshotPublisher:
                 learner_epoch=self._epoch,
                 policy_version=policy_version,
                 program=self._program_hash,
-                weights=weights,
+                weights={**weights, **self.extras},
             )
         )
         self._responses.offer_snapshot(snapshot, policy_version)

@@ -8,19 +8,29 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.diagnostics import diagnostics
-from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.diagnostics import batch_metrics, diagnostics
+from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
+from daedalus.algorithms.gradient_inputs import GradientInputs, packed
+from daedalus.algorithms.gradients import GradientComputer, Terms
+from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.gradient_faults import rollouts_at_fault
-from daedalus.learner.training.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.learner.training.optimizers import build_optimizer
+from daedalus.learner.training.received_gradients import (
+    batch_metrics_of,
+    diagnostics_of,
+    mean_gradient,
+    mean_terms,
+    observation_moments,
+    return_moments,
+)
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import Gradient, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
@@ -55,6 +65,7 @@ class Learner:
         self._assembler = BatchAssembler(spaces, self._device)
         self._observations = ObservationStatistics(self._network.normalizer)
         self._rewards = RewardNormalizer(spec.discount_factor) if spec.normalize_rewards else None
+        self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         self.metrics = UpdateMetrics(spaces, self._device)
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
@@ -90,19 +101,52 @@ class Learner:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
         batch = self._joined(rollouts)
         for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
-            norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
-            if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
+            if not self._make_update(terms, progress):
                 return False
-            self.policy_version += 1
-            self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
-            self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
             if self.policy_version == end:
                 break
         self._observations.add(batch)
         if self._gradients.first_pass is not None:
-            self.metrics.add_first_pass(self._gradients.first_pass)
+            self.metrics.add_batch_metrics(batch_metrics(self._gradients.first_pass))
         self.metrics.add_batch(batch)
         return True
+
+    def _make_update(self, terms: Terms, progress: float) -> bool:
+        """Make an update with the computed gradient. Return False, without an update, if it is not finite."""
+        norm = self._flat.clip_gradients(self._spec.max_gradient_norm)
+        if not math.isfinite(norm):  # such a step would set all parameters to nan for the rest of the run
+            return False
+        self.policy_version += 1
+        self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
+        self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
+        return True
+
+    def apply(self, gradients: Sequence[Gradient], progress: float) -> None:
+        """Make one update with the mean of gradients that actors computed, weighted by their env_steps.
+
+        The intake has checked that each is finite.
+
+        Args:
+          gradients: the gradients of the batch, in order.
+          progress: as for `step`.
+        """
+        if self._rewards is not None:
+            for gradient in gradients:
+                self._rewards.moments.merge(return_moments(gradient))
+        self._flat.gradients.copy_(mean_gradient(gradients, tuple(self.gradient_shapes)))
+        if self._make_update(mean_terms(gradients, self._device), progress):
+            components = tuple(self._observations.moments)
+            self._observations.merge([observation_moments(gradient, components) for gradient in gradients])
+            for gradient in gradients:
+                if (measured := batch_metrics_of(gradient)) is not None:
+                    self.metrics.add_batch_metrics(measured.to(self._device))
+        else:
+            self.policy_version += 1
+            self.updates_skipped += 1
+        self._received_diagnostics = diagnostics_of(gradients[-1])
+        for gradient in gradients:
+            counts = gradient.action_counts.items()
+            self.metrics.add_action_counts({name: torch.from_numpy(values.copy()) for name, values in counts})
 
     def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
         """Return the batch of the rollouts, with normalised rewards, on the device."""
@@ -121,6 +165,9 @@ class Learner:
 
     def take_diagnostics(self) -> dict[str, float]:
         """Return the diagnostics of the newest batch (algorithms/diagnostics.py), once; empty without a new batch."""
+        if self._received_diagnostics:
+            received, self._received_diagnostics = self._received_diagnostics, {}
+            return received
         first_pass = self._gradients.take_first_pass()
         rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
         return {} if first_pass is None else diagnostics(first_pass, rho_clip)
@@ -137,6 +184,19 @@ class Learner:
         The arrays may share memory with the parameters: copy or encode them before the next step.
         """
         return {name: parameter.detach().cpu().numpy() for name, parameter in self._parameters.items()}
+
+    def gradient_inputs(self, progress: float) -> dict[str, np.ndarray]:
+        """Return what a snapshot needs besides `weights` for actors to compute gradients, at a share of the budget."""
+        count = mean = squares = 0.0
+        if self._rewards is not None:
+            moments = self._rewards.moments
+            count, mean, squares = float(moments.count), float(moments.mean), float(moments.squares)
+        return {GRADIENT_INPUTS: packed(GradientInputs(self.entropy_bonus(progress), count, mean, squares))}
+
+    @property
+    def gradient_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the parameters that have gradients, by name."""
+        return {name: tuple(each.shape) for name, each in self._parameters.items() if each.requires_grad}
 
     def state(self) -> dict[str, Tensor]:
         """Return the training state besides the parameters: optimiser and running statistics, random state."""

@@ -1,20 +1,17 @@
 """Metrics of updates and batches since the last metrics row. State; no I/O."""
 
-import itertools
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.diagnostics import FirstPass
+from daedalus.algorithms.diagnostics import BATCH_METRICS
 from daedalus.algorithms.gradients import Terms
-from daedalus.algorithms.losses import explained_variance, mean, shares_of, variance
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
 GRADIENT_CLIPPED_FRACTION = "gradient_clipped_fraction"  # share of the updates
-BATCH_METRICS = ("explained_variance", "value_mean", "advantage_std")  # before the first update of the batch
 METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION, *BATCH_METRICS)
 
 
@@ -32,16 +29,7 @@ class UpdateMetrics:
         self._norms = 0.0
         self._batch_sums = torch.zeros(len(BATCH_METRICS), device=device)
         self._updates = self._clipped_updates = self._batches = 0
-        self._action_counts = {
-            name: torch.zeros(space.choices, dtype=torch.int64, device=device)
-            for name, space in spaces.actions.items()
-            if isinstance(space, DiscreteSpace)
-        }
-        self._first_choices = {  # of each variable among all choices of its component
-            name: torch.tensor([0, *itertools.accumulate(space.counts[:-1])], device=device)
-            for name, space in spaces.actions.items()
-            if isinstance(space, DiscreteSpace)
-        }
+        self._actions = ActionCounts(spaces, device)
         self._newest: Tensor | None = None  # the first image of the newest batch
 
     def add_update(self, terms: Terms, gradient_norm: float, clipped: bool) -> None:
@@ -51,26 +39,20 @@ class UpdateMetrics:
         self._updates += 1
         self._clipped_updates += clipped
 
-    def add_first_pass(self, first_pass: FirstPass) -> None:
-        """Add the metrics of a batch."""
-        shares = shares_of(first_pass.valid)
-        self._batch_sums += torch.stack(
-            [
-                explained_variance(first_pass.values, first_pass.targets, shares),
-                mean(first_pass.values, shares),
-                variance(first_pass.advantages, shares).sqrt(),
-            ]
-        )
+    def add_batch_metrics(self, metrics: Tensor) -> None:
+        """Add BATCH_METRICS of a batch, or of the rollout of a gradient."""
+        self._batch_sums += metrics
         self._batches += 1
 
     def add_batch(self, batch: Batch) -> None:
         """Count the actions of a batch, and keep one of its observations."""
         if self._image is not None:
             self._newest = batch.observations[self._image][0, 0]
-        for name, counts in self._action_counts.items():
-            choices = batch.actions[name] + self._first_choices[name]  # [T, B, D]
-            weights = batch.valid.unsqueeze(-1).expand(choices.shape)
-            counts += torch.bincount(choices.flatten(), weights.flatten(), len(counts)).to(torch.int64)
+        self._actions.add(batch)
+
+    def add_action_counts(self, counts: dict[str, Tensor]) -> None:
+        """Add how often each choice of each discrete component was made, [choices] int64."""
+        self._actions.merge(counts)
 
     def take_means(self) -> dict[str, float]:
         """Return means over the updates, or batches, since the last call, by name; empty without updates."""
@@ -87,10 +69,7 @@ class UpdateMetrics:
 
     def take_action_counts(self) -> dict[str, list[int]]:
         """Return how often each choice of each discrete component was chosen in the batches since the last call."""
-        taken = {name: counts.tolist() for name, counts in self._action_counts.items()}
-        for counts in self._action_counts.values():
-            counts.zero_()
-        return taken
+        return self._actions.take()
 
     def take_observation_image(self) -> np.ndarray | None:
         """Return an observation of the newest batch, with its frames side by side: uint8 [H, W] or [H, W, 3].

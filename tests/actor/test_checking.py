@@ -1,17 +1,21 @@
 """actor/checking: what is found in environments with faults, and in good ones."""
 
+from typing import Literal
+
 import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from building import run_spec
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from plain import plain_spaces
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
-from daedalus.actor.checking.report import EnvironmentReport, never_ends, slow_steps
+from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -190,3 +194,20 @@ def test_an_environment_without_an_end_is_noted() -> None:
     assert "no episode ended within 25 env_steps of random actions" in never_ends(endless, spec())
     assert not never_ends(check(), spec())
     assert not never_ends(endless.model_copy(update={"time_limit": 500}), spec())
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "noted"),
+    [
+        ((3, 40, 40), "float32", True),
+        ((40, 40, 3), "float32", True),
+        ((40, 40, 3), "uint8", False),
+        ((40, 40), "float32", False),  # rather a matrix
+        ((3, 4, 40), "float32", False),
+    ],
+)
+def test_an_image_of_floats_is_noted(shape: tuple[int, ...], dtype: Literal["float32", "uint8"], noted: bool) -> None:
+    report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype=dtype), 2))
+    assert ("if it is an image, return bytes from 0 to 255" in float_images(report, spec())) is noted
+    chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "nature"})})
+    assert not float_images(report, chosen)

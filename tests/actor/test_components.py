@@ -217,10 +217,10 @@ def test_discrete_observation_outside_its_space_is_refused() -> None:
         (
             gym.Discrete(2),
             gym.Box(np.array([0, 1], np.float32), np.ones(2, np.float32)),
-            "is not supported: the lower bound 1 is not below the upper bound 1",
+            "the lower bound 1 is not below the upper bound 1: leave a number that cannot change out of the action",
         ),
-        (gym.Box(-1, 1, (0,)), gym.Discrete(2), "with one to 4 axes, none of them empty, is"),
-        (gym.Discrete(2), gym.Box(-1, 1, (0,)), "an array of numbers, none of them empty, is"),
+        (gym.Box(-1, 1, (0,)), gym.Discrete(2), "use an array with one to 4 axes that is not empty"),
+        (gym.Discrete(2), gym.Box(-1, 1, (0,)), "use an array of numbers that is not empty"),
     ],
 )
 def test_space_that_is_not_supported_is_refused_with_the_limit(

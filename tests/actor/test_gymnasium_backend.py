@@ -296,6 +296,18 @@ def test_observation_that_stops_to_fit_is_named(monkeypatch: pytest.MonkeyPatch,
         environments.step({"action": np.zeros((2, 1), np.int64)})
 
 
+def test_only_one_environment_is_reset_to_learn_whether_there_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    resets = []
+    monkeypatch.setattr(
+        Drifting, "reset", lambda self, **_: (resets.append(self), ({"a": np.zeros(2, np.uint8)}, {}))[1]
+    )
+    monkeypatch.setitem(gymnasium.registry, "Drifting-v0", EnvSpec("Drifting-v0", lambda **_: Drifting(None)))
+    environments = created(EnvironmentSpec(id="Drifting-v0"), 3)
+    assert len(resets) == 1
+    environments.reset(1)
+    assert len(resets) == 4
+
+
 def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     failing = EnvSpec("Drifting-v0", lambda **_: Drifting(KeyError("gripper")))
     monkeypatch.setitem(gymnasium.registry, "Drifting-v0", failing)

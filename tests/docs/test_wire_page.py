@@ -14,8 +14,8 @@ from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
 from daedalus.protocol.status import ActorStatus, Event, EventKind, RunStatus
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
-TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Acknowledgement", "RunEnded"]
-TABLES += ["SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport"]
+TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Gradient", "Acknowledgement"]
+TABLES += ["RunEnded", "SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport"]
 
 
 def first_column(table: str) -> set[str]:

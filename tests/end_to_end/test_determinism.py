@@ -26,6 +26,7 @@ NORMALIZATION = (
     "training.normalize_rewards=true",
     "training.normalize_advantages=true",
 )
+GRADIENTS = "collection.upload=gradients"
 
 
 def train_in_one_process(spec: RunSpec, directory: Path) -> Outcome:
@@ -60,15 +61,17 @@ def checkpoint_files(directory: Path) -> dict[str, bytes]:
     return {entry.name: entry.read_bytes() for entry in checkpoint.iterdir() if entry.suffix == ".safetensors"}
 
 
-@pytest.mark.parametrize("normalization", [(), NORMALIZATION], ids=["plain", "normalised"])
+@pytest.mark.parametrize(
+    "changes", [(), NORMALIZATION, (*NORMALIZATION, GRADIENTS)], ids=["plain", "normalised", "gradients"]
+)
 def test_a2c_gives_bit_for_bit_equal_weights_in_one_process_and_in_several(
-    start: Callable[..., Running], tmp_path: Path, normalization: tuple[str, ...]
+    start: Callable[..., Running], tmp_path: Path, changes: tuple[str, ...]
 ) -> None:
     settings = read_preset("cartpole")
     choose_algorithm(settings, "a2c")
-    override(settings, (*SETTINGS, *normalization))
+    override(settings, (*SETTINGS, *changes))
     assert train_in_one_process(run_spec(settings), tmp_path / "one").finished
-    words = [word for setting in (*SETTINGS, *normalization) for word in ("--set", setting)]
+    words = [word for setting in (*SETTINGS, *changes) for word in ("--set", setting)]
     running = start("train", "cartpole", "--algorithm", "a2c", *words, "--run-dir", "many")
     assert running.wait() == 0, running.output
     one, many = checkpoint_files(tmp_path / "one"), checkpoint_files(tmp_path / "many")
@@ -77,7 +80,19 @@ def test_a2c_gives_bit_for_bit_equal_weights_in_one_process_and_in_several(
     state = safetensors.numpy.load(one["learner.safetensors"])
     counts = [float(state[name]) for name in ("observations/observation/count", "returns/count") if name in state]
     env_steps = json.loads((tmp_path / "many" / "summary.json").read_text())["env_steps"]
-    assert counts == ([env_steps] * 2 if normalization else [])  # each env_step counts once; reset rows do not
+    assert counts == ([env_steps] * 2 if changes else [])  # each env_step counts once; reset rows do not
+
+
+def test_one_actor_gives_equal_weights_with_rollouts_and_with_gradients(tmp_path: Path) -> None:
+    """The actor computes exactly what the learner would, with all running statistics and annealed settings."""
+    settings = read_preset("cartpole")
+    choose_algorithm(settings, "a2c")
+    annealed = ("training.entropy_bonus=0.02", "training.entropy_bonus_final=0.001", "collection.actors=1")
+    override(settings, (*SETTINGS, *NORMALIZATION, *annealed, "training.env_steps=20000"))
+    train_in_one_process(run_spec(settings), tmp_path / "rollouts")
+    override(settings, (GRADIENTS,))
+    train_in_one_process(run_spec(settings), tmp_path / "gradients")
+    assert checkpoint_files(tmp_path / "rollouts") == checkpoint_files(tmp_path / "gradients")
 
 
 def test_another_seed_gives_other_weights(tmp_path: Path) -> None:

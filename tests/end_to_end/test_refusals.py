@@ -51,11 +51,11 @@ def join(**kwargs: object) -> bytes:
 
 def test_another_protocol_version_is_refused_and_both_versions_are_named(client: Transport) -> None:
     other = bytearray(join())
-    struct.pack_into("<H", other, 4, 7)
+    struct.pack_into("<H", other, 4, PROTOCOL_VERSION + 1)
     answer = ask(client, keys.join("run", "client"), bytes(other))
     assert isinstance(answer, Refusal)
     assert answer.code == "mismatch"
-    assert "protocol version 7" in answer.reason
+    assert f"protocol version {PROTOCOL_VERSION + 1}" in answer.reason
     assert f"this one {PROTOCOL_VERSION}" in answer.reason
 
 

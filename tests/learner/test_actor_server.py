@@ -23,6 +23,7 @@ from daedalus.protocol.messages import (
     Join,
     Message,
     Refusal,
+    Rollout,
     RunEnded,
     Snapshot,
     SnapshotRequest,
@@ -130,7 +131,7 @@ def test_versions_of_a_batch_are_as_many_as_the_learner_makes_of_it(
         learner = Learner(
             TrainingSpec(algorithm="appo", passes=3, minibatches=4), RECURRENT if state_size else POLICY, SPACES
         )
-        learner.step(rollouts, 0.0)
+        learner.step([each for each in rollouts if isinstance(each, Rollout)], 0.0)
         assert counters.updates == learner.policy_version == updates
     finally:
         server.close("the test is over")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from building import ENVIRONMENTS, EPOCH, ROWS, joined_fleet, make_rollout, run_spec
 
-from daedalus.learner.serving.intake import Intake
+from daedalus.learner.serving.intake import Intake, Rejected
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 SPACES = Spaces(
@@ -42,7 +41,7 @@ def verdict_on(changed: dict[str, Any]) -> str:
     """Return why a rollout is rejected, or an empty string."""
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", spaces=SPACES))
     verdict = intake.judge("a", intake.read("a", encode(make_rollout(**changed))), 0, 0.0)
-    return "" if isinstance(verdict, Rollout) else verdict.reason
+    return verdict.reason if isinstance(verdict, Rejected) else ""
 
 
 def test_valid_rollout_is_accepted() -> None:
@@ -112,4 +111,4 @@ def test_probability_of_discrete_actions_is_at_most_one() -> None:
 def _discrete_verdict(log_probs: np.ndarray) -> str:
     intake = Intake(run_spec(), EPOCH, joined_fleet("a"))
     verdict = intake.read("a", encode(make_rollout(behaviour_log_probs=log_probs)))
-    return "" if isinstance(verdict, Rollout) else verdict.reason
+    return verdict.reason if isinstance(verdict, Rejected) else ""

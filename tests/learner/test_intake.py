@@ -15,7 +15,7 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot
+from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot, Upload
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
 VERSION, MAX_LAG = 10, 4
@@ -29,7 +29,7 @@ class Harness:
         self.fleet = joined_fleet("a", "b")
         self.intake = Intake(run_spec(max_policy_lag=MAX_LAG, **training), EPOCH, self.fleet)
 
-    def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Rollout | Rejected:
+    def receive(self, data: bytes, sender: str = "a", now: float = 1.0) -> Upload | Rejected:
         return self.intake.judge(sender, self.intake.read(sender, data), VERSION, now)
 
     def memory(self) -> list[Any]:

@@ -1,4 +1,4 @@
-"""learner/training/normalization.py: the statistics equal those of all values together, however they arrive."""
+"""algorithms/normalization.py: the statistics equal those of all values together, however they arrive."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ import torch
 from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
-from daedalus.learner.training import normalization
-from daedalus.learner.training.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
+from daedalus.algorithms import normalization
+from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.protocol.messages import Rollout

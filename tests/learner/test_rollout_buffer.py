@@ -1,10 +1,12 @@
 """learner/serving/rollout_buffer.py: when a batch is complete, and which rollouts it contains."""
 
+from collections.abc import Sequence
+
 import pytest
 from building import identity, make_rollout
 
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, TakenRollouts
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import Rollout, Upload
 
 
 def rollout(actor: str, sequence: int = 0, version: int = 0) -> Rollout:
@@ -15,7 +17,7 @@ def actors(taken: TakenRollouts) -> list[str]:
     return [rollout.identity.actor for rollout in taken.rollouts]
 
 
-def sequences(rollouts: list[Rollout]) -> list[int]:
+def sequences(rollouts: Sequence[Upload]) -> list[int]:
     return [rollout.identity.sequence for rollout in rollouts]
 
 

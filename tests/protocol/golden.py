@@ -19,6 +19,7 @@ from daedalus.protocol.messages import (
     EvaluationRequest,
     EventsReport,
     EventsRequest,
+    Gradient,
     Join,
     Message,
     Origin,
@@ -62,6 +63,21 @@ def _rollout(frames: np.ndarray) -> Rollout:
         episode_returns=np.array([1.5, -2.0], np.float32),
         episode_lengths=np.array([12, 9], np.int32),
         episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
+    )
+
+
+def _gradient(gradient: dict[str, np.ndarray]) -> Gradient:
+    return Gradient(
+        identity=RolloutIdentity(actor="wing-1", incarnation=2**61 + 1, sequence=7, learner_epoch=2**60 + 3),
+        policy_version=41,
+        gradient=gradient,
+        env_steps=5,
+        metrics={"policy_loss": np.array(-0.5, np.float32), "rho_mean": np.array(1.0, np.float32)},
+        moments={"observations/state": np.array([[0.1, 2.0], [3.5, 0.0]]), "returns": np.array([1.5, 0.25])},
+        action_counts={"gripper": np.array([2, 3], np.int64)},
+        episode_returns=np.array([1.5, -2.0], np.float32),
+        episode_lengths=np.array([12, 9], np.int32),
+        episode_info={"goals": np.array([0.0, 2.0], np.float32)},
     )
 
 
@@ -114,6 +130,8 @@ MESSAGES: dict[str, Message] = {
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),
     "rollout_numbers": _rollout(np.linspace(-1, 1, (_T + 1) * _E * 4, dtype=np.float32).reshape(_T + 1, _E, 4)),
     "rollout_pixels": _rollout(_PIXELS),
+    "gradient_float32": _gradient({"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.ones(3, np.float32)}),
+    "gradient_compact": _gradient(planes(bfloat16({"body.weight": 1.01 * np.eye(3, dtype=np.float32)}), None)),
     "acknowledgement": Acknowledgement(verdict="rejected", reason="policy lag 40", policy_version=81),
     "snapshot": Snapshot(
         learner_epoch=9,

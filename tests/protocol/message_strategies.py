@@ -15,6 +15,7 @@ from daedalus.protocol.messages import (
     EvaluationRequest,
     EventsReport,
     EventsRequest,
+    Gradient,
     Join,
     Origin,
     Program,
@@ -185,6 +186,34 @@ def rollouts(draw: st.DrawFn) -> Rollout:
 
 
 @st.composite
+def gradients(draw: st.DrawFn) -> Gradient:
+    random, episodes = draw(generators), draw(st.integers(0, 4))
+    shapes = st.lists(st.integers(0, 4), max_size=3).map(tuple)
+    compact = draw(st.booleans())
+    layout = draw(st.dictionaries(text, shapes, min_size=1, max_size=4))
+    return Gradient(
+        identity=draw(
+            st.builds(RolloutIdentity, actor=text, incarnation=counters, sequence=counters, learner_epoch=counters)
+        ),
+        policy_version=draw(counters),
+        gradient={
+            name: bits(random, "|u1", (2, *shape)) if compact else bits(random, "<f4", shape)
+            for name, shape in layout.items()
+        },
+        env_steps=draw(counters),
+        metrics={name: bits(random, "<f4", ()) for name in draw(st.lists(text, max_size=3, unique=True))},
+        moments={
+            name: bits(random, "<f8", (2, *draw(shapes))) for name in draw(st.lists(text, max_size=3, unique=True))
+        },
+        action_counts={
+            name: bits(random, "<i8", (draw(sizes),)) for name in draw(st.lists(text, max_size=3, unique=True))
+        },
+        episode_returns=bits(random, "<f4", (episodes,)),
+        episode_lengths=bits(random, "<i4", (episodes,)),
+    )
+
+
+@st.composite
 def evaluation_reports(draw: st.DrawFn) -> EvaluationReport:
     random, episodes = draw(generators), (draw(st.integers(1, 5)),)
     return EvaluationReport(
@@ -245,6 +274,7 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     Refusal: st.builds(Refusal, reason=text),
     Program: st.builds(Program, hash=text, model=st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))),
     Rollout: rollouts(),
+    Gradient: gradients(),
     Acknowledgement: st.builds(Acknowledgement, reason=text, policy_version=counters),
     Snapshot: snapshots(),
     SnapshotRequest: st.builds(

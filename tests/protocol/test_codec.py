@@ -148,7 +148,7 @@ def test_constant_picture_compresses_to_one_frame() -> None:
     assert len(encode(some_rollout(frames.copy(order="C")))) > 2 * noise.size
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float16", "int8", "int16", "uint32", "uint64", "complex64", "O", "U3"])
+@pytest.mark.parametrize("dtype", ["float16", "int8", "int16", "uint32", "uint64", "complex64", "O", "U3"])
 def test_encoding_an_unsupported_dtype_raises_value_error(dtype: str) -> None:
     with pytest.raises(ValueError, match=r"weights/w.*the protocol does not support"):
         encode(dataclasses.replace(SNAPSHOT, weights={"w": np.zeros(2, dtype)}))

@@ -61,7 +61,7 @@ SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
         "'weights/b' has an invalid swapped flag",
     ),
     "swapped scalar": (lambda c: c["arrays"].__setitem__(1, ["b", "<f4", [], True]), "'b' has an invalid swapped flag"),
-    "dtype float64": (lambda c: c["arrays"][0].__setitem__(1, "<f8"), "has an unsupported dtype"),
+    "dtype float16": (lambda c: c["arrays"][0].__setitem__(1, "<f2"), "has an unsupported dtype"),
     "dtype object": (lambda c: c["arrays"][0].__setitem__(1, "|O"), "has an unsupported dtype"),
     "dtype big-endian": (lambda c: c["arrays"][0].__setitem__(1, ">f4"), "has an unsupported dtype"),
     "dtype a list": (lambda c: c["arrays"][0].__setitem__(1, ["<f4"]), "has an unsupported dtype"),

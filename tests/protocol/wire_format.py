@@ -24,7 +24,7 @@ from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 LIMITS = Limits()
 PREFIX = struct.Struct("<4sHHI")
-DTYPES = ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8")
+DTYPES = ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8", "<f8")
 repeatable = settings(max_examples=60, deadline=None, derandomize=True)
 
 

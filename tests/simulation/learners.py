@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.messages import Upload
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import TransportError
@@ -139,8 +140,8 @@ class LearnerProcess:
         self.life.published[self.version] = self.kernel.now
         return {"w": np.array(self.ledger.token(self.life.number, self.version), np.float32)}
 
-    def _updates(self, rollouts: list[Rollout]) -> int:
-        return self.settings.spec.training.updates_from(sum(int(rollout.valid.sum()) for rollout in rollouts))
+    def _updates(self, rollouts: list[Upload]) -> int:
+        return updates_of(self.settings.spec.training, rollouts, memory=False)
 
     def _check(self, server: ActorServer, counters: RunCounters, before: tuple[int, int]) -> None:
         with server.lock:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.intake import Rejected
 from daedalus.learner.serving.rollout_buffer import TakenRollouts
-from daedalus.protocol.messages import Acknowledgement, Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Acknowledgement, Rollout, RolloutIdentity, Snapshot, Upload
 from daedalus.protocol.spec import RunSpec
 
 from .kernel import Kernel
@@ -90,7 +90,7 @@ class Ledger:
 
     # ------------------------------------------------------------------------------------------------ learner
 
-    def judged(self, life: Life, rollout: Rollout, verdict: Rollout | Rejected, incarnation: int) -> None:
+    def judged(self, life: Life, rollout: Rollout, verdict: Upload | Rejected, incarnation: int) -> None:
         """Check the verdict on a rollout; `incarnation` is the newest of its actor that has joined."""
         identity = rollout.identity
         if verdict is rollout:
@@ -159,7 +159,7 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
     intake, buffer = server.rollouts._intake, server.rollouts._buffer
     judge, add, take = intake.judge, buffer.add, buffer.take
 
-    def noted_judge(sender: str, content: Rollout | Rejected, policy_version: int, now: float) -> Rollout | Rejected:
+    def noted_judge(sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
         verdict = judge(sender, content, policy_version, now)
         if isinstance(content, Rollout):
             ledger.judged(life, content, verdict, server.fleet.actors[sender].incarnation)

@@ -1,6 +1,7 @@
 """Running statistics of observations and returns, and the normalisation of rewards. State; no I/O, no threads."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +14,21 @@ from daedalus.protocol.messages import Rollout, RolloutIdentity
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 _MAX_STREAMS = 4096  # actors whose running returns are kept
+
+
+class Moments(NamedTuple):
+    """Number, mean and sum of squared deviations of some values, in float64."""
+
+    number: int
+    mean: Tensor  # [*shape]
+    squares: Tensor  # [*shape]
+
+
+def moments_of(values: Tensor) -> Moments:
+    """Return the moments of values [N, *shape]; those of no values are 0."""
+    values = values.to("cpu", torch.float64)
+    mean = values.mean(0) if len(values) else values.new_zeros(values.shape[1:])
+    return Moments(len(values), mean, (values - mean).square().sum(0))
 
 
 class RunningMoments:
@@ -33,13 +49,15 @@ class RunningMoments:
 
     def add(self, values: Tensor) -> None:
         """Add values [N, *shape]."""
-        number = len(values)
+        self.merge(moments_of(values))
+
+    def merge(self, others: Moments) -> None:
+        """Add the values that the moments are of."""
+        number = others.number
         if not number:
             return
-        values = values.to("cpu", torch.float64)
-        mean = values.mean(0)
-        total, difference = self.count + number, mean - self.mean
-        self.squares += (values - mean).square().sum(0) + difference.square() * self.count * number / total
+        total, difference = self.count + number, others.mean - self.mean
+        self.squares += others.squares + difference.square() * self.count * number / total
         self.mean += difference * number / total
         self.count += number
 
@@ -71,9 +89,18 @@ class ObservationStatistics:
 
         Call after the updates of the batch: they learn with the statistics that the actors acted with.
         """
+        self.merge([self.moments_of(batch)])
+
+    def moments_of(self, batch: Batch) -> dict[str, Moments]:
+        """Return the moments of the observations of the valid rows, by component."""
         rows = batch.valid.bool()
+        return {name: moments_of(batch.observations[name][:-1][rows]) for name in self.moments}
+
+    def merge(self, parts: Sequence[dict[str, Moments]]) -> None:
+        """Add observations by their moments, and set the normaliser's statistics. See `add`."""
         for name, moments in self.moments.items():
-            moments.add(batch.observations[name][:-1][rows])
+            for part in parts:
+                moments.merge(part[name])
             self._normalizer.set_statistics(name, moments.mean, moments.variance)
 
 
@@ -92,8 +119,12 @@ class RewardNormalizer:
 
     def add(self, rollouts: Sequence[Rollout]) -> None:
         """Add the returns of rollouts to the statistics."""
+        self.moments.merge(self.moments_of(rollouts))
+
+    def moments_of(self, rollouts: Sequence[Rollout]) -> Moments:
+        """Return the moments of the returns of the valid rows of rollouts. Call it once for each rollout, in order."""
         seen = [self._returns(rollout)[rollout.valid] for rollout in rollouts]
-        self.moments.add(torch.from_numpy(np.concatenate(seen)))
+        return moments_of(torch.from_numpy(np.concatenate(seen)))
 
     def scale(self, batch: Batch) -> None:
         """Scale the rewards of a batch in place."""

@@ -1,0 +1,62 @@
+"""What an actor uploads of its rollouts: the rollouts themselves, or their gradients. No threads."""
+
+from typing import Protocol
+
+import numpy as np
+
+from daedalus.actor.session.learner_queries import ActorError
+from daedalus.policy.user_modules import UserModuleError, UserModules
+from daedalus.protocol.messages import Rollout, Upload
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+
+
+class Uploads(Protocol):
+    """Maker of the messages that an actor uploads in one session."""
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """Use the weights of a snapshot for the next rollouts. Raises PolicyError if they do not fit."""
+        ...
+
+    def compute(self, rollout: Rollout) -> Upload:
+        """Return what to upload of the next rollout."""
+        ...
+
+
+class RolloutUploads:
+    """Uploads of the rollouts themselves."""
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """See Uploads. Rollouts need no weights."""
+
+    def compute(self, rollout: Rollout) -> Upload:
+        """See Uploads."""
+        return rollout
+
+
+def make_uploads(spec: RunSpec, spaces: Spaces, modules: UserModules) -> Uploads:
+    """Return what makes the uploads that a run asks for. Only gradients import torch.
+
+    `modules` may be imported for the network and the algorithm. Raises ActorError if the actor cannot compute
+    gradients.
+    """
+    if not spec.uploads_gradients:
+        return RolloutUploads()
+    try:
+        modules.check(spec.learner_modules)
+        from daedalus.algorithms.errors import AlgorithmError
+        from daedalus.algorithms.rollout_gradients import RolloutGradients
+        from daedalus.policy.network.errors import NetworkError
+    except UserModuleError as error:
+        raise ActorError(str(error)) from None
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        raise ActorError(
+            "this run takes gradients (collection.upload), which an actor computes with torch: install it with "
+            "pip install 'daedalus-rl[learner]', or set collection.upload=rollouts"
+        ) from None
+    try:
+        return RolloutGradients(spec, spaces, modules)
+    except (AlgorithmError, NetworkError) as error:
+        raise ActorError(str(error)) from None

@@ -1,0 +1,126 @@
+"""Gradients of an actor's own rollouts, at the weights that played them. State; no I/O, no threads."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from daedalus.algorithms.action_counts import ActionCounts
+from daedalus.algorithms.batch import BatchAssembler
+from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
+from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
+from daedalus.algorithms.gradient_inputs import unpacked
+from daedalus.algorithms.gradients import GradientComputer
+from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer
+from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.user_modules import NO_MODULES, UserModules
+from daedalus.protocol.compact import bfloat16, float32, planes
+from daedalus.protocol.messages import LARGEST_GRADIENT_NORM, Gradient, Rollout
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import RunSpec
+
+
+class RolloutGradients:
+    """Computes what an actor uploads in place of its rollouts.
+
+    A synchronous algorithm gets float32, because its updates must equal those of one process to the bit. The others get
+    bfloat16 with error feedback: what one rounding loses is added to the next gradient, so that nothing is lost in the
+    long run. Seide et al. (2014), section 2.
+    """
+
+    def __init__(self, spec: RunSpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
+        """Raise NetworkError or AlgorithmError if the network or the algorithm cannot be constructed here."""
+        torch.set_num_threads(1)
+        training = spec.training.model_copy(update={"device": "cpu"})
+        with torch.random.fork_rng(devices=()):  # a learner in the same process draws its own numbers
+            self._network = ActorCritic(spec.policy, spaces, modules)
+        self._computer = GradientComputer(training, self._network, spaces, modules)
+        self._assembler = BatchAssembler(spaces, torch.device("cpu"))
+        self._observations = ObservationStatistics(self._network.normalizer)
+        self._rewards = RewardNormalizer(training.discount_factor) if training.normalize_rewards else None
+        self._actions = ActionCounts(spaces, torch.device("cpu"))
+        self._in_float32 = spec.algorithm.synchronous
+        self._parameters = dict(self._network.named_parameters())
+        self._unsent: dict[str, np.ndarray] = {}  # by parameter: what rounding has lost so far
+        self._entropy_bonus = 0.0
+
+    def load(self, weights: dict[str, np.ndarray]) -> None:
+        """Use the weights of a snapshot in all later calls. Raises PolicyError if they do not fit."""
+        for name, parameter in self._parameters.items():
+            if name not in weights:
+                raise PolicyError(f"the snapshot lacks the weights {name!r} of the network")
+            if weights[name].shape != tuple(parameter.shape):
+                raise PolicyError(
+                    f"weights {name!r} are {weights[name].shape}, the network requires {tuple(parameter.shape)}"
+                )
+        try:
+            inputs = unpacked(weights[GRADIENT_INPUTS])
+        except (KeyError, ValueError) as error:
+            raise PolicyError(f"the snapshot has no numbers to compute gradients with: {error}") from None
+        with torch.no_grad():
+            for name, parameter in self._parameters.items():
+                parameter.copy_(torch.from_numpy(weights[name].copy()))
+        self._entropy_bonus = inputs.entropy_bonus
+        if self._rewards is not None:
+            moments = self._rewards.moments
+            moments.count.fill_(inputs.returns_count)
+            moments.mean.fill_(inputs.returns_mean)
+            moments.squares.fill_(inputs.returns_squares)
+
+    def compute(self, rollout: Rollout) -> Gradient:
+        """Return the gradient of a rollout that the loaded weights have played. Call once for each rollout, in order.
+
+        Rewards are normalised as the learner would: with the statistics of the snapshot and of the rollout itself.
+        """
+        batch = self._assembler.join([rollout])
+        moments = {f"observations/{name}": part for name, part in self._observations.moments_of(batch).items()}
+        if self._rewards is not None:
+            moments["returns"] = self._rewards.moments_of([rollout])
+            self._rewards.moments.merge(moments["returns"])
+            self._rewards.scale(batch)
+        (terms,) = self._computer.compute(batch, self._entropy_bonus)
+        first_pass = self._computer.take_first_pass()
+        measured: dict[str, float] = {}
+        if first_pass is not None:
+            measured = dict(zip(BATCH_METRICS, batch_metrics(first_pass).tolist(), strict=True))
+            measured |= diagnostics(first_pass, None)
+        self._actions.add(batch)
+        gradient = Gradient(
+            identity=rollout.identity,
+            policy_version=rollout.policy_version,
+            gradient=self._computed(),
+            env_steps=rollout.env_steps,
+            metrics={
+                name: np.array(float(value), np.float32) for name, value in {**terms._asdict(), **measured}.items()
+            },
+            moments={name: _packed(part) for name, part in moments.items()},
+            action_counts={name: np.array(counts, np.int64) for name, counts in self._actions.take().items()},
+            episode_returns=rollout.episode_returns,
+            episode_lengths=rollout.episode_lengths,
+            episode_info=rollout.episode_info,
+        )
+        return gradient if self._in_float32 else self._rounded(gradient)
+
+    def _computed(self) -> dict[str, np.ndarray]:
+        """Return a copy of the computed gradient by parameter."""
+        learned = {name: each.shape for name, each in self._parameters.items() if each.requires_grad}
+        parts = self._computer.parameters.gradients.split([shape.numel() for shape in learned.values()])
+        return {
+            name: part.view(shape).numpy().copy() for (name, shape), part in zip(learned.items(), parts, strict=True)
+        }
+
+    def _rounded(self, gradient: Gradient) -> Gradient:
+        """Return the gradient in bfloat16, and keep what rounding has lost for the next one."""
+        wanted = gradient.gradient
+        if gradient.norm <= LARGEST_GRADIENT_NORM:  # the learner rejects all others
+            wanted = {name: values + self._unsent.get(name, np.float32(0.0)) for name, values in wanted.items()}
+        bits = bfloat16(wanted)
+        if wanted is not gradient.gradient:
+            sent = float32(bits)
+            self._unsent = {name: values - sent[name] for name, values in wanted.items()}
+        return replace(gradient, gradient=planes(bits, None))
+
+
+def _packed(moments: Moments) -> np.ndarray:
+    return torch.stack([moments.mean, moments.squares]).numpy()

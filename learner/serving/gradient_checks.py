@@ -1,0 +1,152 @@
+"""Checks of gradients that actors computed, against the parameters and the specification. Pure functions."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from daedalus.protocol.compact import bits_of, float32
+from daedalus.protocol.limits import Limits
+from daedalus.protocol.messages import (
+    DIAGNOSTICS,
+    LARGEST_GRADIENT_NORM,
+    LOSS_TERMS,
+    MAX_INFO_NAMES,
+    MAX_INFO_VALUES,
+    Gradient,
+)
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import RunSpec
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+_LARGEST_METRIC = 1e30
+_LARGEST_MOMENT = 1e30  # of observations of up to 1e15, squared
+_ARRAY_BYTES = 16  # padding of each array, rounded up
+_MAX_METRICS = len(LOSS_TERMS) + len(DIAGNOSTICS)
+
+
+def gradient_limits(spec: RunSpec, shapes: Shapes, spaces: Spaces, environments: int) -> Limits:
+    """Return the size limits of a gradient of an actor with so many environments."""
+    size = sum(4 * math.prod(shape) + _ARRAY_BYTES for shape in shapes.values())
+    moments = expected_moments(spec, spaces)
+    size += sum(8 * math.prod(shape) + _ARRAY_BYTES for shape in moments.values())
+    discrete = [space for space in spaces.actions.values() if isinstance(space, DiscreteSpace)]
+    size += sum(8 * space.choices + _ARRAY_BYTES for space in discrete)
+    episodes = spec.collection.rollout_length * environments
+    size += 12 * episodes + MAX_INFO_NAMES * (4 * MAX_INFO_VALUES + _ARRAY_BYTES) + _MAX_METRICS * _ARRAY_BYTES
+    arrays = len(shapes) + len(moments) + len(discrete) + MAX_INFO_NAMES + _MAX_METRICS + 2
+    return Limits(max_bytes=size, max_arrays=arrays)
+
+
+def expected_moments(spec: RunSpec, spaces: Spaces) -> dict[str, tuple[int, ...]]:
+    """Return the names and shapes of the moments in a gradient."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    if spec.policy.normalize_observations:
+        for name, space in spaces.observations.items():
+            if isinstance(space, ArraySpace) and not space.is_image:
+                shapes[f"observations/{name}"] = (2, *space.stacked_shape)
+    if spec.training.normalize_rewards:
+        shapes["returns"] = (2,)
+    return shapes
+
+
+def restored(gradient: Gradient) -> Gradient:
+    """Return the gradient in float32."""
+    compact = {name: values for name, values in gradient.gradient.items() if values.dtype == np.uint8}
+    return replace(gradient, gradient={**gradient.gradient, **float32(bits_of(compact, None))})
+
+
+def first_violation(gradient: Gradient, spec: RunSpec, shapes: Shapes, spaces: Spaces, environments: int) -> str:
+    """Return a description of the first violation of a `restored` gradient, or an empty string.
+
+    Args:
+      gradient: what the actor sent.
+      spec, spaces: of the run.
+      shapes: those of the parameters that have gradients, by name.
+      environments: number of environments of the actor.
+    """
+    most = spec.collection.rollout_length * environments
+    if gradient.env_steps > most:
+        return f"env_steps is {gradient.env_steps}, but a rollout of this actor has {most} rows"
+    return (
+        _gradient_violation(gradient, shapes)
+        or _moments_violation(gradient, expected_moments(spec, spaces))
+        or _counts_violation(gradient, spaces)
+        or _metrics_violation(gradient)
+        or _episodes_violation(gradient)
+    )
+
+
+def _gradient_violation(gradient: Gradient, shapes: Shapes) -> str:
+    given = {name: values.shape for name, values in gradient.gradient.items()}
+    different = next((name for name in sorted({*given, *shapes}) if given.get(name) != shapes.get(name)), None)
+    if different is not None:
+        return (
+            f"the gradient of {different!r} is {_shape(given.get(different))}, and in this run's network "
+            f"{_shape(shapes.get(different))}: install the release and the modules that the learner uses"
+        )
+    norm = gradient.norm
+    if not norm <= LARGEST_GRADIENT_NORM:  # nor nan
+        return (
+            f"the norm of the gradient is {norm:.3g}, at most {LARGEST_GRADIENT_NORM:g} is allowed: "
+            "its observations or rewards are too large"
+        )
+    return ""
+
+
+def _shape(shape: tuple[int, ...] | None) -> str:
+    return "absent" if shape is None else str(list(shape))
+
+
+def _moments_violation(gradient: Gradient, expected: dict[str, tuple[int, ...]]) -> str:
+    given = {name: values.shape for name, values in gradient.moments.items()}
+    if given != expected:
+        return f"moments are of {_shapes(given)}, expected {_shapes(expected)}"
+    for name, values in gradient.moments.items():
+        if not np.isfinite(values).all() or np.abs(values).max() > _LARGEST_MOMENT or (values[1] < 0.0).any():
+            return f"moments/{name} has a value that no rollout has"
+    return ""
+
+
+def _counts_violation(gradient: Gradient, spaces: Spaces) -> str:
+    discrete = {name: space for name, space in spaces.actions.items() if isinstance(space, DiscreteSpace)}
+    if gradient.action_counts.keys() != discrete.keys():
+        return f"action_counts are of {_names(gradient.action_counts)}, expected {_names(discrete)}"
+    for name, space in discrete.items():
+        counts = gradient.action_counts[name]
+        if counts.shape != (space.choices,) or (counts < 0).any() or (counts > gradient.env_steps).any():
+            return f"action_counts/{name} is not a count of {space.choices} choices in {gradient.env_steps} env_steps"
+    return ""
+
+
+def _metrics_violation(gradient: Gradient) -> str:
+    names = gradient.metrics.keys()
+    if not set(LOSS_TERMS) <= names <= {*LOSS_TERMS, *DIAGNOSTICS}:
+        return f"metrics has the names {_names(gradient.metrics)}, expected {', '.join(LOSS_TERMS)}"
+    for name, value in gradient.metrics.items():
+        if not abs(float(value)) <= _LARGEST_METRIC:  # nor nan
+            return f"metrics/{name[:64]} is {float(value)}, at most {_LARGEST_METRIC:g} is allowed"
+    return ""
+
+
+def _episodes_violation(gradient: Gradient) -> str:
+    if len(gradient.episode_returns) > gradient.env_steps:
+        return f"{len(gradient.episode_returns)} episodes ended in {gradient.env_steps} env_steps"
+    if not np.isfinite(gradient.episode_returns).all():
+        return "episode_returns has a value that is not finite"
+    if (gradient.episode_lengths < 1).any():
+        return "episode_lengths has a value below 1"
+    for name, values in gradient.episode_info.items():
+        if not np.isfinite(values).all():
+            return f"episode_info {name!r} has a value that is not finite"
+    return ""
+
+
+def _names(names: Mapping[str, object]) -> str:
+    return ", ".join(sorted(name[:64] for name in names)[:8]) or "nothing"
+
+
+def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name[:64]} {list(shapes[name])}" for name in sorted(shapes)[:8]) or "nothing"

@@ -1,0 +1,163 @@
+"""Gradients from actors: what the learner accepts, what it rejects, and that it counts each once."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, make_rollout, run_spec
+
+from daedalus.algorithms.rollout_gradients import RolloutGradients
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.intake import Intake, Rejected
+from daedalus.learner.training.learner import Learner
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Gradient, Message, Upload
+from daedalus.protocol.spec import RunSpec
+
+VERSION, MAX_LAG = 10, 4
+
+
+def spec_of(algorithm: str = "a3c") -> RunSpec:
+    content = run_spec(algorithm=algorithm, max_policy_lag=MAX_LAG, normalize_rewards=True).model_dump()
+    content["policy"]["normalize_observations"] = True
+    content["collection"]["upload"] = "gradients"
+    return RunSpec.model_validate(content)
+
+
+SPEC = spec_of()
+LEARNER = Learner(SPEC.training, SPEC.policy, SPACES)
+
+
+def gradient(sequence: int = 0, version: int = VERSION, spec: RunSpec = SPEC, **replaced: Any) -> Gradient:
+    actor = RolloutGradients(spec, SPACES)
+    actor.load(LEARNER.weights() | LEARNER.gradient_inputs(0.0))
+    computed = actor.compute(make_rollout(identity(sequence=sequence), version=version, seed=sequence))
+    return replace(computed, **replaced)
+
+
+GOOD = gradient()
+
+
+class Harness:
+    def __init__(self) -> None:
+        self.fleet = joined_fleet("a", "b")
+        self.intake = Intake(SPEC, EPOCH, self.fleet)
+        self.intake.gradient_shapes = LEARNER.gradient_shapes
+
+    def receive(self, message: Message, sender: str = "a") -> Upload | Rejected:
+        data = encode(message)
+        refused = self.intake.refuse_size(sender, len(data))
+        assert refused is None, refused
+        return self.intake.judge(sender, self.intake.read(sender, data), VERSION, 1.0)
+
+
+@pytest.fixture
+def harness() -> Harness:
+    return Harness()
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "a3c"])
+def test_a_gradient_is_accepted_once_and_in_float32(harness: Harness, algorithm: str) -> None:
+    sent = gradient(version=VERSION - 1, spec=spec_of(algorithm))
+    verdict = harness.receive(sent)
+    assert isinstance(verdict, Gradient)
+    assert {name: values.shape for name, values in verdict.gradient.items()} == LEARNER.gradient_shapes
+    assert all(values.dtype == np.float32 for values in verdict.gradient.values())
+    assert harness.fleet.actors["a"].policy_lag == 1
+    again = harness.receive(sent)
+    assert isinstance(again, Rejected)
+    assert again.cause == "duplicate"
+
+
+def test_its_episodes_and_env_steps_count_like_those_of_a_rollout() -> None:
+    rollout = make_rollout(identity(), version=VERSION, seed=0)
+    of_rollout, of_gradient = RunCounters(100), RunCounters(100)
+    for counters, upload in ((of_rollout, rollout), (of_gradient, GOOD)):
+        counters.accepted(upload, 10)
+        counters.trained([upload], VERSION + 1, 1)
+    assert of_gradient.state(0.0) == of_rollout.state(0.0)
+
+
+def changed(part: str, name: str, value: Any) -> dict[str, Any]:
+    return {part: getattr(GOOD, part) | {name: value}}
+
+
+def with_bits(bits: int) -> dict[str, Any]:
+    """Return a gradient with one value of these bits as a bfloat16."""
+    planes = GOOD.gradient["value_head.bias"].copy()
+    planes[:, 0] = bits >> 8, bits & 0xFF
+    return changed("gradient", "value_head.bias", planes)
+
+
+@pytest.mark.parametrize(
+    ("replaced", "reason"),
+    [
+        (with_bits(0x7FC0), "the norm of the gradient is nan"),
+        (with_bits(0x7F80), "the norm of the gradient is inf"),
+        (with_bits(0x5680), "the norm of the gradient is 7.04e+13, at most 1e+12 is allowed"),
+        (changed("gradient", "value_head.bias", np.zeros(3, np.float32)), r"'value_head.bias' is [3], and in this"),
+        (changed("gradient", "other", np.zeros(3, np.float32)), r"'other' is [3], and in this run's network absent"),
+        ({"gradient": {"value_head.bias": np.zeros(1, np.float32)}}, "in this run's network ["),
+        ({"env_steps": ROWS * ENVIRONMENTS + 1}, f"a rollout of this actor has {ROWS * ENVIRONMENTS} rows"),
+        ({"moments": {}}, "moments are of nothing, expected observations/observation [2, 3], returns [2]"),
+        (changed("moments", "returns", np.array([np.nan, 1.0])), "moments/returns has a value that no rollout has"),
+        (changed("moments", "returns", np.array([0.0, -1.0])), "moments/returns has a value that no rollout has"),
+        (changed("moments", "returns", np.array([1e40, 1.0])), "moments/returns has a value that no rollout has"),
+        ({"action_counts": {}}, "action_counts are of nothing, expected action"),
+        (changed("action_counts", "action", np.full(4, 99)), "action_counts/action is not a count of 4 choices"),
+        (changed("action_counts", "action", np.full(4, -1)), "action_counts/action is not a count of 4 choices"),
+        (changed("metrics", "entropy", np.array(np.nan, np.float32)), "metrics/entropy is nan"),
+        (changed("metrics", "own", np.array(1.0, np.float32)), "metrics has the names"),
+        ({"metrics": {}}, "metrics has the names nothing, expected policy_loss"),
+        ({"episode_lengths": np.zeros_like(GOOD.episode_lengths)}, "episode_lengths has a value below 1"),
+        ({"episode_returns": np.full_like(GOOD.episode_returns, np.inf)}, "episode_returns has a value that is not"),
+        ({"env_steps": 0, "action_counts": {"action": np.zeros(4, np.int64)}}, "episodes ended in 0 env_steps"),
+    ],
+)
+def test_an_unfit_gradient_is_rejected_with_the_reason_and_three_quarantine_its_sender(
+    harness: Harness, replaced: dict[str, Any], reason: str
+) -> None:
+    for number in range(3):
+        verdict = harness.receive(replace(GOOD, **replaced))
+        assert isinstance(verdict, Rejected)
+        assert (verdict.cause, verdict.verdict) == ("unfit", "quarantined" if number == 2 else "rejected")
+        assert reason in verdict.reason
+        assert "\n" not in verdict.reason
+    assert harness.fleet.actors["a"].rejected == {"unfit": 3}
+    assert isinstance(harness.receive(replace(GOOD, identity=identity("b")), "b"), Gradient)
+
+
+@pytest.mark.parametrize(
+    ("message", "cause", "reason"),
+    [
+        (make_rollout(version=VERSION), "malformed", "the message is not a gradient, which this run takes"),
+        (replace(GOOD, identity=identity(epoch=EPOCH + 1)), "epoch", "for another learner epoch"),
+        (replace(GOOD, identity=identity(incarnation=2)), "unknown_actor", "incarnation 2"),
+        (gradient(version=VERSION - MAX_LAG - 1), "stale", "policy lag 5, at most 4 is allowed"),
+        (gradient(version=VERSION + 1), "unfit", "newer than the learner's version"),
+    ],
+)
+def test_the_promises_about_rollouts_hold_for_gradients(
+    harness: Harness, message: Message, cause: str, reason: str
+) -> None:
+    verdict = harness.receive(message)
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == cause
+    assert reason in verdict.reason
+
+
+def test_a_run_of_rollouts_rejects_gradients() -> None:
+    fleet = joined_fleet("a")
+    intake = Intake(run_spec(), EPOCH, fleet)
+    verdict = intake.read("a", encode(GOOD))
+    assert isinstance(verdict, Rejected)
+    assert verdict.cause == "malformed"
+
+
+def test_the_size_of_a_gradient_is_bounded(harness: Harness) -> None:
+    largest = max(len(encode(gradient(spec=spec_of(algorithm)))) for algorithm in ("a2c", "a3c"))
+    assert harness.intake.refuse_size("a", largest) is None
+    refused = harness.intake.refuse_size("a", 1 << 20)
+    assert refused is not None
+    assert refused.cause == "malformed"
