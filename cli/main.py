@@ -23,7 +23,6 @@ on several machines, one process at a time:
   status     show the state of a learner and its actors
   drain      ask actors to leave after their current rollout
   gateway    connect actors in any language
-  bridge     connect actors that are written in other languages and run the policy themselves
   exporter   export the status as Prometheus metrics
   certs      create certificates for encrypted connections
 
@@ -62,7 +61,7 @@ def _run() -> int:
     return _COMMANDS[command](rest)
 
 
-_MODULES = {name: f"daedalus.cli.commands.{name}" for name in ("learner", "actor", "evaluate", "bridge", "gateway")}
+_MODULES = {name: f"daedalus.cli.commands.{name}" for name in ("learner", "actor", "evaluate", "gateway")}
 
 
 def _train(arguments: list[str]) -> int:

@@ -11,12 +11,13 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from daedalus.gateway.connection import ClientConnection
 from daedalus.gateway.gateway import Gateway
+from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import HEADERS, Guard
 
 Application = Callable[[Any, Any, Any], Awaitable[None]]
 
 
-def application(gateway: Gateway, guard: Guard) -> Application:
+def application(gateway: Gateway, raw: RawEndpoint, guard: Guard) -> Application:
     """Return the application: every request passes the guard first."""
 
     class Actor:
@@ -25,8 +26,15 @@ def application(gateway: Gateway, guard: Guard) -> Application:
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             await ClientConnection(gateway, guard, scope, receive, send).serve()
 
+    class Raw:
+        """The WebSocket of one client that runs the policy itself."""
+
+        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+            await raw.serve(scope, receive, send)
+
     routes: list[BaseRoute] = [
         WebSocketRoute("/actor", Actor()),
+        WebSocketRoute("/raw", Raw()),
         Route("/protocol.json", _protocol),
     ]
     return _Guarded(Starlette(routes=routes), guard)

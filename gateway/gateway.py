@@ -122,7 +122,8 @@ class Gateway:
         for seat in list(self._seats.values()):
             seat.on_end(ClientError("unavailable", "the gateway stops"))
         self._joins.shutdown(wait=False, cancel_futures=True)
-        await asyncio.to_thread(self._thread.join, 3.0)
+        if self._thread.is_alive():
+            await asyncio.to_thread(self._thread.join, 3.0)
 
     def _start(self, work: Any) -> None:
         task = self._loop.create_task(work)

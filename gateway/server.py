@@ -21,6 +21,7 @@ from daedalus.transport.credentials import CERTIFICATE, KEY
 _PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
 _MAX_CONNECTIONS = 2048
 _STOP_SECONDS = 2  # for connections to end after a stop
+_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _REQUEST_SECONDS = 10.0  # from the connection to a complete request
 
@@ -45,7 +46,8 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
         """Give the application the function that sets the limit."""
         super().handle_connect(event)
         if self.response.status_code == 101:
-            self.scope["extensions"] = {**(self.scope["extensions"] or {}), "daedalus.limit": self._set_limit}  # type: ignore[typeddict-item] - extensions may have any name
+            ours = {"daedalus.limit": self._set_limit, "daedalus.stream": self._become_stream}
+            self.scope["extensions"] = {**(self.scope["extensions"] or {}), **ours}  # type: ignore[typeddict-item] - extensions may have any name
 
     def send_receive_event_to_app(self) -> None:
         """Queue a message; pause reading only if the application is behind, which costs two system calls."""
@@ -53,6 +55,16 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
         self.read_paused = paused or self.queue.qsize() < _QUEUED_MESSAGES
         super().send_receive_event_to_app()
         self.read_paused = paused or self.queue.qsize() > _QUEUED_MESSAGES
+
+    def _become_stream(self, size: int) -> None:
+        """Let the client wait for any time: TCP detects a host that vanished, in place of pings."""
+        self._set_limit(size)
+        self.stop_keepalive()
+        connection = self.transport.get_extra_info("socket")
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEP_ALIVE:
+            if hasattr(socket, name):
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def _set_limit(self, size: int) -> None:
         self.conn.max_message_size = size

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "bridge", "gateway", "cli")
+PACKAGES = ("protocol", "transport", "policy", "algorithms", "actor", "learner", "gateway", "cli")
 ALLOWED = {
     "protocol": {"protocol"},
     "transport": {"protocol", "transport"},
@@ -16,7 +16,6 @@ ALLOWED = {
     "algorithms": {"protocol", "policy", "algorithms"},
     "actor": {"protocol", "transport", "policy", "algorithms", "actor"},
     "learner": {"protocol", "transport", "policy", "algorithms", "learner"},
-    "bridge": {"protocol", "transport", "bridge"},
     "gateway": {"protocol", "transport", "policy", "actor", "gateway"},
     "cli": set(PACKAGES),
 }
@@ -105,7 +104,6 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("protocol.codec", {"torch", "zenoh", "daedalus.policy", "daedalus.transport"}),
         ("gateway.server", {"torch", "daedalus.learner", "daedalus.algorithms"}),
         ("gateway.gateway", {"torch", "daedalus.learner", "daedalus.algorithms"}),
-        ("bridge.service", {"torch", "daedalus.actor", "daedalus.learner", "numpy", "gymnasium"}),
     ],
 )
 def test_a_process_loads_only_what_it_needs(module: str, absent: set[str]) -> None:

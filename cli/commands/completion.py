@@ -29,7 +29,6 @@ _PARSERS = {
     "status": ("commands.status", "parser"),
     "drain": ("commands.drain", "parser"),
     "gateway": ("commands.gateway", "parser"),
-    "bridge": ("commands.bridge", "parser"),
     "exporter": ("commands.exporter", "parser"),
     "certs": ("commands.certs", "parser"),
     "evaluate": ("commands.evaluate_arguments", "parser"),

@@ -26,7 +26,7 @@ from daedalus.cli.processes import (
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.connecting import connect, connect_with_retry
 from daedalus.transport.credentials import Credentials, load
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -166,6 +166,7 @@ async def _serve(
     """Serve until a signal, or until the gateway fails; raises what made it fail."""
     from daedalus.gateway.app import application
     from daedalus.gateway.gateway import Gateway, GatewayConfig
+    from daedalus.gateway.raw.endpoint import RawEndpoint
     from daedalus.gateway.security import LOOPBACK, guard
     from daedalus.gateway.server import Server, tls_context
     from daedalus.gateway.tokens import Tokens
@@ -182,13 +183,20 @@ async def _serve(
     tls = None if serving is None else tls_context(serving.directory)
     port = listener.getsockname()[1]
     names = [*LOOPBACK, *arguments.host, *([] if serving is None else _bracketed(serving.hosts()))]
-    gateway = Gateway(transport, GatewayConfig(name=name, owner=owner, run=arguments.run), fail)
+    config = GatewayConfig(name=name, owner=owner, run=arguments.run)
+    gateway = Gateway(transport, config, fail)
     gateway.open()
     watch = asyncio.create_task(_set_when_stopped(stop, ended))
     rules = guard([*names, socket.gethostname()], port, arguments.allow_origin, tokens)
     shown = arguments.listen.rpartition(":")[0]
     _logger.info("clients connect to %s://%s:%d/actor", "wss" if tls else "ws", shown, port)
-    await Server(application(gateway, rules), tls).run_until(ended, listener, gateway.close)
+    raw = RawEndpoint(lambda: connect(arguments.connect, credentials), rules, config.actor_name)
+
+    async def close() -> None:
+        await raw.close()
+        await gateway.close()
+
+    await Server(application(gateway, raw, rules), tls).run_until(ended, listener, close)
     watch.cancel()
     if failures:
         raise failures[0]

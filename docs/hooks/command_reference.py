@@ -9,7 +9,6 @@ from typing import Any
 from unittest.mock import patch
 
 from daedalus.cli.commands import (
-    bridge,
     certs,
     check,
     completion,
@@ -40,7 +39,6 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
         "status": status.parser(),
         "drain": drain.parser(),
         "gateway": gateway.parser(),
-        "bridge": bridge.parser(),
         "exporter": exporter.parser(),
         "certs": certs.parser(),
         "evaluate": evaluate_parser(),

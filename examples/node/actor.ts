@@ -2,7 +2,7 @@
 
 import { hostname } from "node:os";
 import { setTimeout as sleep } from "node:timers/promises";
-import { Bridge, BridgeError } from "./bridge.ts";
+import { Gateway, GatewayError } from "./gateway.ts";
 import { Collector } from "./collector.ts";
 import { type Kind, kindOf, KINDS } from "./environments.ts";
 import * as link from "./link.ts";
@@ -21,8 +21,8 @@ const NAME_IN_USE_MILLISECONDS = 10_000; // until the network notices that an ea
 const ACKNOWLEDGE_SECONDS = 30; // a saturated learner answers late
 
 export interface ActorConfig {
-  host: string; // of the bridge
-  port: number; // of the bridge
+  host: string; // of the gateway
+  port: number; // of the gateway
   run: string; // `*`: any run
   name: string; // the same after a restart
   incarnation: bigint; // identifies this process
@@ -59,7 +59,7 @@ export class Actor {
         await this.#joinAndCollect(() => (lastLogged = ""));
       } catch (error) {
         if (error instanceof RunOverError) return this.#log(error.message);
-        const temporary = error instanceof LearnerLostError || error instanceof BridgeError;
+        const temporary = error instanceof LearnerLostError || error instanceof GatewayError;
         if (temporary) nameInUseDeadline = performance.now() + NAME_IN_USE_MILLISECONDS;
         else if (!(error instanceof NameTakenError && performance.now() < nameInUseDeadline)) throw error;
         if (lastLogged !== error.message) this.#log(`${error.message}; looking for a learner`);
@@ -75,54 +75,54 @@ export class Actor {
     this.#stopCollecting(new RunOverError("stopped"));
   }
 
-  /** Connect to the bridge, join, and collect until an error ends the session. */
+  /** Connect to the gateway, join, and collect until an error ends the session. */
   async #joinAndCollect(onJoined: () => void): Promise<never> {
     const { host, port, name, incarnation } = this.#config;
-    const bridge = await Bridge.open(host, port);
+    const gateway = await Gateway.open(host, port, name);
     try {
       this.#snapshot = undefined;
       this.#stopReason = this.#stopped ? new RunOverError("stopped") : undefined;
-      bridge.onClosed = (error) => this.#stopCollecting(error);
+      gateway.onClosed = (error) => this.#stopCollecting(error);
       const origin = { host: hostname(), software: SOFTWARE, address: "" };
       const known = { actor: name, incarnation, origin, failure: "" };
       const inquiry = { ...known, spaces: null, environments: 0 };
-      const { run, spec, learner_epoch } = await link.join(bridge, this.#run, inquiry);
+      const { run, spec, learner_epoch } = await link.join(gateway, this.#run, inquiry);
       this.#run = run;
       const kind = supported(spec.environment, spec.collection.upload);
       if (this.#uploader.learnerEpoch !== learner_epoch) {
         this.#uploader = new Uploader(learner_epoch, spec.collection.window);
         this.#publishedVersion = 0;
       }
-      bridge.follow(`daedalus/${run}/snapshots`, (bytes) => this.#onPublication(bytes));
-      bridge.follow(`daedalus/${run}/end`, (bytes) => this.#onPublication(bytes));
-      bridge.watch(`daedalus/${run}/learner`, (_key, present) => {
+      gateway.follow(`daedalus/${run}/snapshots`, (bytes) => this.#onPublication(bytes));
+      gateway.follow(`daedalus/${run}/end`, (bytes) => this.#onPublication(bytes));
+      gateway.watch(`daedalus/${run}/learner`, (_key, present) => {
         if (!present) this.#stopCollecting(new LearnerLostError("the learner went away"));
       });
-      bridge.announce(`daedalus/${run}/actors/${name}/${incarnation}`);
+      gateway.announce(`daedalus/${run}/actors/${name}/${incarnation}`);
       const environments = this.#config.environments ?? spec.collection.envs_per_actor;
-      const welcome = await link.join(bridge, run, { ...known, spaces: kind.spaces, environments });
+      const welcome = await link.join(gateway, run, { ...known, spaces: kind.spaces, environments });
       if (welcome.learner_epoch !== learner_epoch) throw new LearnerLostError("the learner was restarted");
       this.#heardAt = performance.now();
       onJoined();
       this.#log(`joined run '${run}' as '${name}': ${environments} x ${spec.environment.id}`);
-      return await this.#collect(bridge, welcome, kind, environments);
+      return await this.#collect(gateway, welcome, kind, environments);
     } finally {
-      bridge.close();
+      gateway.close();
     }
   }
 
   // ----------------------------------------------------------------------------------------- collecting
 
   /** Collect and upload until an error ends the session. */
-  async #collect(bridge: Bridge, welcome: link.Welcome, kind: Kind, environments: number): Promise<never> {
+  async #collect(gateway: Gateway, welcome: link.Welcome, kind: Kind, environments: number): Promise<never> {
     const { run, spec, seed, learner_epoch } = welcome;
     const uploader = this.#uploader;
     // The same learner epoch was joined again: send the rollouts without a final acknowledgement once more.
-    for (const sequence of uploader.pending.keys()) void this.#upload(bridge, run, sequence);
+    for (const sequence of uploader.pending.keys()) void this.#upload(gateway, run, sequence);
     this.#snapshotAt = 0; // request the first snapshot at once: it may have been published earlier
-    await this.#waitUntil(bridge, run, () => this.#snapshot !== undefined, MISSED_PUSH_MILLISECONDS);
+    await this.#waitUntil(gateway, run, () => this.#snapshot !== undefined, MISSED_PUSH_MILLISECONDS);
     const hash = String(this.#snapshot!.fields.program);
-    const policy = await Policy.load(await link.program(bridge, run, hash), hash);
+    const policy = await Policy.load(await link.program(gateway, run, hash), hash);
     const random = seeded(seed);
     const vector = kind.make(environments, random, spec.environment.max_episode_steps ?? undefined);
     const { rollout_length } = spec.collection;
@@ -130,30 +130,30 @@ export class Actor {
     // A synchronous algorithm uses one rollout of each policy version.
     const synchronous = spec.training.algorithm === "a2c" || spec.training.algorithm_record?.synchronous === true;
     for (let loaded = -1; ; ) {
-      await this.#waitUntil(bridge, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
+      await this.#waitUntil(gateway, run, () => uploader.hasRoom); // before collecting, so that the newest policy acts
       if (synchronous) {
         // A rejected rollout is replaced, unless a newer version is out: another one of this version would be stale.
         const due = () => this.#version > loaded || (this.#rejected && this.#publishedVersion <= loaded);
-        await this.#waitUntil(bridge, run, due, MISSED_PUSH_MILLISECONDS);
+        await this.#waitUntil(gateway, run, due, MISSED_PUSH_MILLISECONDS);
         this.#rejected = false;
       } else if (this.#publishedVersion > this.#version) {
-        if (performance.now() > this.#snapshotAt + MISSED_PUSH_MILLISECONDS) await this.#requestSnapshot(bridge, run);
+        if (performance.now() > this.#snapshotAt + MISSED_PUSH_MILLISECONDS) await this.#requestSnapshot(gateway, run);
       }
       if (this.#version !== loaded) policy.bind(weightsOf(this.#snapshot!));
       loaded = this.#version;
       const sequence = uploader.nextSequence();
       const identity = { actor: this.#config.name, incarnation: this.#config.incarnation, sequence, learner_epoch };
       uploader.pending.set(sequence, encode(await collector.collect(identity, loaded)));
-      void this.#upload(bridge, run, sequence);
+      void this.#upload(gateway, run, sequence);
     }
   }
 
   /** Send a rollout until its final acknowledgement, and do what the verdict requires. Never throws. */
-  async #upload(bridge: Bridge, run: string, sequence: number): Promise<void> {
+  async #upload(gateway: Gateway, run: string, sequence: number): Promise<void> {
     try {
       const answer = await this.#uploader.deliver(sequence, async (rollout) => {
         const key = `daedalus/${run}/rollouts/${this.#config.name}`;
-        const [bytes] = await bridge.query(key, rollout, ACKNOWLEDGE_SECONDS);
+        const [bytes] = await gateway.query(key, rollout, ACKNOWLEDGE_SECONDS);
         if (bytes) this.#heardAt = performance.now();
         const answer = bytes && tryDecode(bytes);
         return answer?.kind === "Acknowledgement" ? (answer.fields as unknown as Acknowledgement) : undefined;
@@ -204,9 +204,9 @@ export class Actor {
   }
 
   /** Request the newest snapshot in case a push was lost. Throws LearnerLostError without an answer. */
-  async #requestSnapshot(bridge: Bridge, run: string): Promise<void> {
+  async #requestSnapshot(gateway: Gateway, run: string): Promise<void> {
     this.#snapshotAt = performance.now();
-    const answers = await bridge.query(`daedalus/${run}/snapshots`);
+    const answers = await gateway.query(`daedalus/${run}/snapshots`);
     if (answers.length === 0) throw new LearnerLostError("the learner did not answer a request for its snapshot");
     this.#heardAt = performance.now();
     for (const answer of answers) this.#onPublication(answer);
@@ -218,13 +218,13 @@ export class Actor {
    * Wait until `ready` returns true. Throws the reason if collecting must stop. Requests a snapshot if none came for
    * `snapshotTimeout` milliseconds, or no message at all for SILENCE_MILLISECONDS.
    */
-  async #waitUntil(bridge: Bridge, run: string, ready: () => boolean, snapshotTimeout = Infinity): Promise<void> {
+  async #waitUntil(gateway: Gateway, run: string, ready: () => boolean, snapshotTimeout = Infinity): Promise<void> {
     for (;;) {
       if (this.#stopReason) throw this.#stopReason;
       if (ready()) return;
       const now = performance.now();
       const overdue = now > this.#snapshotAt + snapshotTimeout || now > this.#heardAt + SILENCE_MILLISECONDS;
-      await (overdue ? this.#requestSnapshot(bridge, run) : this.#nextEvent());
+      await (overdue ? this.#requestSnapshot(gateway, run) : this.#nextEvent());
     }
   }
 

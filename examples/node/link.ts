@@ -1,6 +1,6 @@
 /** The queries of an actor to learners: join and program. Functions without state. */
 
-import type { Bridge } from "./bridge.ts";
+import type { Gateway } from "./gateway.ts";
 import { encode, type Message, tryDecode } from "./wire.ts";
 
 /** `environment` of the run's specification, except the settings that concern only the Python actor. */
@@ -50,9 +50,9 @@ export class LearnerLostError extends Error {}
  * Send one request to join `run` (`*`: any run) and return the answer. Throws LearnerLostError without an answer, and
  * RefusedError or RunOverError if a learner refuses.
  */
-export async function join(bridge: Bridge, run: string, fields: Message["fields"]): Promise<Welcome> {
+export async function join(gateway: Gateway, run: string, fields: Message["fields"]): Promise<Welcome> {
   const request = encode({ kind: "Join", fields, arrays: {} });
-  const answers = await query(bridge, `daedalus/${run}/join/${fields.actor}`, request);
+  const answers = await query(gateway, `daedalus/${run}/join/${fields.actor}`, request);
   const welcomes = answers.filter((answer) => answer.kind === "Welcome");
   if (welcomes.length > 1) throw new RefusedError("several learners answer here: choose one with --run");
   if (welcomes.length === 1) return welcomes[0].fields as unknown as Welcome;
@@ -62,18 +62,18 @@ export async function join(bridge: Bridge, run: string, fields: Message["fields"
   if (refusal?.code === "not_ready") throw new LearnerLostError(String(refusal.reason));
   const Kind = refusal?.code === "name_taken" ? NameTakenError : RefusedError;
   if (refusal) throw new Kind(`the learner refused this actor: ${refusal.reason}`);
-  throw new LearnerLostError("no learner answers: check that the learner runs and that the bridge connects to it");
+  throw new LearnerLostError("no learner answers: check that the learner runs and that the gateway connects to it");
 }
 
 /** Return the ONNX model with a hash. Throws LearnerLostError if no learner has it. */
-export async function program(bridge: Bridge, run: string, hash: string): Promise<Uint8Array> {
-  for (const answer of await query(bridge, `daedalus/${run}/program/${hash}`)) {
+export async function program(gateway: Gateway, run: string, hash: string): Promise<Uint8Array> {
+  for (const answer of await query(gateway, `daedalus/${run}/program/${hash}`)) {
     if (answer.kind === "Program") return answer.arrays.model.data as Uint8Array;
   }
   throw new LearnerLostError(`no learner has the program ${hash}`);
 }
 
 /** Send a query and return the decoded answers without the damaged ones. */
-async function query(bridge: Bridge, key: string, payload?: Uint8Array): Promise<Message[]> {
-  return (await bridge.query(key, payload)).map(tryDecode).filter((message) => message !== undefined);
+async function query(gateway: Gateway, key: string, payload?: Uint8Array): Promise<Message[]> {
+  return (await gateway.query(key, payload)).map(tryDecode).filter((message) => message !== undefined);
 }

@@ -8,11 +8,11 @@ import { PolicyError } from "./policy.ts";
 import { ProtocolError } from "./wire.ts";
 
 const USAGE = `\
-usage: node main.ts [--bridge HOST:PORT] [--run NAME] [--name NAME] [--envs E]
+usage: node main.ts [--gateway HOST:PORT] [--run NAME] [--name NAME] [--envs E]
 
-Collect rollouts for a learner, through \`daedalus bridge\`.
+Collect rollouts for a learner, through \`daedalus gateway\`.
 
-  --bridge HOST:PORT  address of the bridge (default: 127.0.0.1:7448)
+  --gateway HOST:PORT  address of the gateway (default: 127.0.0.1:8080)
   --run NAME          the run to join; required if several learners share a network
   --name NAME         name of this actor, the same after a restart (default: node-PID)
   --envs E            number of environments (default: the learner's envs_per_actor)
@@ -26,7 +26,7 @@ const NAME_RULE = "must have 1 to 64 letters, digits, '.', '_' or '-', and start
 function parseOptions(): ActorConfig | undefined {
   const { values } = parseArgs({
     options: {
-      bridge: { type: "string", default: "127.0.0.1:7448" },
+      gateway: { type: "string", default: "127.0.0.1:8080" },
       run: { type: "string", default: "*" },
       name: { type: "string", default: `node-${process.pid}` },
       envs: { type: "string" },
@@ -34,8 +34,8 @@ function parseOptions(): ActorConfig | undefined {
     },
   });
   if (values.help) return undefined;
-  const [, host, port] = values.bridge.match(/^(.+):(\d{1,5})$/) ?? [];
-  if (!host || Number(port) > 65535) throw new TypeError(`--bridge must be HOST:PORT, not ${values.bridge}`);
+  const [, host, port] = values.gateway.match(/^(.+):(\d{1,5})$/) ?? [];
+  if (!host || Number(port) > 65535) throw new TypeError(`--gateway must be HOST:PORT, not ${values.gateway}`);
   if (!NAME.test(values.name)) throw new TypeError(`--name ${NAME_RULE}, not ${values.name}`);
   if (values.run !== "*" && !NAME.test(values.run)) throw new TypeError(`--run ${NAME_RULE}, not ${values.run}`);
   const environments = values.envs === undefined ? undefined : Number(values.envs);

@@ -12,8 +12,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import CERTIFICATE, CLIENTS, KEY
 
 FOLDERS = (
-    "actor|algorithms|benchmarks|bridge|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests"
-    "|transport"
+    "actor|algorithms|benchmarks|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests|transport"
 )
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
 FILE_ENDINGS = {"py", "ts", "md", "toml"}

@@ -7,7 +7,7 @@ import typing
 import pytest
 from pages import DOCS
 
-from daedalus.bridge.packets import Kind
+from daedalus.gateway.raw.packets import Kind
 from daedalus.protocol import messages
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
@@ -72,7 +72,7 @@ def test_the_specifications_tables_have_what_an_actor_needs() -> None:
     assert first_column(table_under("| `collection.` |")) == set(CollectionSpec.model_fields) - {"actors"}
 
 
-def test_the_bridges_packets_are_all_explained() -> None:
+def test_the_gateways_packets_are_all_explained() -> None:
     rows = re.findall(r"^\| (\d+) \| (\w+) \|", WIRE, re.MULTILINE)
     assert {(int(number), kind) for number, kind in rows} == {(kind.value, kind.name.lower()) for kind in Kind}
 

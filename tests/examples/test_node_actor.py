@@ -2,9 +2,7 @@
 
 import json
 import shutil
-import socket
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,12 +13,12 @@ import node
 import numpy as np
 import pytest
 import torch
+from gateways import RunningGateway
 from learner_status import actor_status, env_steps, learner_status
 from plain import ACTION, NAME, plain
-from processes import LIMIT, Running, until
+from processes import Running, until
 from recording_learner import ONE_AT_A_TIME, SPEC, RecordingLearner
 
-from daedalus.bridge.service import Bridge
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.codec import PROTOCOL_VERSION
 from daedalus.protocol.messages import Acknowledgement, Refusal
@@ -37,25 +35,20 @@ def test_the_tests_of_the_node_actor_pass() -> None:
 
 @pytest.fixture
 def network() -> Iterator[tuple[MemoryNetwork, str]]:
-    """Memory network and the address of a bridge to it."""
-    inside, stop = MemoryNetwork(), threading.Event()
-    listener = socket.create_server(("127.0.0.1", 0))
-    address = f"127.0.0.1:{listener.getsockname()[1]}"
-    thread = threading.Thread(target=Bridge(listener, lambda: MemoryTransport(inside)).run, args=(stop,))
-    thread.start()
-    yield inside, address
-    stop.set()
-    thread.join(LIMIT)
-    assert not thread.is_alive()
+    """Memory network and the address of a gateway to it."""
+    inside = MemoryNetwork()
+    gateway = RunningGateway(inside, follows=False)
+    yield inside, f"127.0.0.1:{gateway.port}"
+    gateway.close()
 
 
 @pytest.fixture
 def begin() -> Iterator[Callable[..., Running]]:
-    """Function that starts an actor with the bridge at HOST:PORT. Actors left are killed at the end."""
+    """Function that starts an actor with the gateway at HOST:PORT. Actors left are killed at the end."""
     running: list[Running] = []
 
     def begin_one(address: str, environments: int = 6) -> Running:
-        words = [node.program(), "main.ts", "--bridge", address, "--name", "wing-ts", "--envs", str(environments)]
+        words = [node.program(), "main.ts", "--gateway", address, "--name", "wing-ts", "--envs", str(environments)]
         running.append(Running(words, node.FOLDER))
         return running[-1]
 
@@ -249,8 +242,8 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     endless = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
     learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", *endless)
     learner.expect("actors join with")
-    bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
-    actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1])
+    gateway = start("gateway", "--connect", address, "--listen", "127.0.0.1:0")
+    actor = begin(gateway.expect(r"clients connect to ws://(\S+)/actor")[1])
 
     until(lambda: env_steps(learner_status(address), "wing-ts") > 0)
     before = env_steps(learner_status(address), "wing-ts")
@@ -266,8 +259,8 @@ def test_a_real_learner_trains_on_the_rollouts_of_the_actor(
     until(lambda: actor_status(learner_status(address), "wing-ts").get("alive") is False)
     learner.process.terminate()
     learner.wait()
-    bridge.process.terminate()
-    assert bridge.wait() == 0, bridge.output
+    gateway.process.terminate()
+    assert gateway.wait() == 0, gateway.output
 
 
 def test_a_real_learner_learns_nested_spaces_with_masks_from_the_actor(
@@ -292,12 +285,12 @@ def test_a_real_learner_learns_nested_spaces_with_masks_from_the_actor(
     environment = ("--env", "nested_environment:NestedMasked-v0", "--env-steps", 400_000)
     learner = start("learner", *environment, *words, "--listen", address, "--run-dir", "run")
     learner.expect("actors join with")
-    bridge = start("bridge", "--connect", address, "--listen", "tcp/127.0.0.1:0")
-    actor = begin(bridge.expect(r"clients connect to tcp/(\S+)")[1], environments=32)
+    gateway = start("gateway", "--connect", address, "--listen", "127.0.0.1:0")
+    actor = begin(gateway.expect(r"clients connect to ws://(\S+)/actor")[1], environments=32)
     assert learner.wait() == 0, learner.output
     assert actor.wait() == 0, actor.output
     result = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert result["solved"] is True
     assert result["rollouts_rejected"].keys() <= {"stale"}
-    bridge.process.terminate()
-    assert bridge.wait() == 0, bridge.output
+    gateway.process.terminate()
+    assert gateway.wait() == 0, gateway.output

@@ -8,7 +8,7 @@ import pytest
 from gateways import JsonClient, RunningGateway
 from scripted_learner import ScriptedLearner
 
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def learner(network: MemoryNetwork) -> Iterator[ScriptedLearner]:
 @pytest.fixture
 def gateway(network: MemoryNetwork) -> Iterator[RunningGateway]:
     """A gateway that must not fail."""
-    running = RunningGateway(MemoryTransport(network))
+    running = RunningGateway(network)
     yield running
     running.close()
     assert running.failure is None

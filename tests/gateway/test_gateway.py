@@ -21,7 +21,7 @@ from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
 ROWS = 4
@@ -370,7 +370,7 @@ def test_connection_without_a_hello_is_closed(
 
 
 def test_gateway_stops_while_clients_play(learner: ScriptedLearner, network: MemoryNetwork) -> None:
-    running = RunningGateway(MemoryTransport(network))
+    running = RunningGateway(network)
     client = JsonClient(running.port)
     client.hello("arm-1")
     client.act([0.0, 0.0, 0.0, 0.0])

@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_a
 from scripted_learner import ScriptedLearner
 
 from daedalus.gateway import messages
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork
 
 SCHEMA = json.loads(importlib.resources.files("daedalus.gateway").joinpath("protocol.json").read_text())
 OBSERVATION = [0.1, 0.2, 0.3, 0.4]
@@ -103,7 +103,7 @@ class AnyOrder(RuleBasedStateMachine):
 
 
 def test_messages_in_any_order(network: MemoryNetwork, learner: ScriptedLearner) -> None:
-    running = RunningGateway(MemoryTransport(network))
+    running = RunningGateway(network)
 
     class Bound(AnyOrder):
         gateway = running

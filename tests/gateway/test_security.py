@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from gateways import JsonClient, RunningGateway
-from processes import LIMIT, Running
+from processes import LIMIT
 from scripted_learner import ScriptedLearner
 from websockets.exceptions import InvalidStatus
 
@@ -20,7 +20,7 @@ from daedalus.gateway.errors import ClientError
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import guard
 from daedalus.gateway.tokens import TOKENS, Tokens, digest
-from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
 
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def secured(folder: Path, network: MemoryNetwork, learner: ScriptedLearner) -> Iterator[RunningGateway]:
-    running = RunningGateway(MemoryTransport(network), folder / "gateway")
+    running = RunningGateway(network, folder / "gateway")
     yield running
     running.close()
     assert running.failure is None
@@ -179,9 +179,3 @@ def test_connection_without_a_request_is_closed(
     with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as silent:
         silent.sendall(b"GET /actor HTTP/1.1\r\nHost:")
         assert silent.recv(1) == b""
-
-
-def test_gateway_beyond_loopback_needs_tls(start: Callable[..., Running]) -> None:
-    process = start("gateway", "--connect", "tcp/127.0.0.1:1", "--listen", "0.0.0.0:0")
-    process.expect(r"0\.0\.0\.0:0 is unencrypted .* use --serve-tls")
-    assert process.wait() == 2

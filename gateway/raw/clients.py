@@ -29,7 +29,7 @@ class _Usage:
 
 
 class ClientTable:
-    """Decides which clients a bridge serves, and drops the client that takes too much."""
+    """Decides which clients a gateway serves, and drops the client that takes too much."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -88,7 +88,7 @@ class ClientTable:
             elif total > TOTAL_BYTES:
                 dropped = max(self._usage, key=lambda each: self._usage[each].held)
                 share = self._usage[dropped].held
-                reason = f"{total:,} bytes of queries and answers wait in the bridge, most of them ({share:,}) its own"
+                reason = f"{total:,} bytes of queries and answers wait in the gateway, most of them ({share:,}) its own"
             usage.held += size
             if dropped is not None:
                 self._usage.pop(dropped)

@@ -1,6 +1,7 @@
-"""The bridge over MemoryTransport: answers, news, presence, limits and cleanup of its clients."""
+"""Packets of raw clients over MemoryTransport: answers, news, presence, limits and cleanup of its clients."""
 
 import contextlib
+import logging
 import socket
 import struct
 import threading
@@ -10,9 +11,10 @@ import pytest
 from log_lines import LINES
 from processes import LIMIT, until
 
-from daedalus.bridge import clients, packet_socket
-from daedalus.bridge.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
-from daedalus.bridge.service import Bridge
+from daedalus.gateway.raw import clients, packet_socket
+from daedalus.gateway.raw.clients import ClientTable
+from daedalus.gateway.raw.connection import ClientConnection
+from daedalus.gateway.raw.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -45,7 +47,7 @@ class Caller:
         return kind, number, self.read(key).decode(), self.read(payload)
 
     def ended(self) -> bool:
-        """Return whether the bridge closed the connection, after reading the packets before."""
+        """Return whether the gateway closed the connection, after reading the packets before."""
         try:
             return self.socket.recv(1) == b""
         except ConnectionError:
@@ -53,28 +55,48 @@ class Caller:
 
 
 class Scene:
-    """A running bridge, and another transport on its network."""
+    """Connections of raw clients over TCP, and another transport on their network."""
 
     def __init__(self) -> None:
         self.network = MemoryNetwork()
         self.end = MemoryTransport(self.network)
         self.open: Callable[[], Transport] = lambda: MemoryTransport(self.network)
-        listener = socket.create_server(("127.0.0.1", 0))
-        self.port = listener.getsockname()[1]
-        self.stop = threading.Event()
-        self.bridge = Bridge(listener, lambda: self.open())
-        self.thread = threading.Thread(target=self.bridge.run, args=(self.stop,))
-        self.thread.start()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._table = ClientTable()
+        self._clients: list[tuple[ClientConnection, threading.Thread]] = []
+        self._accepting = threading.Thread(target=self._accept, daemon=True)
+        self._accepting.start()
         self.callers: list[Caller] = []
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # the listener was shut down
+            while True:
+                connection, _ = self._listener.accept()
+                client = ClientConnection(connection, lambda: self.open(), self._table)
+                self._table.connect(client)
+                thread = threading.Thread(target=self._run, args=(client,), daemon=True)
+                self._clients.append((client, thread))
+                thread.start()
+
+    def _run(self, client: ClientConnection) -> None:
+        logging.getLogger("daedalus.raw").warning("disconnected: %s", client.run())
 
     def call(self) -> Caller:
         self.callers.append(Caller(self.port))
         return self.callers[-1]
 
+    def stop(self) -> None:
+        for client, thread in self._clients:
+            client.close()
+            thread.join(LIMIT)
+            assert not thread.is_alive()
+
     def close(self) -> None:
-        self.stop.set()
-        self.thread.join(LIMIT)
-        assert not self.thread.is_alive()
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._accepting.join(LIMIT)
+        self._listener.close()
+        self.stop()
         for caller in self.callers:
             caller.socket.close()
 
@@ -274,7 +296,7 @@ def test_unreachable_network_is_reported_to_the_client(scene: Scene) -> None:
 
 
 def use(scene: Scene, caller: Caller) -> None:
-    """Send a query and read its end, so that the bridge counts the caller as a client."""
+    """Send a query and read its end, so that the table counts the caller as a client."""
     caller.send(Kind.QUERY, 1, "daedalus/r/status")
     assert caller.next()[0] == Kind.END
 
@@ -364,7 +386,7 @@ def test_client_with_the_largest_share_is_dropped_when_all_hold_too_much(
     assert small.read(1)  # the answer is on its way
     for number in range(4):
         large.send(Kind.QUERY, number, "daedalus/r/snapshots")
-    until(lambda: any("bytes of queries and answers wait in the bridge" in line for line in LINES))
+    until(lambda: any("bytes of queries and answers wait in the gateway" in line for line in LINES))
     until(lambda: len(scene.network.ends) == 2)
     assert len(small.read(HEADER_BYTES - 1 + (8 << 20))) == HEADER_BYTES - 1 + (8 << 20)
     assert small.next()[0] == Kind.END
@@ -379,7 +401,7 @@ def test_queries_in_transfer_count_before_their_memory_is_allocated(
     for caller in callers:
         use(scene, caller)
         caller.socket.sendall(HEADER.pack(MAX_QUERY_BYTES, Kind.QUERY, len(key), 0, 1) + key)
-    until(lambda: any("bytes of queries and answers wait in the bridge" in line for line in LINES))
+    until(lambda: any("bytes of queries and answers wait in the gateway" in line for line in LINES))
     until(lambda: len(scene.network.ends) == 3)  # two callers and the scene's own
 
 
@@ -399,7 +421,7 @@ def test_stop_disconnects_clients_and_ends_their_presence(scene: Scene) -> None:
     caller = scene.call()
     caller.send(Kind.ANNOUNCE, 1, "daedalus/r/actors/wing")
     until(lambda: len(scene.network.ends) == 2)
-    scene.stop.set()
+    scene.stop()
     assert caller.ended()
     until(lambda: len(scene.network.ends) == 1)
 

@@ -1,4 +1,4 @@
-"""The packets between the bridge and its clients, and their encoding. Pure functions, without I/O.
+"""The packets between a gateway and clients that run the policy themselves, and their encoding. Pure.
 
 Each end first sends the four bytes b"DBR1", then packets:
 
@@ -34,12 +34,12 @@ class Kind(enum.IntEnum):
     FOLLOW = 2  # client: subscribes to the key
     ANNOUNCE = 3  # client: declares presence under the key until its connection ends
     WATCH = 4  # client: watches presence under the key
-    ANSWER = 5  # bridge: one answer to a query
-    END = 6  # bridge: the query has no more answers
-    NEWS = 7  # bridge: the newest value of a key that the client follows
-    PRESENT = 8  # bridge: the packet's key has become present
-    ABSENT = 9  # bridge: the packet's key is no longer present
-    ERROR = 10  # bridge: the reason, as text, why it closes the connection
+    ANSWER = 5  # gateway: one answer to a query
+    END = 6  # gateway: the query has no more answers
+    NEWS = 7  # gateway: the newest value of a key that the client follows
+    PRESENT = 8  # gateway: the packet's key has become present
+    ABSENT = 9  # gateway: the packet's key is no longer present
+    ERROR = 10  # gateway: the reason, as text, why it closes the connection
 
 
 _PATTERNS = (Kind.QUERY, Kind.WATCH)  # whose key may contain `*`
@@ -50,7 +50,7 @@ class PacketError(Exception):
 
 
 class Packet(NamedTuple):
-    """One message between the bridge and a client."""
+    """One message between the gateway and a client."""
 
     kind: Kind
     number: int
@@ -96,10 +96,18 @@ def read_header(data: bytes) -> Header:
     return Header(Kind(kind), number, milliseconds / 1000, key_bytes, payload_bytes)
 
 
+def is_own_key(key: str, name: str) -> bool:
+    """Return whether a client may use a key if it may act only as `name` and as NAME.ANYTHING."""
+    kind, *rest = key.split("/")[2:] or [""]
+    if kind in ("join", "rollouts", "evaluations", "actors"):
+        return bool(rest) and (rest[0] == name or rest[0].startswith(f"{name}."))
+    return kind in ("program", "snapshots", "end", "learner")
+
+
 def check_key(data: bytes, kind: Kind) -> str:
     """Return the key of a client's packet. Raises PacketError if it is not valid.
 
-    A bridge gives access to keys under `daedalus/` only: Zenoh's routers expose their settings under other keys.
+    The gateway gives access to keys under `daedalus/` only: Zenoh's routers expose their settings under other keys.
     """
     key = data.decode("ascii", "replace")
     if not _KEY.fullmatch(key) or ("*" in key and kind not in _PATTERNS):

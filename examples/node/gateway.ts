@@ -1,17 +1,16 @@
 /**
- * Client of `daedalus bridge`: queries, subscriptions and presence over one TCP connection. docs/wire.md specifies the
+ * Client of `daedalus gateway`: queries, subscriptions and presence over one WebSocket. docs/wire.md specifies the
  * packets. This file does not know the messages in their payloads.
  */
-
-import { connect, type Socket } from "node:net";
 
 const GREETING = Buffer.from("DBR1");
 const HEADER_BYTES = 12;
 const MAX_PAYLOAD_BYTES = 2 ** 30;
+const CHUNK_BYTES = 2 ** 18; // of the stream of packets in one WebSocket message
 const [QUERY, FOLLOW, ANNOUNCE, WATCH, ANSWER, END, NEWS, PRESENT, ABSENT, ERROR] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10];
 
 /** The connection could not be opened, or has ended; the message states the reason. */
-export class BridgeError extends Error {}
+export class GatewayError extends Error {}
 
 interface PendingQuery {
   answers: Buffer[];
@@ -19,9 +18,9 @@ interface PendingQuery {
   reject: (error: Error) => void;
 }
 
-/** One connection to a bridge. */
-export class Bridge {
-  readonly #socket: Socket;
+/** One connection to a gateway. */
+export class Gateway {
+  readonly #socket: WebSocket;
   readonly #queries = new Map<number, PendingQuery>(); // this and the next two by packet number
   readonly #follows = new Map<number, (value: Buffer) => void>();
   readonly #watches = new Map<number, (key: string, present: boolean) => void>();
@@ -30,27 +29,36 @@ export class Bridge {
   #receivedBytes = 0;
   #neededBytes = GREETING.length; // received bytes before which parsing cannot succeed
   #greeted = false;
-  #failure?: BridgeError;
+  #failure?: GatewayError;
 
-  /** Connect to a bridge. Throws BridgeError if the connection cannot be opened. */
-  static async open(host: string, port: number): Promise<Bridge> {
-    const socket = connect({ host, port, noDelay: true });
+  /** Connect to a gateway as an actor of this name. Throws GatewayError if the connection cannot be opened. */
+  static async open(host: string, port: number, name: string): Promise<Gateway> {
+    const socket = new WebSocket(`ws://${host}:${port}/raw`);
     await new Promise<void>((resolve, reject) => {
-      socket.once("connect", resolve);
-      socket.once("error", (error) =>
-        reject(new BridgeError(`cannot connect to the bridge at ${host}:${port}: ${error.message}`)),
-      );
+      socket.onopen = () => resolve();
+      socket.onerror = socket.onclose = () =>
+        reject(new GatewayError(`cannot connect to the gateway at ${host}:${port}: is it running?`));
     });
-    return new Bridge(socket);
+    socket.send(JSON.stringify({ type: "hello", version: 1, name }));
+    return new Gateway(socket);
   }
 
-  private constructor(socket: Socket) {
+  private constructor(socket: WebSocket) {
     this.#socket = socket;
-    socket.removeAllListeners("error");
-    socket.on("data", (data) => this.#onData(data));
-    socket.on("error", (error) => this.#fail(`the connection to the bridge failed: ${error.message}`));
-    socket.on("close", () => this.#fail("the bridge closed the connection"));
-    socket.write(GREETING);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => {
+      if (typeof data === "string") this.#fail(JSON.parse(data).reason);
+      else this.#onData(Buffer.from(data));
+    };
+    socket.onerror = () => this.#fail("the connection to the gateway failed");
+    socket.onclose = () => this.#fail("the gateway closed the connection");
+    this.#write(GREETING);
+  }
+
+  #write(bytes: Buffer): void {
+    for (let first = 0; first < bytes.length; first += CHUNK_BYTES) {
+      this.#socket.send(bytes.subarray(first, first + CHUNK_BYTES));
+    }
   }
 
   /** Return every answer to a query that arrives within `seconds`. The list is empty if no process serves the key. */
@@ -90,7 +98,7 @@ export class Bridge {
     header.writeUInt8(key.length, 5);
     header.writeUInt16LE(Math.round(seconds * 1000), 6);
     header.writeUInt32LE(this.#number, 8);
-    this.#socket.write(Buffer.concat([header, Buffer.from(key, "ascii"), payload]));
+    this.#write(Buffer.concat([header, Buffer.from(key, "ascii"), payload]));
     return this.#number;
   }
 
@@ -110,7 +118,7 @@ export class Bridge {
   #parse(bytes: Buffer): number {
     if (!this.#greeted) {
       if (!bytes.subarray(0, GREETING.length).equals(GREETING)) {
-        this.#fail("the server at this address is not a bridge of this protocol: check --bridge");
+        this.#fail("the server at this address is no gateway of this protocol: check --gateway");
       }
       this.#greeted = true;
       this.#neededBytes = HEADER_BYTES;
@@ -119,7 +127,7 @@ export class Bridge {
     const payloadBytes = bytes.readUInt32LE(0);
     const keyEnd = HEADER_BYTES + bytes.readUInt8(5);
     if (payloadBytes > MAX_PAYLOAD_BYTES) {
-      this.#fail(`the bridge sent a payload of ${payloadBytes} bytes, the limit is ${MAX_PAYLOAD_BYTES}`);
+      this.#fail(`the gateway sent a payload of ${payloadBytes} bytes, the limit is ${MAX_PAYLOAD_BYTES}`);
     }
     this.#neededBytes = keyEnd + payloadBytes;
     if (bytes.length < this.#neededBytes) return 0;
@@ -139,19 +147,19 @@ export class Bridge {
       const pending = this.#queries.get(number);
       this.#queries.delete(number);
       pending?.resolve(pending.answers);
-    } else this.#fail(`the bridge sent a packet of unknown kind ${kind}`);
+    } else this.#fail(`the gateway sent a packet of unknown kind ${kind}`);
   }
 
   /** End the connection and reject all pending queries. Only the first call has an effect. */
   #fail(reason: string): void {
     if (this.#failure) return;
-    this.#failure = new BridgeError(reason);
-    this.#socket.destroy();
+    this.#failure = new GatewayError(reason);
+    this.#socket.close();
     for (const pending of this.#queries.values()) pending.reject(this.#failure);
     this.#queries.clear();
     this.onClosed?.(this.#failure);
   }
 
   /** Called once, when the connection has ended. */
-  onClosed?: (reason: BridgeError) => void;
+  onClosed?: (reason: GatewayError) => void;
 }

@@ -1,4 +1,4 @@
-"""Packets over one TCP connection, with a deadline for each step. One thread reads; any thread may send."""
+"""Packets over one socket, with a deadline for each step. One thread reads; any thread may send."""
 
 import contextlib
 import select
@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from daedalus.bridge.packets import (
+from daedalus.gateway.raw.packets import (
     GREETING,
     HEADER_BYTES,
     Packet,
@@ -21,7 +21,6 @@ HANDSHAKE_SECONDS = 10.0  # from the connection to the first packet
 STALL_SECONDS = 30.0  # a client that stalls for longer, or stops within a packet, is disconnected
 _SLOWEST_RATE = 64 << 10  # bytes a second: a payload has so much more time
 _CHUNK_BYTES = 64 << 10  # allocate memory for bytes received, not for bytes declared
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))  # detects a host that vanished
 
 
 class PacketSocket:
@@ -35,11 +34,6 @@ class PacketSocket:
         """Exchange greetings, and wait for the first packet; return False if the client disconnected instead."""
         deadline = time.monotonic() + HANDSHAKE_SECONDS
         self._connection.settimeout(STALL_SECONDS)  # of `sendall`, for one packet
-        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEP_ALIVE:
-            if hasattr(socket, name):
-                self._connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._connection.sendall(GREETING)
         late = f"the client sent no packet within {HANDSHAKE_SECONDS:g} s"
         if self._read(len(GREETING), deadline, late) != GREETING:

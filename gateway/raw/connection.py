@@ -1,4 +1,4 @@
-"""One client of the bridge: its TCP connection, and a Transport that only this client uses.
+"""One client that runs the policy itself: its packets, and a Transport that only this client uses.
 
     client thread            reads packets and performs them
     one thread per query     waits for the answers and sends them to the client
@@ -13,10 +13,10 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from daedalus.bridge.budget import QueryBudget
-from daedalus.bridge.clients import MAX_CLIENTS, ClientTable
-from daedalus.bridge.packet_socket import PacketSocket
-from daedalus.bridge.packets import MAX_ANSWER_BYTES, Kind, Packet, PacketError, fits_packet
+from daedalus.gateway.raw.budget import QueryBudget
+from daedalus.gateway.raw.clients import MAX_CLIENTS, ClientTable
+from daedalus.gateway.raw.packet_socket import PacketSocket
+from daedalus.gateway.raw.packets import MAX_ANSWER_BYTES, Kind, Packet, PacketError, fits_packet, is_own_key
 from daedalus.transport.interface import Inbox, Transport, TransportError
 
 _MAX_DECLARATIONS = 64  # of FOLLOW, WATCH and ANNOUNCE by one client
@@ -28,8 +28,14 @@ class ClientConnection:
     """Serves one client from `run` until the connection ends."""
 
     def __init__(
-        self, connection: socket.socket, open_transport: Callable[[], Transport], clients: ClientTable
+        self,
+        connection: socket.socket,
+        open_transport: Callable[[], Transport],
+        clients: ClientTable,
+        only: str | None = None,
     ) -> None:
+        """Construct the connection. `only` is the name that the client may act under; None: the network decides."""
+        self._only = only
         self._socket = PacketSocket(connection)
         self._open_transport = open_transport
         self._clients = clients
@@ -37,7 +43,7 @@ class ClientConnection:
         self._budget = QueryBudget()
         self._changed = threading.Condition()  # guards the next six attributes
         self._closed = False
-        self._reason = ""  # why the bridge ended the connection
+        self._reason = ""  # why the gateway ended the connection
         self._declared = 0
         self._inboxes: dict[int, tuple[str, Inbox]] = {}  # by the number of the FOLLOW packet
         self._fresh: set[int] = set()  # numbers whose inbox may hold a new value
@@ -46,7 +52,7 @@ class ClientConnection:
     def run(self) -> str:
         """Serve the client until it disconnects, `close` or `drop` is called, or it breaks the protocol.
 
-        Returns the reason for which the bridge ended the connection; empty if the client disconnected.
+        Returns the reason for which the gateway ended the connection; empty if the client disconnected.
         """
         try:
             if self._socket.greet():
@@ -99,16 +105,18 @@ class ClientConnection:
         transport = self._open_transport()
         if not self._keep(transport):
             return
-        threading.Thread(target=self._send_news, name="bridge-news", daemon=True).start()
+        threading.Thread(target=self._send_news, name="raw-news", daemon=True).start()
         while (packet := self._socket.next(lambda size: self._clients.hold(self, size))) is not None:
             self._clients.heard(self)
             self._perform(transport, packet)
 
     def _perform(self, transport: Transport, packet: Packet) -> None:
+        if self._only is not None and not is_own_key(packet.key, self._only):
+            raise PacketError(f"this client may act as {self._only} only, not use the key {packet.key}")
         if packet.kind == Kind.QUERY:
             if not self._budget.take(len(packet.payload), self._socket.has_gone):
                 raise ConnectionAbortedError
-            threading.Thread(target=self._run_query, args=(transport, packet), name="bridge-query", daemon=True).start()
+            threading.Thread(target=self._run_query, args=(transport, packet), name="raw-query", daemon=True).start()
             return
         self._declared += 1
         if self._declared > _MAX_DECLARATIONS:

@@ -15,10 +15,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from daedalus.gateway.app import application
 from daedalus.gateway.gateway import Gateway, GatewayConfig
+from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import Tokens
-from daedalus.transport.interface import Transport
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 CARTPOLE = {
     "observations": {"observation": {"kind": "array", "shape": [4], "dtype": "float32"}},
@@ -29,12 +30,20 @@ CARTPOLE = {
 class RunningGateway:
     """A gateway with its web server, on a thread of its own."""
 
-    def __init__(self, transport: Transport, certificates: Path | None = None, owner: str = "") -> None:
-        """`certificates` is the folder of a gateway; without it, plain WebSockets on loopback."""
-        self._transport = transport
+    def __init__(self, network: MemoryNetwork, certificates: Path | None = None, *, follows: bool = True) -> None:
+        """Start a gateway.
+
+        Args:
+          network: the network that it connects to.
+          certificates: folder of a gateway; None: plain WebSockets on loopback.
+          follows: whether it follows a run; otherwise it serves raw clients only.
+        """
+        self._follows = follows
+        self._open_transport = lambda: MemoryTransport(network)
+        self._transport = self._open_transport()
         self._tokens = None if certificates is None else Tokens(certificates)
         self._tls = None if certificates is None else tls_context(certificates)
-        self._config = GatewayConfig(name=f"{owner}.gateway" if owner else "gateway", owner=owner)
+        self._config = GatewayConfig(name="gateway")
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
         self.failure: Exception | None = None
@@ -47,10 +56,17 @@ class RunningGateway:
 
     async def _serve(self, ready: "Future[Gateway]") -> None:
         gateway = Gateway(self._transport, self._config, self._fail)
-        gateway.open()
+        if self._follows:
+            gateway.open()
         ready.set_result(gateway)
         rules = guard(LOOPBACK, self.port, [], self._tokens)
-        await Server(application(gateway, rules), self._tls).run_until(self._stop, self.listener, gateway.close)
+        raw = RawEndpoint(self._open_transport, rules, self._config.actor_name)
+
+        async def close() -> None:
+            await raw.close()
+            await gateway.close()
+
+        await Server(application(gateway, raw, rules), self._tls).run_until(self._stop, self.listener, close)
 
     def _fail(self, error: Exception) -> None:
         self.failure = error

@@ -1,1 +1,0 @@
-"""Connects clients in other languages to the network over TCP. Only the command line imports this package."""
