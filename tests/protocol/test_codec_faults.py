@@ -5,6 +5,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
+import msgpack
 import pytest
 from wire_format import (
     LIMITS,
@@ -204,3 +205,10 @@ def test_error_names_both_protocol_versions(version: int) -> None:
         with pytest.raises(VersionMismatchError, match=rf"version {version}, this one {PROTOCOL_VERSION}:") as refused:
             decode(data, LIMITS)
         assert refused.value.theirs == version
+
+
+@pytest.mark.parametrize("value", [b"bytes", msgpack.ExtType(5, b"x"), {1: "an integer as key"}])
+def test_a_header_has_only_texts_as_keys_and_no_bytes_or_extensions(value: Any) -> None:
+    data = wire({"kind": "Join", "fields": {"origin": value}, "arrays": [], "size": 0})
+    with pytest.raises(ProtocolError, match="unreadable header: ValueError"):
+        decode(data, LIMITS)
