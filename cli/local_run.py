@@ -27,6 +27,7 @@ _logger = logging.getLogger(__name__)
 _POLL_SECONDS = 0.05
 _EVALUATOR = "evaluator"
 _FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
+_SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
 
 
 class RunFailedError(Exception):
@@ -181,6 +182,14 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
     return Supervised("the learner", begin, ended=_FINISHED)
 
 
+def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
+    """End the learner, and wait until it has written its summary, which the evaluation reads."""
+    learner.terminate()
+    deadline = time.monotonic() + _SUMMARY_SECONDS
+    while learner.poll() is None and time.monotonic() < deadline and not stopping.wait(_POLL_SECONDS):
+        pass
+
+
 def watch(
     learner: Supervised,
     actors: list[Supervised],
@@ -197,6 +206,7 @@ def watch(
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
         if observer.poll(learner.process) and status is None:
+            _end(learner.process, stopping)
             return 0
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
