@@ -10,7 +10,8 @@ class HeldAnswers:
 
     def __init__(self) -> None:
         self._since: float | None = None  # when the learner began to compute; None: it does not
-        self._requests: list[Request] = []
+        self._waiting: list[Request] = []
+        self._released: list[Request] = []
 
     @property
     def holds(self) -> bool:
@@ -22,18 +23,18 @@ class HeldAnswers:
         self._since = now
 
     def release(self) -> None:
-        """Hold answers no more."""
+        """Hold answers no more. Those that wait may be taken, also if the next batch begins before they are."""
         self._since = None
+        self._released += self._waiting
+        self._waiting = []
 
     def add(self, request: Request) -> None:
         """Add a request. The caller has checked `holds`."""
-        self._requests.append(request)
+        self._waiting.append(request)
 
     def take(self, now: float) -> list[Request]:
-        """Return the requests to answer now: all once they are released, or have waited too long."""
+        """Return the requests to answer now: those that were released, and all if they have waited too long."""
         if self._since is not None and now > self._since + _MOST_SECONDS:
-            self._since = None
-        if self._since is not None:
-            return []
-        released, self._requests = self._requests, []
+            self.release()
+        released, self._released = self._released, []
         return released

@@ -34,3 +34,14 @@ def test_answers_of_a_long_batch_wait_10_seconds() -> None:
     assert held.take(110.0) == []
     assert held.take(110.1) == [request]
     assert not held.holds  # until the next batch: later answers need not wait either
+
+
+def test_released_answers_do_not_wait_for_the_batch_that_begins_at_once() -> None:
+    held, first, second = HeldAnswers(), Waiting(), Waiting()
+    held.begin(100.0)
+    held.add(first)
+    held.release()
+    held.begin(101.0)
+    held.add(second)
+    assert held.take(102.0) == [first]
+    assert held.take(102.0) == []
