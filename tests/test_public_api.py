@@ -162,7 +162,7 @@ def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
         running.expect(r"updates .*/s")
         running.process.send_signal(signal.SIGINT)
         assert running.wait() != 0
-        assert running.lines[-1] == "KeyboardInterrupt"
+        assert running.lines[-1] == "KeyboardInterrupt", running.output
         until(lambda: not processes_mentioning("interrupted-run"))
         assert any((tmp_path / "interrupted-run" / "checkpoints").iterdir())
     finally:
