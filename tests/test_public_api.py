@@ -154,7 +154,9 @@ def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
 
 def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
     program = (
-        "import daedalus; daedalus.train('cartpole', run_dir='interrupted-run', env_steps=10**9,"
+        # a shell starts background jobs with SIGINT ignored, and Python leaves it so
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        " import daedalus; daedalus.train('cartpole', run_dir='interrupted-run', env_steps=10**9,"
         " settings={'training.stop_when_solved': False})"
     )
     running = Running([sys.executable, "-c", program], tmp_path)
