@@ -32,7 +32,7 @@ class Minibatch:
 
 
 def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
-    """Yield one shuffled pass over a batch as `count` minibatches of nearly equal size.
+    """Return one shuffled pass over a batch as `count` minibatches of nearly equal size.
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
     is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
@@ -44,21 +44,29 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
       factors: [T, B], of the rows in the policy loss.
       count: largest number of minibatches.
     """
-    if batch.initial_state.shape[1]:
-        order = torch.randperm(batch.rewards.shape[1]).to(batch.rewards.device)
-        for part in order.tensor_split(min(count, len(order))):
-            yield Minibatch(
-                observations=each(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
-                initial_state=batch.initial_state[part],
-                starts=batch.starts[:-1, part],
-                actions=each(batch.actions, partial(_columns, part=part)),
-                masks=each(batch.masks, partial(_columns, part=part)),
-                log_probs=log_probs[:, part],
-                targets=targets[:, part],
-                factors=factors[:, part],
-                shares=shares_of(batch.valid[:, part]),
-            )
-        return
+    split = _by_environment if batch.initial_state.shape[1] else _by_row
+    return split(batch, log_probs, targets, factors, count)
+
+
+def _by_environment(
+    batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int
+) -> Iterator[Minibatch]:
+    order = torch.randperm(batch.rewards.shape[1]).to(batch.rewards.device)
+    for part in order.tensor_split(min(count, len(order))):
+        yield Minibatch(
+            observations=each(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
+            initial_state=batch.initial_state[part],
+            starts=batch.starts[:-1, part],
+            actions=each(batch.actions, partial(_columns, part=part)),
+            masks=each(batch.masks, partial(_columns, part=part)),
+            log_probs=log_probs[:, part],
+            targets=targets[:, part],
+            factors=factors[:, part],
+            shares=shares_of(batch.valid[:, part]),
+        )
+
+
+def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
     rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
     order = rows[torch.randperm(len(rows)).to(rows.device)]
     number = min(count, len(order))
@@ -75,16 +83,15 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 
     # Of images a second copy of the whole batch would be too much.
     large = {name: values for name, values in batch.observations.items() if values[0, 0].nbytes > _LARGE_BYTES}
-    observations, actions, masks = (
-        {name: parts_of(values) for name, values in components.items() if name not in large}
-        for components in (batch.observations, batch.actions, batch.masks)
-    )
+    small = {name: parts_of(values) for name, values in batch.observations.items() if name not in large}
+    actions = {name: parts_of(values) for name, values in batch.actions.items()}
+    masks = {name: parts_of(values) for name, values in batch.masks.items()}
     arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
     for index, part in enumerate(order.tensor_split(number)):
         starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
-        gathered = {name: values.flatten(0, 1)[part].unsqueeze(0) for name, values in large.items()}
+        gathered = each(large, partial(_rows, rows=part))
         yield Minibatch(
-            observations={name: parts[index] for name, parts in observations.items()} | gathered,
+            observations={name: parts[index] for name, parts in small.items()} | gathered,
             initial_state=batch.initial_state.new_zeros((len(part), 0)),
             starts=starts,
             actions={name: parts[index] for name, parts in actions.items()},
@@ -98,3 +105,8 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 
 def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:
     return values[:rows, part]
+
+
+def _rows(values: Tensor, rows: Tensor) -> Tensor:
+    """Return rows of [T, B, ...] by their numbers in T x B, as [1, N, ...]."""
+    return values.flatten(0, 1)[rows].unsqueeze(0)

@@ -51,7 +51,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
     network = ActorCritic(
         policy, Spaces(observations={"observation": space}, actions={"action": DiscreteSpace(counts=(6,))})
     )
-    flat = FlatParameters(network.parameters())
+    flat = FlatParameters(network.learned_parameters())
     optimizer = Adam(flat.values, 1e-5)
     shape = (rows, environments, *space.stacked_shape)
     observations = torch.randint(0, 256, shape).to(getattr(torch, space.dtype))
@@ -63,8 +63,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
             logits, values = network({"observation": observations}, state, starts)
         loss = values.square().mean() - logits.log_softmax(-1).gather(-1, actions).mean()
-        flat.gradients.zero_()
-        loss.backward()
+        flat.differentiate(loss)
         flat.clip_gradients(0.5)
         optimizer.step(flat.values, flat.gradients, 1e-4)
 

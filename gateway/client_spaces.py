@@ -164,7 +164,7 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
         flat = array.reshape(-1)
         if (flat < 0).any() or (flat >= space.counts).any():
             raise ClientError("misfit", f"{what} is outside its space, {space}")
-        return flat.astype(np.int64) if space.size > 1 else np.int64(flat[0])  # type: ignore[return-value]
+        return flat.astype(np.int64) if space.size > 1 else np.int64(flat[0])  # type: ignore[return-value] - gymnasium's Discrete has numbers, not arrays
     if space.dtype == "uint8":
         if array.dtype != np.uint8 and ((array < 0).any() or (array > 255).any()):
             raise ClientError("misfit", f"{what} has a value that is not from 0 to 255")

@@ -1,4 +1,4 @@
-"""What a client is told when something is wrong."""
+"""Errors that a client receives."""
 
 
 class ClientError(Exception):

@@ -67,7 +67,7 @@ class LearnerLink:
         self._end = RunEndWatch(transport, stop)
         self._feed = SnapshotFeed(transport, self.queries, self._end, join.actor, self.presence.heard)
         self._watched: set[str] = set()
-        self._look_again = False  # an actor was told of another learner
+        self._look_again = False  # an actor was fenced: another learner may have begun
 
     def look_again(self) -> None:
         """Look for the learner: an actor was fenced. From any thread."""

@@ -42,11 +42,9 @@ _PACKAGES = (
 
 def default_directory(name: str, spec: RunSpec) -> Path:
     """Return the default directory of a new run: runs/NAME-ALGORITHM-sSEED-TIME."""
-    plain, algorithm = (
-        re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-") for part in (name, spec.training.algorithm.rpartition(":")[2])
-    )
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{plain}-{algorithm}-s{spec.training.seed}-{stamp}"
+    parts = (name, spec.training.algorithm.rpartition(":")[2])  # the class of `module:Class`
+    plain = "-".join(re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-") for part in parts)
+    return Path("runs") / f"{plain}-s{spec.training.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def check_free(directory: Path) -> None:

@@ -1,6 +1,6 @@
 """algorithms/minibatches.py: a pass over a batch contains every valid row once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -89,3 +89,14 @@ def test_each_pass_has_a_new_order(state_size: int) -> None:
     made = numbered(state_size)
     orders = {tuple(made.pass_of(1)[0].log_probs.flatten().tolist()) for _ in range(5)}
     assert len(orders) > 1
+
+
+def test_an_action_may_have_the_name_of_a_large_observation() -> None:
+    made = numbered(state_size=0)
+    image = torch.randn(ROWS + 1, WIDTH, 40, 40)  # too large to be gathered for a whole pass
+    batch = replace(made.batch, observations={ACTION: image})
+    for minibatch in minibatches(batch, made.numbers, made.targets, made.factors, 4):
+        for column, number in enumerate(minibatch.log_probs[0].int().tolist()):
+            t, b = divmod(number, WIDTH)
+            assert torch.equal(minibatch.observations[ACTION][0, column], image[t, b])
+            assert torch.equal(minibatch.actions[ACTION][0, column], batch.actions[ACTION][t, b])
