@@ -11,6 +11,17 @@ import numpy as np
 from gymnasium import spaces as gym
 
 LENGTH = 8  # steps of an episode; the largest return, too
+TARGET = 6.4  # a policy that ignores a part of the observation has at most 6.3
+SETTINGS = (  # that learn it in seconds
+    f"training.target_return={TARGET}",
+    "environment.frame_stack=1",
+    "policy.encoder=small",
+    "policy.initial_std=0.3",
+    "training.discount_factor=0.0",
+    "training.entropy_bonus=0.0",
+    "training.learning_rate=0.002",
+    "training.minibatches=8",
+)
 _SIDE = 20  # pixels of the square image
 _PLACES = 4  # vertical stripes of the image: one is bright
 

@@ -9,22 +9,12 @@ from pathlib import Path
 import gymnasium
 import nested_environment
 import pytest
+from nested_environment import SETTINGS, TARGET
 from processes import LIMIT, Running
 
 from daedalus import Client
 
 Start = Callable[..., Running]
-TARGET = 6.4  # of 8; a policy that ignores a part of the observation has at most 6.3
-SETTINGS = (
-    f"training.target_return={TARGET}",
-    "environment.frame_stack=1",
-    "policy.encoder=small",
-    "policy.initial_std=0.3",
-    "training.discount_factor=0.0",
-    "training.entropy_bonus=0.0",
-    "training.learning_rate=0.002",
-    "training.minibatches=8",
-)
 
 
 def options(name: str, directory: Path, *settings: str) -> list[object]:

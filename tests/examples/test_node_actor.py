@@ -270,14 +270,7 @@ def test_a_real_learner_learns_nested_spaces_with_masks_from_the_actor(
     node.program()
     shutil.copy(nested_environment.__file__, tmp_path)
     settings = (
-        "training.target_return=6.4",  # of 8; a policy that ignores a part of the observation has at most 6.3
-        "environment.frame_stack=1",
-        "policy.encoder=small",
-        "policy.initial_std=0.3",
-        "training.discount_factor=0.0",
-        "training.entropy_bonus=0.0",
-        "training.learning_rate=0.002",
-        "training.minibatches=8",
+        *nested_environment.SETTINGS,
         "training.batch_rollouts=2",
         "collection.rollout_length=16",
     )
