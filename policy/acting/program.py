@@ -62,8 +62,8 @@ def export_program(network: ActorCritic, spaces: Spaces) -> bytes:
 
     Inputs, each with N rows: `observations/NAME` [N, *stacked_shape]; `masks/NAME` [N, choices] bool of masked
     actions; `uniform` [N, U] and `normal` [N, G] float32 noise, where U or G is not 0; `epsilon` [N, 1] where actors
-    explore; `state` [N, S] with a memory; and the weights. Outputs: `actions/NAME` [N, D], int64 or float32; `log_prob` [N]; `next_state` [N, S] with a
-    memory. Raises NetworkError if code of the user cannot be exported.
+    explore; `state` [N, S] with a memory; and the weights. Outputs: `actions/NAME` [N, D], int64 or float32; `log_prob`
+    [N]; `next_state` [N, S] with a memory. Raises NetworkError if code of the user cannot be exported.
     """
     try:
         program = _export(network, spaces)

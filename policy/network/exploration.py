@@ -12,6 +12,8 @@ from daedalus.policy.network.distributions.uniform import Uniform
 from daedalus.policy.network.errors import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 
+ANNEALING = "exploration.annealing"  # name of the parameter in a network
+
 _NEVER = -1e30  # logarithm of the weight of a part that is never chosen from
 _SMALLEST = 1e-30  # argument of a logarithm
 
