@@ -101,8 +101,10 @@ class Exploration(nn.Module):
 
     def _logits(self, name: str, like: Tensor, masks: Mapping[str, Tensor]) -> Tensor:
         """Return the parameters of a uniform distribution [..., P], for rows like those of `like` [..., X]."""
-        zeros = torch.zeros_like(like[..., :1], dtype=torch.float32)
-        logits = zeros.expand(*like.shape[:-1], self._uniform[name].parameter_count)
+        # A sum, not `expand`: an exported program would keep the number of rows that it was traced with.
+        logits = 0.0 * like[..., :1].to(torch.float32) + torch.zeros(
+            self._uniform[name].parameter_count, device=like.device
+        )
         return without_illegal(logits, masks[name]) if name in self._masked else logits
 
 

@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from torch import Tensor
 
 from daedalus.policy.network.distributions.distribution import Distribution
@@ -28,4 +29,4 @@ class Uniform(Distribution):
     def log_prob(self, parameters: Tensor, actions: Tensor) -> Tensor:
         """See Distribution: -1e30 for actions that are never chosen."""
         outside = (actions.abs() > _LARGEST).any(-1)
-        return actions.new_full(outside.shape, self._log_density).masked_fill(outside, _NEVER)
+        return torch.where(outside, _NEVER, self._log_density)
