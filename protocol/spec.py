@@ -158,7 +158,8 @@ class TrainingSpec(Specification):
     env_steps: PositiveInt = 1_000_000
     """Budget: env_steps over all actors."""
     target_return: float | None = None
-    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value."""
+    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value. Where actors
+    explore, it is also solved when the mean return of an evaluation does."""
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True
