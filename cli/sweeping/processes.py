@@ -14,7 +14,7 @@ from daedalus.learner.run.run_directory import remove_failed
 
 FINISHED = {0, 3}  # exit statuses of `daedalus train`: target reached or all steps done, budget used up
 _DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-_GRACE_SECONDS = 4.7  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
+_GRACE_SECONDS = 4.6  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
 _TAIL_BYTES = 1 << 14
 _LONGEST_REASON = 300  # characters
 
