@@ -50,6 +50,8 @@ class EnvironmentSpec(Specification):
 
     action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
     """Discrete actions over a continuous action space: one row for each choice, the values of one action."""
+    action_table_columns: Annotated[tuple[NaturalInt, ...], Field(min_length=1, max_length=4096)] | None = None
+    """Which numbers of an action the rows of `action_table` give, from 0. The others stay continuous. Unset: all."""
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
     """Take each action this many times and sum the rewards; together they are one env_step."""
     no_reward_limit: PositiveInt | None = None
