@@ -225,6 +225,22 @@ def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
     assert len({*seeds(1).values(), *seeds(2).values()}) == 16
 
 
+def test_epsilon_is_drawn_by_seed_and_name_and_is_the_same_after_a_restart() -> None:
+    epsilons = (0.1,) * 4 + (0.01,) * 3 + (0.5,) * 3
+
+    def drawn(seed: int) -> list[float]:
+        return [Fleet(seed, None, epsilons).epsilon_for(f"actor-{number}") for number in range(1000)]
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    shares = {epsilon: drawn(1).count(epsilon) / 1000 for epsilon in epsilons}
+    assert shares == pytest.approx({0.1: 0.4, 0.01: 0.3, 0.5: 0.3}, abs=0.06)
+    fleet = Fleet(1, None, epsilons)
+    for incarnation in (1, 2):
+        assert attempt(fleet, "actor-0", incarnation) is None
+        assert fleet.actors["actor-0"].epsilon == drawn(1)[0]
+        assert fleet_status.page(fleet, "", 0.0)[0].epsilon == drawn(1)[0]
+
+
 def test_statuses_are_sorted_by_actor_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
