@@ -66,7 +66,7 @@ class QueryResponses:
             else:
                 self._fleet.refused_joins.add(name, origin, refusal.reason, now)
                 self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
-            seed = self._fleet.seed_for(name, self._start_version)
+            seed, epsilon = self._fleet.seed_for(name, self._start_version), self._fleet.epsilon_for(name)
             is_new = self._fleet.lives(name) != lives
         if refusal is not None:
             self._add_refusal(name, origin, refusal)
@@ -74,7 +74,8 @@ class QueryResponses:
         if is_new and isinstance(message, Join) and message.spaces is not None:
             text = f"joined with {message.environments} environments{_where(origin)}"
             self._events.add("joined", text, actor=name)
-        return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
+        welcome = Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, epsilon=epsilon, spec=self._spec)
+        return encode(welcome)
 
     def report(self, name: str, data: bytes) -> bytes:
         """Return the answer to the encoded ClientReport of an actor. `name` is that in the key of the query."""
