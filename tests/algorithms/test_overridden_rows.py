@@ -102,6 +102,55 @@ def test_gradients_are_those_of_the_rows_between_overrides(algorithm: str, polic
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["none", "gru"])
+@pytest.mark.parametrize("algorithm", ["one_step_q", "one_step_sarsa", "n_step_q"])
+def test_action_values_are_learned_between_overrides(algorithm: str, policy: PolicySpec) -> None:
+    """The row before an override bootstraps from the action that the policy chose, also with Sarsa."""
+    torch.manual_seed(2)
+    spec = spec_of(algorithm)
+    network = ActorCritic(policy, SPACES, training=spec)
+    for parameter in network.learned_parameters():
+        parameter.data.add_(0.3 * torch.randn_like(parameter))
+    computer = GradientComputer(spec, network, SPACES)  # the target network begins as a copy
+    rollout = rollout_with_overrides(network.state_size)
+    starts = torch.from_numpy(np.concatenate([np.zeros((1, ENVIRONMENTS), np.bool_), ~rollout.valid]))
+    frames = {"observation": torch.from_numpy(rollout.frames["observation"])}
+    values, _ = network(frames, torch.from_numpy(rollout.initial_state), starts)  # [T+1, B, choices]
+    actions = torch.from_numpy(rollout.actions["action"].astype(np.int64))
+    chosen = values[:-1].gather(-1, actions).squeeze(-1)
+    following = values.detach().amax(-1)
+    if algorithm == "one_step_sarsa":
+        following[:-1] = chosen.detach()
+    terms: list[Tensor] = []
+    for e in range(ENVIRONMENTS):
+        for rows in pieces(rollout, e):
+            stream = Stream(
+                r=rollout.rewards[rows, e].tolist(),
+                V=following[rows[0] : rows[-1] + 2, e].tolist(),
+                log_ratios=[0.0] * len(rows),
+                terminated=rollout.terminated[rows, e].tolist(),
+                truncated=rollout.truncated[rows, e].tolist(),
+                valid=rollout.valid[rows, e].tolist(),
+            )
+            for s in stream.rows:
+                t = rows[s]
+                if algorithm == "one_step_sarsa" and t == ROWS - 1 and not rollout.terminated[t, e]:
+                    continue  # its next action is in the next rollout
+                target = lambda_return(stream, GAMMA, LAMBDA if algorithm == "n_step_q" else 0.0, s)
+                terms.append(spec.value_coefficient * (chosen[t, e] - target) ** 2)
+    parameters = network.learned_parameters()
+    gradients = torch.autograd.grad(torch.stack(terms).mean(), parameters, allow_unused=True)
+    expected = torch.cat(
+        [
+            (torch.zeros_like(parameter) if gradient is None else gradient).flatten()
+            for parameter, gradient in zip(parameters, gradients, strict=True)
+        ]
+    )
+    (_,) = computer.compute(join([rollout]), 0.0)
+    assert expected.norm() > 0.1
+    torch.testing.assert_close(computer.parameters.gradients, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_statistics_are_of_the_rows_to_learn_from() -> None:
     rollout = rollout_with_overrides(0)
     policy = POLICY.model_copy(update={"normalize_observations": True})
