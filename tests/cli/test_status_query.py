@@ -163,6 +163,12 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
         rollouts_missed=largest,
         busy_answers=largest,
         policy_lag=largest,
+        deadlines=largest,
+        missed_deadlines=largest,
+        overridden_actions=largest,
+        safe_actions=largest,
+        rollouts_dropped=largest,
+        safe_reason="\N{EM DASH}" * 300,
     )
     data = encode(ActorsReport(page=ActorsPage(learner_epoch=largest, actors=(actor,) * PAGE_ACTORS)))
     assert isinstance(decode(data, STATUS_LIMITS), ActorsReport)
