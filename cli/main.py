@@ -50,8 +50,13 @@ def _run() -> int:
         return 0 if arguments else 2
     command, rest = arguments[0], arguments[1:]
     if command in _MODULES:
+        line = [sys.executable, "-P", "-m", _MODULES[command], *rest]
+        if sys.platform == "win32" or not hasattr(os, "execv"):  # Windows would return to the shell at once
+            import subprocess
+
+            return subprocess.run(line, check=False).returncode
         # The command replaces this process, so signals reach it and its exit status is returned.
-        os.execv(sys.executable, [sys.executable, "-P", "-m", _MODULES[command], *rest])
+        os.execv(sys.executable, line)
     if command not in _COMMANDS:
         import difflib
 
