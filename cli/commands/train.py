@@ -43,6 +43,7 @@ _TRAIN_EXAMPLES = """\
 examples:
   daedalus train cartpole
   daedalus train cartpole --algorithm a2c --actors 4 --seed 7
+  daedalus train cartpole --algorithm n_step_q
   daedalus train --env Acrobot-v1 --env-steps 500000
   daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
   daedalus train cartpole --init-from runs/cartpole-impala-s1-20261121-101500 --set training.learning_rate=0.0001

@@ -16,11 +16,11 @@ from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.distributions.categorical import Categorical
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, ObservationSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, TrainingSpec
 
 ROWS = 400
-OBSERVED = {"seen": ArraySpace(shape=(3,), dtype="float32")}
+OBSERVED: dict[str, ObservationSpace] = {"seen": ArraySpace(shape=(3,), dtype="float32")}
 CHOICES = Spaces(observations=OBSERVED, actions={"action": DiscreteSpace(counts=(4,), masked=True)})
 BOUNDED = Spaces(observations=OBSERVED, actions={"arm": ContinuousSpace(low=(-1.0, 0.0), high=(1.0, 7.0))})
 MIXED = Spaces(
@@ -150,13 +150,13 @@ def test_actions_are_random_as_often_as_epsilon_says_and_legal_ones_equally_ofte
     greedy = int(acting.act(0.0).actions["action"][0, 0])
     counts, random = np.zeros(4), np.random.default_rng(7)
     size = acting.runtimes[0].noise_size
-    for _ in range(25):
-        choice = acting.act(0.3, draw_noise(size, ROWS, random))
+    choices = [acting.act(0.3, draw_noise(size, ROWS, random)) for _ in range(25)]
+    for choice in choices:
         counts += np.bincount(choice.actions["action"][:, 0], minlength=4)
     expected = np.array([0.1, 0.0, 0.1, 0.1]) + 0.7 * np.eye(4)[greedy]
     np.testing.assert_allclose(counts / counts.sum(), expected, atol=0.015)
-    probabilities = np.exp(choice.log_probs)
-    np.testing.assert_allclose(probabilities, expected[choice.actions["action"][:, 0]], rtol=1e-4)
+    probabilities = np.exp(choices[0].log_probs)
+    np.testing.assert_allclose(probabilities, expected[choices[0].actions["action"][:, 0]], rtol=1e-4)
 
 
 @pytest.mark.parametrize("algorithm", ["one_step_q", "n_step_q"])
