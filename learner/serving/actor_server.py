@@ -87,7 +87,7 @@ class ActorServer:
           spaces: spaces that all actors must have; None: those of the first actor.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
-        self.fleet = Fleet(spec.training.seed, spaces)
+        self.fleet = Fleet(spec.training.seed, spaces, spec.training.epsilons)
         self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
         self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
         self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
