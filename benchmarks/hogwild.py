@@ -171,7 +171,7 @@ def main() -> None:
         runs = [variant(seed, parsed.workers) for seed in parsed.seeds]
         seconds = sorted(run[0] or float("inf") for run in runs)
         solved = sum(run[0] is not None for run in runs)
-        env_steps, rate = (statistics.median(run[index] for run in runs) for index in (1, 2))
+        env_steps, rate = statistics.median(run[1] for run in runs), statistics.median(run[2] for run in runs)
         median, worst = f"{statistics.median(seconds):.1f}", f"{seconds[-1]:.1f}"
         rows.append((name, f"{solved} of {len(runs)}", median, worst, f"{env_steps:,.0f}", f"{rate:,.0f}"))
         print(rows[-1], flush=True)
