@@ -64,7 +64,7 @@ docs: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,docs,dev]"
+	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,docs,dev]"
 	touch $@
 
 clean:
