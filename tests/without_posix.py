@@ -18,7 +18,14 @@ OF_OS = (
     *("chown", "chroot", "confstr", "fchmod", "fchown", "fdatasync", "fork", "forkpty", "getegid", "geteuid", "getgid"),
     *("getgroups", "getloadavg", "getpgid", "getpgrp", "getpriority", "getresuid", "getsid", "getuid", "killpg"),
     *("mkfifo", "mknod", "nice", "openpty", "pathconf", "posix_fadvise", "posix_fallocate", "posix_spawn", "pread"),
-    *("pwrite", "readv", "register_at_fork", "sched_getaffinity", "sched_setaffinity", "sched_yield",),
+    *(
+        "pwrite",
+        "readv",
+        "register_at_fork",
+        "sched_getaffinity",
+        "sched_setaffinity",
+        "sched_yield",
+    ),
     *("setpriority", "setsid", "setuid", "statvfs", "sync", "sysconf", "wait", "wait3", "wait4", "writev"),
     *("O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC", "O_NONBLOCK", "WNOHANG", "execv"),
 )
