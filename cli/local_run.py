@@ -13,6 +13,7 @@ from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.confirmation import confirmation, confirmation_arguments
+from daedalus.cli.processes import ORDERED
 from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
@@ -90,7 +91,7 @@ def run_locally(
     """
     try:
         status = _train(run, stopping, output, learner_streams) if run.trained is None else run.trained
-        if stopping.is_set():
+        if stopping.is_set() or status == ORDERED:
             raise RunStoppedError
         if status not in _FINISHED:
             raise RunFailedError(status=status)
@@ -179,7 +180,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
-    return Supervised("the learner", begin, ended=_FINISHED)
+    return Supervised("the learner", begin, ended=_FINISHED | {ORDERED})
 
 
 def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:

@@ -32,7 +32,7 @@ from daedalus.protocol import schema
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import CompactSnapshot, Gradient, Message, Origin, Program, Rollout
 
-PROTOCOL_VERSION = 7
+PROTOCOL_VERSION = 8
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")

@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 
 from daedalus.protocol.keys import check_name
+from daedalus.protocol.metrics import MetricsReport, MetricsRequest
+from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
@@ -430,4 +432,7 @@ Message = (
     | ActorsReport
     | EventsRequest
     | EventsReport
+    | MetricsRequest
+    | MetricsReport
+    | OrderRequest
 )
