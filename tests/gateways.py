@@ -19,6 +19,7 @@ from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import Tokens
+from daedalus.gateway.watching.page_data import PageData
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 CARTPOLE = {
@@ -58,6 +59,7 @@ class RunningGateway:
         gateway = Gateway(self._transport, self._config, self._fail)
         if self._follows:
             gateway.open()
+        self.data = PageData()
         ready.set_result(gateway)
         rules = guard(LOOPBACK, self.port, [], self._tokens)
         raw = RawEndpoint(self._open_transport, rules, self._config.actor_name)
@@ -66,7 +68,9 @@ class RunningGateway:
             await raw.close()
             await gateway.close()
 
-        await Server(application(gateway, raw, rules), self._tls).run_until(self._stop, self.listener, close)
+        reached: asyncio.Future[Gateway] = self.loop.create_future()
+        reached.set_result(gateway)
+        await Server(application(reached, raw, rules, self.data), self._tls).run_until(self._stop, self.listener, close)
 
     def _fail(self, error: Exception) -> None:
         self.failure = error

@@ -40,6 +40,11 @@ class MetricsHistory:
                 self._distance *= 2
                 self._thin()
 
+    def rows(self) -> list[dict[str, float]]:
+        """Return all rows that are kept."""
+        with self._lock:
+            return list(self._rows.values())
+
     def page(self, run: str, learner_epoch: int, first: int) -> MetricsReport:
         """Return the rows from number `first` on, as many as a page may have."""
         with self._lock:
