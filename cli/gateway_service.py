@@ -20,6 +20,7 @@ from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import OperatorToken, Tokens
+from daedalus.gateway.watching.camera import CameraProcess
 from daedalus.gateway.watching.monitor import RunMonitor
 from daedalus.gateway.watching.observation import Observation
 from daedalus.gateway.watching.page_data import PageData
@@ -53,6 +54,8 @@ class GatewaySettings:
     origins: list[str] = field(default_factory=list)  # of pages that may connect
     operator_token: OperatorToken | None = None
     other_runs: Callable[[], list[OtherRun]] = lambda: []
+    camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
+    announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
 
 
 class GatewayService:
@@ -65,7 +68,8 @@ class GatewayService:
         self._ended, self._failures = asyncio.Event(), list[Exception]()
         self._gateway: asyncio.Future[Gateway] = self._loop.create_future()
         self._monitor: RunMonitor | None = None
-        self._data = PageData(settings.other_runs)
+        self._camera = None if settings.camera is None else CameraProcess(settings.camera)
+        self._data = PageData(settings.other_runs, self._camera)
         self._transports = ExitStack()
         owner = settings.credentials.name if settings.credentials else ""
         name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
@@ -82,7 +86,10 @@ class GatewayService:
         raw = RawEndpoint(self._raw_transport, rules, self._config.actor_name)
         where, secure = f"{settings.shown_host}:{port}", "s" if tls else ""
         _logger.info("clients connect to ws%s://%s/actor", secure, where)
-        _logger.info("the page of the run is at http%s://%s/", secure, where)
+        if settings.announce is None:
+            _logger.info("the page of the run is at http%s://%s/", secure, where)
+        else:
+            settings.announce(f"http{secure}://{where}/")
         tasks = [asyncio.create_task(self._await_stop()), asyncio.create_task(self._reach_network())]
 
         async def close() -> None:
@@ -125,6 +132,9 @@ class GatewayService:
             gateway = Gateway(transport, self._config, self._fail)
             gateway.open()
             self._gateway.set_result(gateway)
+            if self._camera is not None:
+                self._camera.newest_policy = lambda: gateway.newest_policy
+                self._camera.fetch_policy = gateway.fetch_policy
             watching = transport
             if self._settings.operator is not None:
                 watching = await self._connect(self._settings.operator)
@@ -166,6 +176,8 @@ class GatewayService:
         self._monitor.open()
 
     async def _close(self) -> None:
+        if self._camera is not None:
+            self._camera.stop()
         if self._monitor is not None:
             await asyncio.to_thread(self._monitor.close)
         if self._gateway.done():

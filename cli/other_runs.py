@@ -36,6 +36,8 @@ class OtherRuns:
 
     def _read(self, directory: Path) -> None:
         path = directory / METRICS
+        if not path.exists():
+            raise ValueError(f"{directory} has no {METRICS}: it is no run directory, or its run has not begun to train")
         changed = path.stat().st_mtime_ns
         if directory in self._known and self._known[directory][0] == changed:
             return

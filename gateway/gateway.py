@@ -24,7 +24,7 @@ from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.learner_link import LearnerLink
+from daedalus.gateway.learner_link import LearnerLink, NewestPolicy
 from daedalus.gateway.messages import Act, Hello
 from daedalus.gateway.policy_version import PolicyVersion
 from daedalus.protocol import keys
@@ -126,6 +126,15 @@ class Gateway:
         self._joins.shutdown(wait=False, cancel_futures=True)
         if self._thread.is_alive():
             await asyncio.to_thread(self._thread.join, 3.0)
+
+    @property
+    def newest_policy(self) -> NewestPolicy | None:
+        """The newest policy as messages; None before the first."""
+        return self._link.newest_policy
+
+    def fetch_policy(self) -> None:
+        """Ask the learner for a newer policy, although no client has heard of one."""
+        self._link.fetch()
 
     def _start(self, work: Any) -> None:
         task = self._loop.create_task(work)

@@ -5,6 +5,7 @@ Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
 
 import argparse
 import asyncio
+import errno
 import os
 import re
 import socket
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
+from daedalus.cli.gateway_packages import INSTALL
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
@@ -26,6 +28,7 @@ from daedalus.cli.processes import (
 )
 from daedalus.gateway.tokens import OperatorToken
 from daedalus.policy.acting.runtime import PolicyError
+from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
 from daedalus.transport.credentials import Credentials, load
@@ -33,7 +36,6 @@ from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
 LISTEN = "127.0.0.1:8080"
-INSTALL = 'the gateway needs starlette, uvicorn and websockets: pip install "daedalus-rl[gateway]"'
 
 DESCRIPTION = """\
 Lets programs in any language be actors, over a WebSocket: they send observations and rewards, and the gateway runs the
@@ -106,10 +108,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="folder of an operator's certificate, with which the page reads the status (with --tls)",
     )
+    options.add_argument("--no-camera", action="store_true", help="play no episodes for the page")
+    add_allow_module(options, "the run")
     add_tls(options)
     add_insecure(options)
     add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    options.add_argument("--or-any-port", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
@@ -163,7 +168,7 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        listener = _listen(host, port, arguments.or_any_port)
     except OSError as error:
         print(
             f"daedalus gateway: cannot listen on {arguments.listen}: {os.strerror(error.errno or 0)}", file=sys.stderr
@@ -180,6 +185,16 @@ def main() -> int:
         return 1
     finally:
         listener.close()
+
+
+def _camera(modules: list[str]) -> tuple[str, ...]:
+    """Return the command of the camera's process."""
+    return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(modules))
+
+
+def _announce(address: str) -> None:
+    """Print the address of the page, for the person who started the run."""
+    print(f"watch the run at {address}", flush=True)
 
 
 async def _serve(
@@ -199,8 +214,21 @@ async def _serve(
         origins=arguments.allow_origin,
         operator_token=chosen.operator_token,
         other_runs=chosen.other_runs,
+        camera=None if arguments.no_camera else _camera(arguments.allow_module),
+        announce=_announce if arguments.exit_with_parent else None,
     )
     await GatewayService(settings, stop).run(listener)
+
+
+def _listen(host: str, port: int, or_any: bool) -> socket.socket:
+    """Return a listening socket, at another port if the port is taken and any will do. Raises OSError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if not or_any or error.errno != errno.EADDRINUSE:
+            raise
+        return socket.create_server((host, 0), family=family)
 
 
 def _listening_address(listen: str, tls: bool, insecure: bool) -> tuple[str, int]:

@@ -45,7 +45,7 @@ export class Summary {
 
   /** Show that the gateway is gone, with the last figures. */
   lost() {
-    this.show({ ...this.#seen, state: "closed", reason: "" });
+    if (this.#seen.state !== "ended") this.show({ ...this.#seen, state: "closed", reason: "" });
   }
 
   #notice({ state, reason, status }) {
