@@ -1,22 +1,22 @@
-"""Interface of an algorithm: how its updates are scheduled, and the losses of a batch.
+"""Interface of an algorithm: what it needs of network and actors, the losses of a batch, what follows an update.
 
 docs/guides/algorithm.md shows how to add one.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch, Components
+from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
+from daedalus.algorithms.forward import Forward
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spec import TrainingSpec
 
-# The network on R rows of B environments: normalised observations {name: [R, B, ...]}, state [B, S], starts [R, B] ->
-# parameters of the action distributions [R, B, P], values [R, B].
-Forward = Callable[[Components, Tensor, Tensor], tuple[Tensor, Tensor]]
+__all__ = ["Algorithm", "Forward", "Losses"]
 
 
 class Losses(NamedTuple):
@@ -28,7 +28,7 @@ class Losses(NamedTuple):
 
     policy_loss: Tensor  # scalar
     entropies: Tensor  # [R, B], nats
-    values: Tensor  # [R, B]
+    values: Tensor  # [R, B]; for action values those of the actions that were taken
     targets: Tensor  # [R, B], value targets, without gradients
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
     clipped_fraction: Tensor | None = None  # scalar, share of rows whose probability ratio was clipped; None: no clip
@@ -41,7 +41,10 @@ class Algorithm:
     A class of its own derives from it, sets `record` and defines `losses`. The learner constructs it once.
     """
 
-    record: ClassVar[AlgorithmRecord] = AlgorithmRecord()  # how the updates are scheduled
+    # The heads, the schedule of the updates, how actors explore.
+    record: ClassVar[AlgorithmRecord] = AlgorithmRecord()
+    # Tensors that change in `after_update`: a checkpoint saves them by name, and restores them in place.
+    statistics: Mapping[str, Tensor] = MappingProxyType({})
 
     def __init__(self, spec: TrainingSpec, distribution: ActionDistribution) -> None:
         """Construct the algorithm.
@@ -66,3 +69,11 @@ class Algorithm:
           forward: the network.
         """
         raise NotImplementedError
+
+    def after_update(self, policy_version: int, forward: Forward) -> None:
+        """Do what follows an update, such as changing the target network. Only the learner calls this method.
+
+        Args:
+          policy_version: number of updates so far, from 1.
+          forward: the network, with its new parameters.
+        """

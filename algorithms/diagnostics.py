@@ -14,9 +14,9 @@ VALUE_ERROR_QUANTILES = {"value_error_p05": 0.05, "value_error_p50": 0.5, "value
 class FirstPass(NamedTuple):
     """A batch as the network saw it before its first update. All [T, B], without gradients."""
 
-    log_probs: Tensor  # log pi(a_t | s_t) of the target policy
+    log_probs: Tensor | None  # log pi(a_t | s_t) of the target policy; None for action values: it is greedy
     behaviour_log_probs: Tensor  # log mu(a_t | s_t)
-    values: Tensor  # V(s_t)
+    values: Tensor  # V(s_t), or Q(s_t, a_t)
     targets: Tensor  # value targets
     advantages: Tensor  # before they are normalised
     valid: Tensor  # float32, 1 or 0
@@ -40,18 +40,18 @@ def diagnostics(first: FirstPass, rho_clip: float | None) -> dict[str, float]:
     `rho_clip` is V-trace's bound of rho, or None for an algorithm that does not correct for the policy lag.
     """
     rows = first.valid > 0.0
-    log_ratios = (first.log_probs - first.behaviour_log_probs)[rows]  # [N]
     errors = (first.targets - first.values)[rows]  # [N]
     if not len(errors):
         return {}
-    ratios = log_ratios.exp()
-    measured = {
-        "behaviour_kl": behaviour_kl(log_ratios),
-        "rho_mean": ratios.mean(),
-        "rho_effective_share": effective_sample_share(log_ratios),
-    }
-    if rho_clip is not None:
-        measured["rho_clipped_fraction"] = (ratios > rho_clip).float().mean()
+    measured: dict[str, Tensor] = {}
+    if first.log_probs is not None:
+        log_ratios = (first.log_probs - first.behaviour_log_probs)[rows]  # [N]
+        ratios = log_ratios.exp()
+        measured["behaviour_kl"] = behaviour_kl(log_ratios)
+        measured["rho_mean"] = ratios.mean()
+        measured["rho_effective_share"] = effective_sample_share(log_ratios)
+        if rho_clip is not None:
+            measured["rho_clipped_fraction"] = (ratios > rho_clip).float().mean()
     quantiles = torch.quantile(errors, errors.new_tensor(list(VALUE_ERROR_QUANTILES.values())))
     measured.update(zip(VALUE_ERROR_QUANTILES, quantiles, strict=True))
     return {name: float(value) for name, value in measured.items()}

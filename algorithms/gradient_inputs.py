@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 NAME = "gradient_inputs"
+TARGET = "target_network/"  # followed by the name of a parameter: its value in the target network
 _PARTS = 7  # bfloat16 numbers, of 8 bits each, that make a float64
 
 

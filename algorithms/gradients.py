@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch, Components
+from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.losses import mean, value_loss
 from daedalus.algorithms.own_algorithm import check_updates
 from daedalus.algorithms.precision import is_mixed
@@ -40,7 +40,12 @@ class GradientComputer:
         self._spec, self._network = spec, network
         self._algorithm = build_algorithm(spec, network.distribution, modules)
         self.parameters = FlatParameters(network.learned_parameters())
-        self._is_mixed = is_mixed(spec.precision, self.parameters.values.device, network.convolutional)
+        self.forward = Forward(
+            network,
+            self.parameters,
+            has_target=self._algorithm.record.target_network,
+            is_mixed=is_mixed(spec.precision, self.parameters.values.device, network.convolutional),
+        )
         self._first_pass: FirstPass | None = None  # of the newest batch
         if is_own(spec.algorithm):
             check_updates(spec, lambda batch: self.compute(batch, spec.entropy_bonus), spaces, network.state_size)
@@ -53,7 +58,7 @@ class GradientComputer:
         """
         # The statistics of observations do not change within a batch: normalise once for all passes.
         batch = replace(batch, observations=self._network.normalizer(batch.observations))
-        for losses in self._algorithm.losses(batch, self._forward):
+        for losses in self._algorithm.losses(batch, self.forward):
             if not losses.values.shape == losses.targets.shape == losses.shares.shape:
                 shapes = [tuple(each.shape) for each in (losses.values, losses.targets, losses.shares)]
                 raise ValueError(f"the shapes of values, targets and shares differ: {shapes}")
@@ -75,9 +80,14 @@ class GradientComputer:
         first_pass, self._first_pass = self._first_pass, None
         return first_pass
 
-    def _forward(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
-        if not self._is_mixed:
-            return self._network.unroll(observations, state, starts)
-        # A context for each forward pass: its cache of cast weights must not survive an update of the weights.
-        with torch.autocast(starts.device.type, torch.bfloat16):
-            return self._network.unroll(observations, state, starts)
+    def after_update(self, policy_version: int) -> None:
+        """Let the algorithm do what follows an update, whose gradient the caller has applied."""
+        self._algorithm.after_update(policy_version, self.forward)
+
+    @property
+    def statistics(self) -> dict[str, Tensor]:
+        """Tensors of the algorithm that a checkpoint saves, by name, and restores in place."""
+        statistics = {f"algorithm/{name}": values for name, values in self._algorithm.statistics.items()}
+        if self._algorithm.record.target_network:
+            statistics["target_network"] = self.forward.target_values
+        return statistics

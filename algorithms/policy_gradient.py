@@ -17,8 +17,16 @@ class PolicyGradient(Algorithm):
     """Actor-critic algorithm with a single pass over each batch."""
 
     def targets(self, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
-        """Return value targets and advantages; arguments as for uncorrected_targets."""
-        return uncorrected_targets(self.spec, batch, log_probs, values)
+        """Return value targets and advantages; arguments as for uncorrected_targets.
+
+        Where actors explore, rows are weighted by min(rho_clip, pi / mu): random actions of an actor are then no more
+        frequent in the gradient than those of the policy (off-policy actor-critic: Degris et al. 2012).
+        """
+        targets = uncorrected_targets(self.spec, batch, log_probs, values)
+        if not self.spec.explores:
+            return targets
+        ratios = (log_probs - batch.behaviour_log_probs).exp()
+        return targets._replace(weights=ratios.clamp(max=self.spec.rho_clip))
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of the only update. See Algorithm."""

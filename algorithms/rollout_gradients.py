@@ -9,7 +9,7 @@ from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import BatchAssembler
 from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
-from daedalus.algorithms.gradient_inputs import unpacked
+from daedalus.algorithms.gradient_inputs import TARGET, unpacked
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer
 from daedalus.policy.acting.errors import PolicyError
@@ -34,7 +34,7 @@ class RolloutGradients:
         torch.set_num_threads(1)
         training = spec.training.model_copy(update={"device": "cpu"})
         with torch.random.fork_rng(devices=()):  # a learner in the same process draws its own numbers
-            self._network = ActorCritic(spec.policy, spaces, modules)
+            self._network = ActorCritic(spec.policy, spaces, modules, training)
         self._computer = GradientComputer(training, self._network, spaces, modules)
         self._assembler = BatchAssembler(spaces, torch.device("cpu"))
         self._observations = ObservationStatistics(self._network.normalizer)
@@ -42,12 +42,14 @@ class RolloutGradients:
         self._actions = ActionCounts(spaces, torch.device("cpu"))
         self._in_float32 = spec.algorithm.synchronous
         self._parameters = dict(self._network.named_parameters())
+        target = self._computer.forward.target_parameters
+        self._loaded = {**self._parameters, **{TARGET + name: values for name, values in target.items()}}
         self._unsent: dict[str, np.ndarray] = {}  # by parameter: what rounding has lost so far
         self._entropy_bonus = 0.0
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Use the weights of a snapshot in all later calls. Raises PolicyError if they do not fit."""
-        for name, parameter in self._parameters.items():
+        for name, parameter in self._loaded.items():
             if name not in weights:
                 raise PolicyError(f"the snapshot lacks the weights {name!r} of the network")
             if weights[name].shape != tuple(parameter.shape):
@@ -59,7 +61,7 @@ class RolloutGradients:
         except (KeyError, ValueError) as error:
             raise PolicyError(f"the snapshot has no numbers to compute gradients with: {error}") from None
         with torch.no_grad():
-            for name, parameter in self._parameters.items():
+            for name, parameter in self._loaded.items():
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
         self._entropy_bonus = inputs.entropy_bonus
         if self._rewards is not None:

@@ -29,6 +29,7 @@ on several machines, one process at a time:
 after training:
   evaluate   play episodes with the policy of a run, or record a video
   plot       draw the learning curves of one or more runs
+  compare    print a table of groups of runs, with intervals
 
 for the shell:
   completion print a script that completes commands, options and presets
@@ -112,6 +113,12 @@ def _plot(arguments: list[str]) -> int:
     return plot(arguments)
 
 
+def _compare(arguments: list[str]) -> int:
+    from daedalus.cli.commands.compare import compare
+
+    return compare(arguments)
+
+
 def _certs(arguments: list[str]) -> int:
     from daedalus.cli.commands.certs import certs
 
@@ -133,6 +140,7 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "drain": _drain,
     "exporter": _exporter,
     "plot": _plot,
+    "compare": _compare,
     "certs": _certs,
     "completion": _completion,
 }

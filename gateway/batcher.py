@@ -61,7 +61,7 @@ class Batcher:
     def _choose(self, version: PolicyVersion, actors: list[ClientActor]) -> None:
         inputs = _joined([actor.rows.begin_row() for actor in actors])
         noise = draw_noise(version.runtime.noise_size, len(actors), self._random)
-        choice = version.runtime.act(inputs.observations, inputs.state, noise, inputs.masks)
+        choice = version.runtime.act(inputs.observations, inputs.state, noise, inputs.masks, inputs.epsilon)
         for row, actor in enumerate(actors):
             actions = {name: values[row : row + 1] for name, values in choice.actions.items()}
             one = Choice(actions, choice.log_probs[row : row + 1], choice.state[row : row + 1])
@@ -78,4 +78,5 @@ def _joined(inputs: list[RowInputs]) -> RowInputs:
         {name: np.concatenate([each.observations[name] for each in inputs]) for name in first.observations},
         np.concatenate([each.state for each in inputs]),
         {name: np.concatenate([each.masks[name] for each in inputs]) for name in first.masks},
+        np.concatenate([each.epsilon for each in inputs]),
     )

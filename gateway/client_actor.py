@@ -101,6 +101,7 @@ class ClientActor:
     def _begin_rows(self, current: PolicyVersion) -> None:
         """Continue with the policy of another learner epoch; the unfinished rollout for the previous one is dropped."""
         assert self._transforms is not None
+        assert self._session is not None
         spec = current.session.spec
         writer = RolloutWriter(
             self._transforms.spaces,
@@ -109,6 +110,7 @@ class ClientActor:
             spec.environment,
             rollout_length=spec.collection.rollout_length,
             random=np.random.default_rng(),  # not used: the batcher draws the noise
+            epsilon=self._session.epsilon,
         )
         self._rows_epoch, self.version = current.session.learner_epoch, current
         self._rows = ClientRows(

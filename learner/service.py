@@ -258,7 +258,7 @@ class LearnerService:
             self._heartbeat.beat()
             self._update(learner)
             now = time.monotonic()
-            if seconds_to_target is None and self._counters.reached(training.target_return):
+            if seconds_to_target is None and self._is_solved():
                 seconds_to_target = self._reporter.wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
@@ -277,6 +277,13 @@ class LearnerService:
         row = self._reporter.row(learner, now, last=last)
         self._server.history.add(row)
         recorder.record(row, self._reporter.details(learner))
+
+    def _is_solved(self) -> bool:
+        """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""
+        training = self._spec.training
+        if training.explores and self._evaluations.reached(training.target_return):
+            return True
+        return self._counters.reached(training.target_return)
 
     def _update(self, learner: "Learner") -> None:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""

@@ -7,15 +7,18 @@ actors, which do not import the class.
 
 import difflib
 import re
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from daedalus.protocol.specification import PositiveInt, Specification
+from daedalus.protocol.specification import PositiveInt, Specification, UnitInterval
+
+Heads = Literal["policy_and_value", "action_values"]
+Epsilons = Annotated[tuple[UnitInterval, ...], Field(min_length=1, max_length=64)]
 
 
 class AlgorithmRecord(Specification):
-    """The schedule of one algorithm's updates. Immutable."""
+    """What one algorithm needs of the network, of the actors and of the schedule of updates. Immutable."""
 
     summary: Annotated[str, Field(max_length=200)] = ""
     """One line for `--help`."""
@@ -29,6 +32,30 @@ class AlgorithmRecord(Specification):
     """Rollouts in a batch where the run does not say. None: one per actor."""
     max_lag_batches: PositiveInt = 32
     """The largest policy lag where the run does not say, in batches."""
+    heads: Heads = "policy_and_value"
+    """`action_values`: the head computes Q(s, a) of each choice, and the policy is greedy; there is no value head."""
+    target_network: bool = False
+    """The learner keeps a second network, which `Algorithm.after_update` sets and which gradients do not change."""
+    next_action: bool = False
+    """Targets need the action of the next row (Sarsa), so that a rollout has at least two rows."""
+    epsilons: Epsilons = (0.0,)
+    """The epsilons that actors draw theirs from where `training.exploration` is unset."""
+    exploration_share: UnitInterval = 0.0
+    """Share of the budget in which epsilon falls from 1 where `training.exploration_env_steps` is unset."""
+
+
+def _of_action_values(summary: str, *, next_action: bool = False) -> AlgorithmRecord:
+    """Return the record of a method of Mnih et al. (2016) that learns action values. Section 8 has the epsilons."""
+    return AlgorithmRecord(
+        summary=summary,
+        batch_rollouts=1,
+        max_lag_batches=8,
+        heads="action_values",
+        target_network=True,
+        next_action=next_action,
+        epsilons=(0.1,) * 4 + (0.01,) * 3 + (0.5,) * 3,
+        exploration_share=0.1,
+    )
 
 
 ALGORITHMS = {
@@ -42,6 +69,9 @@ ALGORITHMS = {
     "appo": AlgorithmRecord(
         summary="as impala, several passes over each batch", corrected=True, passes_over_batch=True
     ),
+    "one_step_q": _of_action_values("Q-learning with one-step targets"),
+    "one_step_sarsa": _of_action_values("as one_step_q, on the action that was taken next", next_action=True),
+    "n_step_q": _of_action_values("Q-learning with n-step targets"),
 }
 _OWN = re.compile(r"\w+(\.\w+)*:\w+")  # module:Class
 

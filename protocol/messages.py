@@ -73,6 +73,11 @@ class Welcome:
     learner_epoch: int  # identifies this process of the learner; rollouts for another epoch are fenced
     seed: int  # for the environments and samples of this incarnation of the actor
     spec: RunSpec
+    epsilon: float = 0.0  # probability with which this actor takes a random action in the end; 0: it does not explore
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.epsilon <= 1.0:
+            raise ValueError(f"epsilon is {self.epsilon}: it must be from 0 to 1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

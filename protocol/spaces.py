@@ -205,8 +205,13 @@ class Spaces(Specification):
             if isinstance(space, DiscreteSpace) and space.masked
         }
 
+    @property
+    def listed_actions(self) -> str:
+        """The components of the action in words."""
+        return _listed(self.actions)
+
     def __str__(self) -> str:
-        return f"observation: {_listed(self.observations)}; action: {_listed(self.actions)}"
+        return f"observation: {_listed(self.observations)}; action: {self.listed_actions}"
 
 
 def _listed(components: dict[str, ArraySpace | DiscreteSpace] | dict[str, DiscreteSpace | ContinuousSpace]) -> str:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
-from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, check_algorithm, is_own
+from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, Epsilons, check_algorithm, is_own
 from daedalus.protocol.spaces import ComponentName
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
@@ -50,6 +50,8 @@ class EnvironmentSpec(Specification):
 
     action_table: Annotated[tuple[tuple[float, ...], ...], Field(min_length=2, max_length=65_536)] | None = None
     """Discrete actions over a continuous action space: one row for each choice, the values of one action."""
+    action_table_columns: Annotated[tuple[NaturalInt, ...], Field(min_length=1, max_length=4096)] | None = None
+    """Which numbers of an action the rows of `action_table` give, from 0. The others stay continuous. Unset: all."""
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
     """Take each action this many times and sum the rewards; together they are one env_step."""
     no_reward_limit: PositiveInt | None = None
@@ -139,15 +141,16 @@ class CollectionSpec(Specification):
     """Maximum number of rollouts of one actor that are being played or not yet acknowledged."""
     upload: Literal["rollouts", "gradients"] = "rollouts"
     """What actors send: their `rollouts`, or the `gradients` of their rollouts at the weights that played them. Actors
-    then need torch. For `a2c`, `a3c`, and algorithms of your own that are neither corrected nor make several passes."""
+    then need torch. Not for `impala`, `appo`, and algorithms of your own that are corrected or make several passes."""
 
 
 class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
     algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
-    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes. Or
-    `module:Class` for your own."""
+    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes;
+    `one_step_q`, `one_step_sarsa` and `n_step_q`: action values, for one discrete action. Or `module:Class` for your
+    own."""
     algorithm_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of the constructor of an algorithm of your own."""
     algorithm_record: AlgorithmRecord | None = None
@@ -157,24 +160,27 @@ class TrainingSpec(Specification):
     env_steps: PositiveInt = 1_000_000
     """Budget: env_steps over all actors."""
     target_return: float | None = None
-    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value."""
+    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value. Where actors
+    explore, it is also solved when the mean return of an evaluation does."""
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True
     """Stop when `target_return` is reached. Otherwise use the whole budget."""
 
     batch_rollouts: PositiveInt | None = None
-    """Rollouts in a batch. Unset: 1 for `a3c`, `collection.actors` for `impala` and `appo`. Not for `a2c`."""
+    """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
     max_policy_lag: NaturalInt | None = None
-    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches, for
-    `a3c` of 8."""
+    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches for `impala` and
+    `appo`, of 8 for the others."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""
     trace_lambda: UnitInterval = 1.0
-    """Decay of the multi-step targets. 1: n-step returns; below 1: lambda-returns."""
+    """Decay of the multi-step targets. 1: n-step returns; below 1: lambda-returns. Not for `one_step_q` and
+    `one_step_sarsa`."""
     rho_clip: Annotated[float, Field(gt=0.0)] = 1.0
-    """Upper bound of V-trace's importance weights rho; `impala` and `appo` only."""
+    """Upper bound of the importance weights rho: of V-trace in `impala` and `appo`, and of the policy gradient in `a2c`
+    and `a3c` where actors explore."""
     trace_clip: Annotated[float, Field(gt=0.0)] = 1.0
     """Upper bound of V-trace's trace coefficients c; `impala` and `appo` only."""
     passes: Annotated[int, Field(ge=1, le=64)] = 3
@@ -184,11 +190,21 @@ class TrainingSpec(Specification):
     (environments with memory, else valid rows) makes as many minibatches as it has parts."""
     clip_range: Annotated[float, Field(gt=0.0)] = 0.2
     """Clip range of the probability ratio; `appo` only."""
+    target_period: PositiveInt = 100
+    """Updates between two copies of the network to the target network, where the algorithm has one."""
+
+    exploration: Epsilons | None = None
+    """Epsilons: each actor draws one, by the seed and its name, and takes a random legal action with that probability.
+    Repeat a number to make it more probable. Unset: 0.1, 0.01 or 0.5 with the probabilities 0.4, 0.3 and 0.3 for action
+    values; no exploration for the other algorithms, whose policies are random themselves."""
+    exploration_env_steps: NaturalInt | None = None
+    """Env_steps of all actors together in which epsilon falls linearly from 1 to the number that the actor drew; 0: it
+    has that number from the start. Unset: a tenth of the budget for action values, 0 for the others."""
 
     value_loss: Literal["mse", "huber"] = "mse"
-    """Loss of the value."""
+    """Loss of the value, or of the action values."""
     value_coefficient: Annotated[float, Field(ge=0.0)] = 0.5
-    """Weight of the value loss."""
+    """Weight of that loss."""
     entropy_bonus: Annotated[float, Field(ge=0.0)] = 0.01
     """Weight of the policy's entropy."""
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
@@ -227,6 +243,22 @@ class TrainingSpec(Specification):
     def record(self) -> AlgorithmRecord:
         """How the updates are scheduled. For an algorithm of the user's own: the default, until its class is known."""
         return ALGORITHMS.get(self.algorithm) or self.algorithm_record or AlgorithmRecord()
+
+    @property
+    def epsilons(self) -> tuple[float, ...]:
+        """The epsilons that actors draw theirs from."""
+        return self.record.epsilons if self.exploration is None else self.exploration
+
+    @property
+    def explores(self) -> bool:
+        """Whether an actor may take random actions besides those of its policy."""
+        return max(self.epsilons) > 0.0
+
+    def exploration_annealing(self, progress: float) -> float:
+        """Return how much of epsilon's way from 1 to its final value is left, at a share of the budget: 1 to 0."""
+        steps = self.exploration_env_steps
+        share = self.record.exploration_share if steps is None else steps / self.env_steps
+        return max(1.0 - progress / share, 0.0) if share else 0.0
 
     @property
     def updates_per_batch(self) -> int:
@@ -325,7 +357,16 @@ class RunSpec(Specification):
             kind = "makes several updates of" if self.algorithm.passes_over_batch else "corrects the policy lag of"
             raise ValueError(
                 f"collection.upload is gradients, but {self.training.algorithm} {kind} a batch, which only the learner "
-                "can do: use a3c or a2c, or set collection.upload=rollouts"
+                "can do: use a3c, a2c or n_step_q, or set collection.upload=rollouts"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _next_action_is_in_the_rollout(self) -> "RunSpec":
+        if self.algorithm.next_action and self.collection.rollout_length < 2:
+            raise ValueError(
+                f"collection.rollout_length is 1, but {self.training.algorithm} learns from an action and the next "
+                "one: make it at least 2"
             )
         return self
 

@@ -20,6 +20,7 @@ class ActorStatus(Specification):
     lives: int  # incarnations that joined
     seconds_since_seen: float
     environments: int
+    epsilon: float  # the probability with which it takes a random action in the end; 0: it does not explore
     env_steps: int  # that were trained on
     env_steps_per_second: float
     rollouts_accepted: int

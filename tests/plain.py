@@ -74,12 +74,18 @@ class PlainPolicy:
 
     state_size = 0
     noise_size = NoiseSize(uniform=2, normal=1)
+    explores = False
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Ignore the weights."""
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         """See PolicyRuntime."""
         actions, log_probs, next_state = self.choose(plain(observations), state, noise)

@@ -56,7 +56,7 @@ class ClientCollector:
         self._transforms = Transforms(spec.environment, self._observation_space, self._action_space, example)
         return self._transforms.spaces, 1
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Discard the rollouts of the previous policy."""
         assert self._transforms is not None
         writer = RolloutWriter(
@@ -66,6 +66,7 @@ class ClientCollector:
             spec.environment,
             rollout_length=spec.collection.rollout_length,
             random=np.random.default_rng(seed),
+            epsilon=epsilon,
         )
         rows = ClientRows(
             self._transforms,

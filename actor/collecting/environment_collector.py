@@ -44,7 +44,7 @@ class EnvironmentCollector:
             self._spec = spec.environment
         return self._environments.spaces, self._environments.count
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Reset the environments."""
         environments = self._environments
         assert environments is not None
@@ -57,6 +57,7 @@ class EnvironmentCollector:
             spec.environment,
             rollout_length=spec.collection.rollout_length,
             random=np.random.default_rng(action_seed),
+            epsilon=epsilon,
         )
         self._writer.start(environments.reset(int(environment_seed)))
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from daedalus.actor.collecting.episode_counter import EpisodeCounter
 from daedalus.actor.environments.interface import Observed
+from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
@@ -20,6 +21,7 @@ class RowInputs(NamedTuple):
     observations: dict[str, np.ndarray]  # of each component [E, *stacked_shape]
     state: np.ndarray  # [E, S] float32, the policy's memory before the row
     masks: dict[str, np.ndarray]  # of the masked actions [E, choices] bool
+    epsilon: np.ndarray  # [E, 1] float32, the final epsilon of the actor
 
 
 class RolloutWriter:
@@ -38,6 +40,7 @@ class RolloutWriter:
         *,
         rollout_length: int,
         random: np.random.Generator,
+        epsilon: float = 0.0,
     ) -> None:
         """Allocate the arrays of a rollout.
 
@@ -48,12 +51,21 @@ class RolloutWriter:
           spec: how rewards are clipped and scaled, and whether terminations are bootstrapped.
           rollout_length: T, the number of rows.
           random: source of the sampled actions.
+          epsilon: the actor's, from the learner's Welcome.
+
+        Raises PolicyError if the actor is to explore and the policy cannot.
         """
+        if epsilon > 0.0 and not runtime.explores:
+            raise PolicyError(
+                f"the learner asks this actor to explore with epsilon {epsilon:g}, but its program has no input "
+                "'epsilon': use the same release of daedalus-rl for the learner and the actors"
+            )
         rows = rollout_length
         self._runtime = runtime
         self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
         self._bootstrap_terminations = spec.bootstrap_terminations
         self._random, self._count = random, count
+        self._epsilon = np.full((count, 1), epsilon, np.float32)
         self._episodes = EpisodeCounter(count)
         self._stacks = ObservationStacks(spaces, count)
         self._current_masks: dict[str, np.ndarray] = {}  # of the newest observations
@@ -88,7 +100,7 @@ class RolloutWriter:
         """Return the actions {name: [E, D]} that the policy chooses for the next row."""
         inputs = self.begin_row()
         noise = draw_noise(self._runtime.noise_size, self._count, self._random)
-        choice = self._runtime.act(inputs.observations, inputs.state, noise, inputs.masks)
+        choice = self._runtime.act(inputs.observations, inputs.state, noise, inputs.masks, inputs.epsilon)
         self.take_choice(choice)
         return choice.actions
 
@@ -98,7 +110,7 @@ class RolloutWriter:
             for name, frames in self._stacks.frames.items():
                 self._frames[name][: self._depths[name]] = frames.swapaxes(0, 1)
             self._initial_state[:] = self._state
-        return RowInputs(self._stacks.observations, self._state, self._current_masks)
+        return RowInputs(self._stacks.observations, self._state, self._current_masks, self._epsilon)
 
     def take_choice(self, choice: Choice) -> None:
         """Write what a policy chose from the inputs of this row."""

@@ -11,12 +11,11 @@ import numpy as np
 from gymnasium import spaces as gym
 from pydantic import ValidationError
 
-from daedalus.actor.environments.action_table import table_actions
+from daedalus.actor.environments.bounds import continuous_space, unscaled
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.leaves import Leaf, LeftOut, leaves
-from daedalus.protocol.spaces import ActionSpace, ContinuousSpace, DiscreteSpace
+from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
 
-_UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
 _MAX_DIMENSIONS = 4
 
 
@@ -100,10 +99,9 @@ def _observation(leaf: Leaf) -> ObservationComponent:
 class ActionComponents:
     """The components of an action space, and the environment's actions for their values."""
 
-    def __init__(self, table: tuple[tuple[float, ...], ...] | None, space: gymnasium.Space) -> None:
-        """Raises EnvironmentSetupError if the space is not supported, or the table does not fit it."""
+    def __init__(self, space: gymnasium.Space) -> None:
+        """Raises EnvironmentSetupError if the space is not supported."""
         self._space, self._leaves = space, leaves(space, "action")
-        self._table = None if table is None else table_actions(table, space)
         try:
             self.spaces: dict[str, ActionSpace] = {leaf.name: self._component(leaf) for leaf in self._leaves}
         except ValidationError as error:
@@ -117,8 +115,6 @@ class ActionComponents:
         return _nested(self._space, (), parts)
 
     def _component(self, leaf: Leaf) -> ActionSpace:
-        if self._table is not None:
-            return DiscreteSpace(counts=(len(self._table),))
         match leaf.space:
             case gym.Discrete() as space:
                 return DiscreteSpace(counts=(int(space.n),))
@@ -127,38 +123,20 @@ class ActionComponents:
             case gym.MultiBinary() as space:
                 return DiscreteSpace(counts=(2,) * int(np.prod(space.shape)))
             case gym.Box() as space if space.dtype is not None and space.dtype.kind in "fiu" and 0 not in space.shape:
-                return ContinuousSpace(low=_bounds(space.low), high=_bounds(space.high))
+                return continuous_space(space)
             case _:
                 raise unsupported("action", leaf)
 
     def _env_action(self, leaf: Leaf, values: np.ndarray) -> np.ndarray:
-        if self._table is not None:
-            return self._table[values[:, 0]]
         match leaf.space:
             case gym.Discrete() as space:
                 return values[:, 0] + space.start
             case gym.MultiDiscrete() as space:
                 return (values + space.start.ravel()).reshape(len(values), *space.shape).astype(space.dtype)
             case gym.Box() as space:
-                return _unscaled(values, space)
+                return unscaled(values, space)
             case space:
                 return values.reshape(len(values), *(space.shape or ())).astype(space.dtype)
-
-
-def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
-    return tuple(float(value) if abs(value) < _UNBOUNDED else None for value in values.ravel().astype(np.float64))
-
-
-def _unscaled(values: np.ndarray, space: gym.Box) -> np.ndarray:
-    """Return actions of the environment [E, *shape]: within its bounds, [-1, 1] scaled to them where there are two."""
-    low, high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
-    bounded = (np.abs(low) < _UNBOUNDED) & (np.abs(high) < _UNBOUNDED)
-    with np.errstate(invalid="ignore", over="ignore"):
-        scaled = low + (values.astype(np.float64) + 1.0) * 0.5 * (high - low)
-    actions = np.clip(np.where(bounded, scaled, values), low, high)
-    if space.dtype is not None and space.dtype.kind != "f":
-        actions = np.rint(actions)
-    return actions.reshape(len(values), *space.shape).astype(space.dtype)
 
 
 def _nested(space: gymnasium.Space, path: tuple[str | int, ...], parts: dict[tuple[str | int, ...], Any]) -> Any:

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 from pydantic import ValidationError
 
+from daedalus.actor.environments.action_table import TableActions
 from daedalus.actor.environments.components import (
     ActionComponents,
     ObservationComponent,
@@ -48,7 +49,7 @@ class Transforms:
         """
         observation_space = without(observation_space, spec.leave_out)
         self._observation_space, self._action_space = observation_space, action_space
-        self._actions = ActionComponents(spec.action_table, action_space)
+        self._actions = _actions(spec, action_space)
         components = observation_components(observation_space)
         self._mask_source = mask_component(components, self._actions.spaces)
         self._observations = [component for component in components if component is not self._mask_source]
@@ -158,6 +159,14 @@ class TransformedEnvironment:
     def close(self) -> None:
         """See VectorEnvironment."""
         self._environments.close()
+
+
+def _actions(spec: EnvironmentSpec, space: gymnasium.Space) -> ActionComponents | TableActions:
+    if spec.action_table is not None:
+        return TableActions(spec.action_table, spec.action_table_columns, space)
+    if spec.action_table_columns is not None:
+        raise EnvironmentSetupError("environment.action_table_columns needs environment.action_table: set it, too")
+    return ActionComponents(space)
 
 
 def _pixels(spec: EnvironmentSpec, components: list[ObservationComponent]) -> dict[str, Pixels]:

@@ -151,7 +151,8 @@ class ActorService:
         if self._config.link == "wan" and not welcome.spec.algorithm.synchronous:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
-        self._collector.begin(self._make_runtime(confirmed, spaces), confirmed.spec, confirmed.seed)
+        runtime = self._make_runtime(confirmed, spaces)
+        self._collector.begin(runtime, confirmed.spec, confirmed.seed, confirmed.epsilon)
         self._contents = make_uploads(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
             self._feed.subscribe()
@@ -168,7 +169,7 @@ class ActorService:
         if self._config.runtime == "torch":
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
-            return TorchRuntime(welcome.spec.policy, spaces)
+            return TorchRuntime(welcome.spec.policy, spaces, welcome.spec.training)
         return OnnxRuntime(self._await_program(welcome), self._stop)
 
     def _await_program(self, welcome: Welcome) -> bytes:

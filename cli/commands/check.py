@@ -140,7 +140,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     from daedalus.policy.network.errors import NetworkError
 
     try:
-        network = ActorCritic(spec.policy, spaces, modules)
+        network = ActorCritic(spec.policy, spaces, modules, spec.training)
     except NetworkError as error:
         return "", str(error)
     memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"

@@ -33,6 +33,7 @@ _PARSERS = {
     "certs": ("commands.certs", "parser"),
     "evaluate": ("commands.evaluate_arguments", "parser"),
     "plot": ("commands.plot", "parser"),
+    "compare": ("commands.compare", "parser"),
     "completion": ("commands.completion", "parser"),
 }
 

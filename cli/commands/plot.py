@@ -1,103 +1,78 @@
 """`daedalus plot`: draw the learning curves of one or more runs from their metrics.csv."""
 
 import argparse
-import csv
-import math
 import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
-from daedalus.learner.run.run_directory import CONFIG, METRICS
+from daedalus.cli.commands.compare import parse_groups
+from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
+from daedalus.cli.comparing.selection import select
 
-_DESCRIPTION = "Draws return, entropy, value loss and policy lag of runs over their env_steps."
+_DESCRIPTION = """\
+Draws return, entropy, value loss and policy lag of runs. Runs with equal settings apart from the seed are one curve:
+their interquartile mean, with its 95 % bootstrap interval; or you name the runs of each curve, with `--` between them.
+A folder of run directories stands for all of them."""
 
 _EXAMPLES = """\
 examples:
   daedalus plot runs/cartpole-impala-s1-20261121-101500 --output curve.png
-  daedalus plot runs/cartpole-*-s1-* --output algorithms.png
+  daedalus plot runs --output algorithms.png --by minutes
+  daedalus plot --output change.png runs/old-* -- runs/new-*
+  daedalus plot sweeps/cartpole-rollout_length --output profiles.png --profile
+
+A finished run keeps its last value, because runs that reach their target end early.
 
 exit status: 0 done, 1 failed, 2 bad usage"""
 
-_PANELS = (
-    ("episode_return_mean", "return (mean of the last episodes, band: one std; circles: evaluations)"),
-    ("entropy", "entropy (nats)"),
-    ("value_loss", "value loss"),
-    ("policy_lag_mean", "policy lag (updates)"),
-)
+_PICTURES = (".png", ".svg", ".pdf")
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus plot`."""
     options = command_parser("plot", _DESCRIPTION, _EXAMPLES)
-    options.add_argument(
-        "directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw, each in one colour"
-    )
+    options.usage = "daedalus plot [-h] --output FILE [--by env_steps|minutes] [--profile] RUN_DIR... [-- RUN_DIR...]"
+    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw")
     options.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
+    )
+    options.add_argument(
+        "--by",
+        choices=(ENV_STEPS, "minutes"),
+        default=ENV_STEPS,
+        help="horizontal axis (default: %(default)s)",
+    )
+    options.add_argument(
+        "--profile",
+        action="store_true",
+        help="draw the share of the finished runs whose final return is higher than each return, instead of curves",
     )
     return options
 
 
 def plot(arguments: list[str]) -> int:
     """Run `daedalus plot` and return its exit status: 0 done, 1 failed."""
-    parsed = parser().parse_args(arguments)
+    parsed, parts = parse_groups(parser(), arguments)
     try:
-        runs = {directory.name: _read(directory) for directory in parsed.directories}
-        _draw(runs, parsed.output)
+        if parsed.output.suffix.lower() not in _PICTURES:
+            raise RunDataError(f"--output {parsed.output}: the name must end with {', '.join(_PICTURES)}")
+        columns = () if parsed.profile else COLUMNS if parsed.by == ENV_STEPS else (*COLUMNS, SECONDS)
+        groups, problems = select(parts, finished=parsed.profile, columns=columns)
+        for problem in problems:
+            print(f"daedalus plot: {problem}", file=sys.stderr)
+        if parsed.profile:
+            draw_profiles(groups, parsed.output)
+        else:
+            draw_curves(groups, parsed.output, parsed.by)
     except ModuleNotFoundError:
-        print('daedalus plot: matplotlib is not installed: pip install "daedalus-rl[plot]"', file=sys.stderr)
+        print(f"daedalus plot: {INSTALL}", file=sys.stderr)
         return 1
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        print(f"daedalus plot: {parsed.output}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    except RunDataError as error:
         print(f"daedalus plot: {error}", file=sys.stderr)
         return 1
     print(f"wrote {parsed.output}")
     return 0
-
-
-def _read(directory: Path) -> dict[str, list[float]]:
-    """Return the columns of a run's metrics. Unknown values are NaN. Raises ValueError without metrics."""
-    path = directory / METRICS
-    if not path.exists():
-        if not (directory / CONFIG).exists():
-            raise ValueError(f"{directory} is not a run directory: it has neither {CONFIG} nor {METRICS}")
-        raise ValueError(f"{directory} has no metrics yet: wait until the run has made its first updates")
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{directory} has no metrics yet: wait until the run has made its first updates")
-    missing = {"env_steps", "episode_return_std", *(column for column, _ in _PANELS)} - rows[0].keys()
-    if missing:
-        raise ValueError(f"{path} has no column {min(missing)}: it is not the metrics of a run")
-    return {name: [float(row[name]) if row[name] else float("nan") for row in rows] for name in rows[0]}
-
-
-def _evaluations(run: dict[str, list[float]]) -> tuple[list[float], list[float]]:
-    """Return the env_steps and mean returns of a run's evaluations, or empty lists if there are none."""
-    env_steps, returns = run.get("evaluation_env_steps", []), run.get("evaluation_return_mean", [])
-    by_env_steps = {at: mean for at, mean in zip(env_steps, returns, strict=True) if not math.isnan(at)}
-    return list(by_env_steps), list(by_env_steps.values())
-
-
-def _draw(runs: dict[str, dict[str, list[float]]], output: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 2, figsize=(11, 7), sharex=True, layout="constrained")
-    for axis, (column, title) in zip(axes.flat, _PANELS, strict=True):
-        for label, run in runs.items():
-            (line,) = axis.plot(run["env_steps"], run[column], label=label, linewidth=1.5)
-            if column == "episode_return_mean":
-                mean, std = run[column], run["episode_return_std"]
-                low = [m - s for m, s in zip(mean, std, strict=True)]
-                high = [m + s for m, s in zip(mean, std, strict=True)]
-                axis.fill_between(run["env_steps"], low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-                axis.plot(*_evaluations(run), "o--", color=line.get_color(), linewidth=1, markersize=4)
-        axis.set_title(title, fontsize=10)
-        axis.grid(alpha=0.3)
-    for axis in axes[1]:
-        axis.set_xlabel("env_steps")
-    axes[0, 0].legend(fontsize=8, loc="lower right")
-    figure.savefig(output, dpi=110)
-    plt.close(figure)

@@ -11,6 +11,7 @@ from unittest.mock import patch
 from daedalus.cli.commands import (
     certs,
     check,
+    compare,
     completion,
     drain,
     exporter,
@@ -43,6 +44,7 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
         "certs": certs.parser(),
         "evaluate": evaluate_parser(),
         "plot": plot.parser(),
+        "compare": compare.parser(),
         "completion": completion.parser(),
     }
 

@@ -115,14 +115,14 @@ export class Actor {
 
   /** Collect and upload until an error ends the session. */
   async #collect(gateway: Gateway, welcome: link.Welcome, kind: Kind, environments: number): Promise<never> {
-    const { run, spec, seed, learner_epoch } = welcome;
+    const { run, spec, seed, epsilon, learner_epoch } = welcome;
     const uploader = this.#uploader;
     // The same learner epoch was joined again: send the rollouts without a final acknowledgement once more.
     for (const sequence of uploader.pending.keys()) void this.#upload(gateway, run, sequence);
     this.#snapshotAt = 0; // request the first snapshot at once: it may have been published earlier
     await this.#waitUntil(gateway, run, () => this.#snapshot !== undefined, MISSED_PUSH_MILLISECONDS);
     const hash = String(this.#snapshot!.fields.program);
-    const policy = await Policy.load(await link.program(gateway, run, hash), hash);
+    const policy = await Policy.load(await link.program(gateway, run, hash), hash, epsilon);
     const random = seeded(seed);
     const vector = kind.make(environments, random, spec.environment.max_episode_steps ?? undefined);
     const { rollout_length } = spec.collection;

@@ -27,6 +27,7 @@ export interface Welcome {
   run: string;
   learner_epoch: number | bigint;
   seed: number;
+  epsilon: number;
   spec: {
     environment: EnvironmentSpec;
     collection: { envs_per_actor: number; rollout_length: number; window: number; upload: string };

@@ -32,12 +32,16 @@ const TENSOR_TYPES = { "<f4": "float32", "|u1": "uint8", "|b1": "bool" } as cons
 export class Policy implements BehaviourPolicy {
   readonly stateSize: number;
   readonly #session: InferenceSession;
+  readonly #epsilon: number; // how much this actor explores in the end; 0: it does not
   readonly #inputs: Map<string, InferenceSession.TensorValueMetadata>; // all but the weights
   readonly #weightShapes: Map<string, readonly (number | string)[]>; // by input name
   #weights: Record<string, Tensor> = {};
 
-  /** Load an ONNX model. Throws PolicyError unless `hash` is its SHA-256 and this actor supports the program. */
-  static async load(model: Uint8Array, hash: string): Promise<Policy> {
+  /**
+   * Load an ONNX model, to explore with `epsilon` of the actor's Welcome. Throws PolicyError unless `hash` is its SHA-256
+   * and this actor supports the program.
+   */
+  static async load(model: Uint8Array, hash: string, epsilon = 0): Promise<Policy> {
     const actual = createHash("sha256").update(model).digest("hex");
     if (actual !== hash) throw new PolicyError(`the program has the hash ${actual}, but ${hash} was requested`);
     const session = await InferenceSession.create(model, {
@@ -46,16 +50,17 @@ export class Policy implements BehaviourPolicy {
       // A model may name external files for its tensors. The sender must not be able to read files: use no folder.
       extra: { session: { model_external_initializers_file_folder_path: "/dev/null" } },
     });
-    return new Policy(session);
+    return new Policy(session, epsilon);
   }
 
-  private constructor(session: InferenceSession) {
+  private constructor(session: InferenceSession, epsilon: number) {
     this.#session = session;
+    this.#epsilon = epsilon;
     this.#inputs = new Map();
     this.#weightShapes = new Map();
     for (const input of session.inputMetadata) {
       if (!input.isTensor) throw new PolicyError(`the program's input '${input.name}' must be a tensor`);
-      const isWeight = !/^(observations\/.*|masks\/.*|uniform|normal|state)$/s.test(input.name);
+      const isWeight = !/^(observations\/.*|masks\/.*|uniform|normal|state|epsilon)$/s.test(input.name);
       if (isWeight) this.#weightShapes.set(input.name, input.shape);
       else this.#inputs.set(input.name, input);
       if (isWeight && input.type !== "float32") {
@@ -65,6 +70,9 @@ export class Policy implements BehaviourPolicy {
     const outputs = session.outputNames;
     if (!outputs.some((name) => name.startsWith("actions/")) || !outputs.includes("log_prob")) {
       throw new PolicyError("the program must compute 'actions/NAME' and 'log_prob'");
+    }
+    if (epsilon > 0 && !this.#size("epsilon")) {
+      throw new PolicyError(`the learner asks this actor to explore with epsilon ${epsilon}, but its program cannot`);
     }
     this.stateSize = this.#size("state");
     if (this.stateSize && !outputs.includes("next_state")) {
@@ -94,6 +102,7 @@ export class Policy implements BehaviourPolicy {
       const size = this.#size(name);
       if (size) feeds[name] = new Tensor("float32", draw(rows * size, random), [rows, size]);
     }
+    if (this.#size("epsilon")) feeds.epsilon = new Tensor("float32", new Float32Array(rows).fill(this.#epsilon), [rows, 1]);
     if (this.stateSize) feeds.state = new Tensor("float32", state, [rows, this.stateSize]);
     const outputs = await this.#session.run(feeds);
     const actions: Choice["actions"] = {};

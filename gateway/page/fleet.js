@@ -10,6 +10,8 @@ const KNOWN = new Set(`actor host software address alive quarantined lives secon
   env_steps_per_second rollouts_accepted rollouts_rejected rollouts_missed busy_answers policy_lag compact_snapshots
   bytes_up_per_hour bytes_down_per_hour`.split(/\s+/));
 
+const TITLES = { epsilon: "Exploration" };
+
 const stateOf = (actor) => (actor.quarantined ? "quarantined" : actor.alive ? "alive" : "gone");
 const sum = (values) => values.reduce((total, value) => total + value, 0);
 const rejections = (actor) => sum(Object.values(actor.rollouts_rejected));
@@ -113,7 +115,7 @@ function isSet(value) {
 }
 
 function extraColumn(name) {
-  const title = name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
+  const title = TITLES[name] ?? name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
   const text = (row) => (typeof row[name] === "number" ? number(row[name]) : isSet(row[name]) ? String(row[name]) : "-");
   const value = (row) => (typeof row[name] === "number" ? row[name] : 0);
   return { name: `extra ${name}`, title, number: true, text, value };

@@ -16,6 +16,7 @@ class Actor:
     """State of one actor; the counts are over all its incarnations."""
 
     name: str
+    epsilon: float = 0.0  # final one, with which it explores
     lives_before: int = 0  # a number that is different after an actor of this name was forgotten
     incarnation: int = -1  # the newest; -1 before the first Join
     incarnations: int = 0  # number of incarnations that joined

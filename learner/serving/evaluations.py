@@ -23,6 +23,7 @@ class Evaluations:
     # By evaluator: checkpoint directory, policy version, env_steps.
     in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
     newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics.py, until taken
+    best_mean: float | None = None  # the highest mean return so far
 
     @property
     def checkpoints_in_use(self) -> set[Path]:
@@ -56,6 +57,7 @@ class Evaluations:
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
         del self.in_progress[report.evaluator]
         mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
+        self.best_mean = mean if self.best_mean is None else max(mean, self.best_mean)
         self.newest = {
             "evaluation_return_mean": mean,
             "evaluation_return_std": std,
@@ -68,6 +70,10 @@ class Evaluations:
         except OSError as error:
             text += f", the best so far, but its checkpoint was not kept: {error.strerror}"
         return Acknowledgement(verdict="accepted"), text
+
+    def reached(self, target: float | None) -> bool:
+        """Return whether the mean return of an evaluation was at least the target."""
+        return target is not None and self.best_mean is not None and self.best_mean >= target
 
     def take_newest(self) -> dict[str, float]:
         """Return the newest evaluation as metrics; empty without an evaluation since the last call."""

@@ -8,7 +8,7 @@ The lock of the actor server guards all of it.
 
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -25,14 +25,22 @@ __all__ = ["Actor", "Fleet"]
 _MAX_ACTORS = 16_384
 _MAX_OF_ONE_OWNER = 4096  # so that one certificate cannot fill the fleet
 _FORGET_SECONDS = 60.0  # of absence
+_EPSILON = 1  # distinguishes this draw from others by the same seed and name
 _SWEEP_SECONDS = 1.0  # between searches for actors to forget
 
 
 class Fleet:
     """All actors of a run, and the spaces that they share."""
 
-    def __init__(self, seed: int, spaces: Spaces | None) -> None:
-        self._seed = seed
+    def __init__(self, seed: int, spaces: Spaces | None, epsilons: Sequence[float] = (0.0,)) -> None:
+        """Construct an empty fleet.
+
+        Args:
+          seed: of the run.
+          spaces: of the environment, if they are known before the first actor.
+          epsilons: those that actors draw theirs from.
+        """
+        self._seed, self._epsilons = seed, epsilons
         self.spaces = spaces  # known before, or from the first actor
         self.actors: dict[str, Actor] = {}  # joined actors, by name
         self.pushed_bytes = 0  # snapshots published so far, as sent to each subscriber
@@ -74,7 +82,8 @@ class Fleet:
             reason = self._make_room(keys.owner(join.actor))
             if reason:
                 return Refusal(code="full", reason=reason)
-            self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten)
+            epsilon = self.epsilon_for(join.actor)
+            self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten, epsilon=epsilon)
             self._of_owner[keys.owner(join.actor)] += 1
         self.spaces = join.spaces
         self.refused_joins.joined(join.actor)
@@ -148,6 +157,11 @@ class Fleet:
         """
         entropy = [self._seed, zlib.crc32(name.encode()), self.lives(name), start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+    def epsilon_for(self, name: str) -> float:
+        """Return the final epsilon of an actor: drawn by the run's seed and the name, the same in every incarnation."""
+        random = np.random.default_rng([self._seed, zlib.crc32(name.encode()), _EPSILON])
+        return self._epsilons[int(random.integers(len(self._epsilons)))]
 
     # ---------------------------------------------------------------------------------------------- forgetting
 

@@ -53,6 +53,7 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         lives=actor.incarnations,
         seconds_since_seen=max(now - actor.last_seen, 0.0),
         environments=actor.environments,
+        epsilon=actor.epsilon,
         env_steps=actor.env_steps,
         env_steps_per_second=actor.env_steps_per_second,
         rollouts_accepted=actor.accepted,

@@ -65,7 +65,7 @@ class QueryResponses:
             else:
                 self._fleet.refused_joins.add(name, origin, refusal.reason, now)
                 self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
-            seed = self._fleet.seed_for(name, self._start_version)
+            seed, epsilon = self._fleet.seed_for(name, self._start_version), self._fleet.epsilon_for(name)
             is_new = self._fleet.lives(name) != lives
         if refusal is not None:
             self._add_refusal(name, origin, refusal)
@@ -73,7 +73,8 @@ class QueryResponses:
         if is_new and isinstance(message, Join) and message.spaces is not None:
             text = f"joined with {message.environments} environments{_where(origin)}"
             self._events.add("joined", text, actor=name)
-        return encode(Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, spec=self._spec))
+        welcome = Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, epsilon=epsilon, spec=self._spec)
+        return encode(welcome)
 
     def _add_refusal(self, name: str, origin: Origin, refusal: Refusal) -> None:
         kind: EventKind = "failed" if refusal.code == "failed" else "refused"

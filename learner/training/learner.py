@@ -10,7 +10,7 @@ from torch import Tensor
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.diagnostics import batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
-from daedalus.algorithms.gradient_inputs import GradientInputs, packed
+from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.learner.run.settings import SettingsError
@@ -29,6 +29,7 @@ from daedalus.learner.training.received_gradients import (
 from daedalus.learner.training.update_metrics import UpdateMetrics
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.exploration import ANNEALING
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.messages import Gradient, Rollout
 from daedalus.protocol.spaces import Spaces
@@ -57,10 +58,11 @@ class Learner:
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
         self._device = torch.device(spec.device)
-        self._network = ActorCritic(policy, spaces, modules).to(self._device)
+        self._network = ActorCritic(policy, spaces, modules, spec).to(self._device)
         self._gradients = GradientComputer(spec, self._network, spaces, modules)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
+        self._loaded = {name: each for name, each in self._parameters.items() if name != ANNEALING}
         self._optimizer = build_optimizer(spec, self._flat.values)
         self._assembler = BatchAssembler(spaces, self._device)
         self._observations = ObservationStatistics(self._network.normalizer)
@@ -69,6 +71,7 @@ class Learner:
         self.metrics = UpdateMetrics(spaces, self._device)
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
+        self._anneal_exploration(0.0)
 
     @property
     def state_size(self) -> int:
@@ -95,6 +98,7 @@ class Learner:
             kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
         self.updates_skipped += end - self.policy_version
         self.policy_version = end
+        self._anneal_exploration(progress)
         return left_out
 
     def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
@@ -118,6 +122,7 @@ class Learner:
             return False
         self.policy_version += 1
         self._optimizer.step(self._flat.values, self._flat.gradients, self.learning_rate(progress))
+        self._gradients.after_update(self.policy_version)
         self.metrics.add_update(terms, norm, clipped=norm > self._spec.max_gradient_norm)
         return True
 
@@ -143,6 +148,7 @@ class Learner:
         else:
             self.policy_version += 1
             self.updates_skipped += 1
+        self._anneal_exploration(progress)
         self._received_diagnostics = diagnostics_of(gradients[-1])
         for gradient in gradients:
             counts = gradient.action_counts.items()
@@ -172,6 +178,11 @@ class Learner:
         rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
         return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
+    def _anneal_exploration(self, progress: float) -> None:
+        """Set how much actors with the next snapshot explore, at a share of the budget."""
+        if self._network.exploration is not None:
+            self._network.exploration.set_annealing(self._spec.exploration_annealing(progress))
+
     # ----------------------------------------------------------------------------- for actors and checkpoints
 
     def program(self) -> bytes:
@@ -191,7 +202,10 @@ class Learner:
         if self._rewards is not None:
             moments = self._rewards.moments
             count, mean, squares = float(moments.count), float(moments.mean), float(moments.squares)
-        return {GRADIENT_INPUTS: packed(GradientInputs(self.entropy_bonus(progress), count, mean, squares))}
+        target = self._gradients.forward.target_parameters
+        inputs = {TARGET + name: values.cpu().numpy() for name, values in target.items()}
+        inputs[GRADIENT_INPUTS] = packed(GradientInputs(self.entropy_bonus(progress), count, mean, squares))
+        return inputs
 
     @property
     def gradient_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -206,6 +220,7 @@ class Learner:
         statistics = {f"{self._spec.optimizer}/{name}": value for name, value in self._optimizer.statistics.items()}
         for component, moments in self._observations.moments.items():
             statistics |= {f"observations/{component}/{name}": value for name, value in moments.state().items()}
+        statistics |= self._gradients.statistics
         if self._rewards is not None:
             statistics |= {f"returns/{name}": value for name, value in self._rewards.moments.state().items()}
         return statistics
@@ -215,7 +230,7 @@ class Learner:
 
         Raises CheckpointMismatchError, which names a difference, if they belong to another network.
         """
-        for name, parameter in self._parameters.items():
+        for name, parameter in self._loaded.items():
             if name not in parameters:
                 raise CheckpointMismatchError(f"the checkpoint has no weights {name!r}, which this run's network has")
             if parameters[name].shape != tuple(parameter.shape):
@@ -223,14 +238,16 @@ class Learner:
                     f"the weights {name!r} are {parameters[name].shape} in the checkpoint and {tuple(parameter.shape)} "
                     "in this run's network: use the same environment and [policy] settings"
                 )
-        unknown = parameters.keys() - self._parameters.keys()
+        unknown = parameters.keys() - {*self._loaded, ANNEALING}
         if unknown:
             raise CheckpointMismatchError(
                 f"the checkpoint has weights {min(unknown)!r}, which this run's network lacks"
             )
         with torch.no_grad():
-            for name, parameter in self._parameters.items():
+            for name, parameter in self._loaded.items():
                 parameter.copy_(torch.from_numpy(parameters[name].copy()))
+        if self._gradients.forward.target_parameters:
+            self._gradients.forward.update_target()
         self._observations.take_from_network()
 
     def restore(self, version: int, parameters: dict[str, np.ndarray], state: dict[str, Tensor]) -> None:
@@ -239,6 +256,8 @@ class Learner:
         Raises CheckpointMismatchError if they belong to another network or optimiser.
         """
         self.load(parameters)
+        if self._network.exploration is not None and ANNEALING in parameters:
+            self._network.exploration.set_annealing(float(parameters[ANNEALING].item()))
         for name, statistic in self._statistics().items():
             saved = state.get(name)
             if saved is None or saved.shape != statistic.shape:

@@ -29,6 +29,11 @@ def draw_noise(size: NoiseSize, rows: int, random: np.random.Generator) -> Noise
     )
 
 
+def no_exploration(rows: int) -> np.ndarray:
+    """Return the epsilon of rows that do not explore, [rows, 1]."""
+    return np.zeros((rows, 1), np.float32)
+
+
 def neutral_noise(size: NoiseSize, rows: int) -> Noise:
     """Return the noise that gives greedy actions."""
     return Noise(

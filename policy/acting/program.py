@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.acting.runtime import (
+    EPSILON,
     LOG_PROB,
     NEXT_STATE,
     NORMAL,
@@ -49,8 +50,9 @@ class _Acting(nn.Module):
         uniform: Tensor,
         normal: Tensor,
         masks: dict[str, Tensor],
+        epsilon: Tensor,
     ) -> tuple[Tensor, ...]:
-        actions, log_prob, next_state = self._network[0].act(observations, state, uniform, normal, masks)
+        actions, log_prob, next_state = self._network[0].act(observations, state, uniform, normal, masks, epsilon)
         outputs = (*(actions[name] for name in self._actions), log_prob)
         return (*outputs, next_state) if self._network[0].state_size else outputs
 
@@ -59,9 +61,9 @@ def export_program(network: ActorCritic, spaces: Spaces) -> bytes:
     """Return the ONNX program of a network.
 
     Inputs, each with N rows: `observations/NAME` [N, *stacked_shape]; `masks/NAME` [N, choices] bool of masked
-    actions; `uniform` [N, U] and `normal` [N, G] float32 noise, where U or G is not 0; `state` [N, S] with a memory;
-    and the weights. Outputs: `actions/NAME` [N, D], int64 or float32; `log_prob` [N]; `next_state` [N, S] with a
-    memory. Raises NetworkError if code of the user cannot be exported.
+    actions; `uniform` [N, U] and `normal` [N, G] float32 noise, where U or G is not 0; `epsilon` [N, 1] where actors
+    explore; `state` [N, S] with a memory; and the weights. Outputs: `actions/NAME` [N, D], int64 or float32; `log_prob`
+    [N]; `next_state` [N, S] with a memory. Raises NetworkError if code of the user cannot be exported.
     """
     try:
         program = _export(network, spaces)
@@ -83,11 +85,12 @@ def _export(network: ActorCritic, spaces: Spaces) -> bytes:
         for name, space in spaces.observations.items()
     }
     state = torch.zeros((_ROWS, network.state_size), device=device)
-    uniform = torch.full((_ROWS, distribution.uniform_count), 0.5, device=device)
+    uniform = torch.full((_ROWS, network.uniform_count), 0.5, device=device)
     normal = torch.zeros((_ROWS, distribution.normal_count), device=device)
     masks = {name: torch.ones((_ROWS, size), dtype=torch.bool, device=device) for name, size in spaces.masks.items()}
     inputs = [observation_name(name) for name in observations]
-    inputs += [STATE, UNIFORM, NORMAL, *map(mask_name, masks)]
+    inputs += [STATE, UNIFORM, NORMAL, *map(mask_name, masks), EPSILON]
+    epsilon = torch.zeros((_ROWS, 1), device=device)
     outputs = [*map(action_name, spaces.actions), LOG_PROB, *([NEXT_STATE] if network.state_size else [])]
     program: Any = io.BytesIO()  # torch accepts a file, although its annotation does not
     with warnings.catch_warnings(), torch.no_grad():
@@ -95,7 +98,7 @@ def _export(network: ActorCritic, spaces: Spaces) -> bytes:
         warnings.simplefilter("ignore")
         torch.onnx.export(
             _Acting(network, spaces),
-            (observations, state, uniform, normal, masks, {}),
+            (observations, state, uniform, normal, masks, epsilon),
             program,
             dynamo=False,
             export_params=False,

@@ -12,12 +12,12 @@ import numpy as np
 
 from daedalus.policy.acting.call_watchdog import CallWatchdog
 from daedalus.policy.acting.errors import PolicyError
-from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.noise import Noise, NoiseSize, no_exploration
 from daedalus.policy.acting.onnx_initializers import with_initializers
 from daedalus.policy.acting.program_check import check_program
 from daedalus.policy.acting.program_session import ProgramSession
 
-STATE, UNIFORM, NORMAL = "state", "uniform", "normal"
+STATE, UNIFORM, NORMAL, EPSILON = "state", "uniform", "normal", "epsilon"
 LOG_PROB, NEXT_STATE = "log_prob", "next_state"
 _OBSERVATIONS, _MASKS, _ACTIONS = "observations/", "masks/", "actions/"
 _MAX_STATE_SIZE = _MAX_NOISE_SIZE = 1 << 16
@@ -44,6 +44,11 @@ class PolicyRuntime(Protocol):
         """How many random numbers the choice of one action takes."""
         ...
 
+    @property
+    def explores(self) -> bool:
+        """Whether the policy takes random actions with the probability `epsilon` of `act`."""
+        ...
+
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """Use these weights in all later calls. Raises PolicyError if names, shapes or dtypes do not fit.
 
@@ -52,7 +57,12 @@ class PolicyRuntime(Protocol):
         ...
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         """Choose one action for each environment: a sample, or the greedy one if the noise is neutral.
 
@@ -61,6 +71,7 @@ class PolicyRuntime(Protocol):
           state: [E, S] float32, the policy's memory before this row; zeros where an episode starts.
           noise: for E rows.
           masks: of the masked actions [E, choices] bool, True for a legal choice.
+          epsilon: [E, 1] float32, the final epsilon of each row, for a policy that `explores`; None: no exploration.
         """
         ...
 
@@ -109,7 +120,8 @@ class OnnxRuntime:
         self._components = {name for name in inputs if name.startswith((_OBSERVATIONS, _MASKS))}
         self._state_size = _size(inputs, STATE, _MAX_STATE_SIZE)
         self._noise_size = NoiseSize(_size(inputs, UNIFORM, _MAX_NOISE_SIZE), _size(inputs, NORMAL, _MAX_NOISE_SIZE))
-        others = self._components | {STATE, UNIFORM, NORMAL}
+        self._explores = _size(inputs, EPSILON, 1) == 1
+        others = self._components | {STATE, UNIFORM, NORMAL, EPSILON}
         self._shapes = {name: shape for name, shape in inputs.items() if name not in others}
         self._convolutional = any(len(shape) > 2 for shape in self._shapes.values())
         self._feed: dict[str, np.ndarray] = {}
@@ -136,6 +148,11 @@ class OnnxRuntime:
         return self._noise_size
 
     @property
+    def explores(self) -> bool:
+        """See PolicyRuntime."""
+        return self._explores
+
+    @property
     def weight_names(self) -> tuple[str, ...]:
         """Names of the weights that the program requires."""
         return tuple(self._shapes)
@@ -157,7 +174,12 @@ class OnnxRuntime:
             self._feed = bound
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         """See PolicyRuntime. Raises PolicyError if the program fails, or its outputs have wrong shapes."""
         feed = self._feed
@@ -171,6 +193,8 @@ class OnnxRuntime:
             feed[UNIFORM] = noise.uniform
         if self._noise_size.normal:
             feed[NORMAL] = noise.normal
+        if self._explores:
+            feed[EPSILON] = no_exploration(len(state)) if epsilon is None else epsilon
         return self._checked(self._session.run(feed), state)
 
     def _set(self, name: str, values: np.ndarray) -> None:
@@ -212,7 +236,7 @@ def _action_components(outputs: list[str], remembers: bool) -> tuple[str, ...]:
 
 def _is_input(name: str) -> bool:
     """Return whether an input changes from call to call. All others are weights."""
-    return name in (STATE, UNIFORM, NORMAL) or name.startswith((_OBSERVATIONS, _MASKS))
+    return name in (STATE, UNIFORM, NORMAL, EPSILON) or name.startswith((_OBSERVATIONS, _MASKS))
 
 
 def _size(inputs: dict[str, tuple[Any, ...]], name: str, largest: int) -> int:

@@ -3,30 +3,32 @@
 import numpy as np
 import torch
 
-from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.noise import Noise, NoiseSize, no_exploration
 from daedalus.policy.acting.runtime import Choice, PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 
 class TorchRuntime:
     """Runs the network with torch on one thread."""
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces) -> None:
-        """Raise PolicyError if the network cannot be built, or has code that the user supplies."""
+    def __init__(self, spec: PolicySpec, spaces: Spaces, training: TrainingSpec | None = None) -> None:
+        """Raise PolicyError if the network cannot be built, or has code that the user supplies.
+
+        `training` is as for ActorCritic.
+        """
         for name in (spec.encoder, spec.distribution):
             if ":" in name:
                 # The name came over the wire; importing it would execute code that another process chose.
                 raise PolicyError(f"{name!r} is custom code, not imported here: use --runtime onnx")
         torch.set_num_threads(1)
         try:
-            self._network = ActorCritic(spec, spaces).eval().requires_grad_(False)
+            self._network = ActorCritic(spec, spaces, training=training).eval().requires_grad_(False)
         except NetworkError as error:
             raise PolicyError(str(error)) from None
-        distribution = self._network.distribution
-        self._noise_size = NoiseSize(distribution.uniform_count, distribution.normal_count)
+        self._noise_size = NoiseSize(self._network.uniform_count, self._network.distribution.normal_count)
         self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
         self._parameters = dict(self._network.named_parameters())
         self._acting = [name for name in self._parameters if not name.startswith("value_")]
@@ -40,6 +42,11 @@ class TorchRuntime:
     def noise_size(self) -> NoiseSize:
         """See PolicyRuntime."""
         return self._noise_size
+
+    @property
+    def explores(self) -> bool:
+        """See PolicyRuntime."""
+        return self._network.exploration is not None
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """See PolicyRuntime. The value head and its encoder may be absent: acting does not use them."""
@@ -57,7 +64,12 @@ class TorchRuntime:
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         """See PolicyRuntime."""
         tensors = {
@@ -70,6 +82,7 @@ class TorchRuntime:
             torch.from_numpy(noise.uniform),
             torch.from_numpy(noise.normal),
             {name: torch.from_numpy(mask) for name, mask in masks.items()},
+            torch.from_numpy(no_exploration(len(state)) if epsilon is None else epsilon),
         )
         chosen = {name: values.numpy() for name, values in actions.items()}
         return Choice(chosen, log_probs.numpy(), next_state.numpy() if self.state_size else state)

@@ -7,12 +7,13 @@ from torch import Tensor, nn
 
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.policy.network.encoders import build_encoder
+from daedalus.policy.network.exploration import Exploration
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
 from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import PolicySpec
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observation
 
@@ -22,28 +23,48 @@ Components = dict[str, Tensor]
 class ActorCritic(nn.Module):
     """Normaliser, encoder, memory, policy head with the distribution of actions, value head.
 
-    Learning calls `forward`; acting needs only `act`, which is what the exported program computes.
+    Learning calls `forward`; acting needs only `act`, which is what the exported program computes. For an algorithm of
+    action values, the outputs of the policy head are Q(s, a), and there is no value head.
     """
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
-        """Raise NetworkError if the encoder or the distribution does not fit the spaces, or may not be imported."""
+    def __init__(
+        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: TrainingSpec | None = None
+    ) -> None:
+        """Construct the network.
+
+        Args:
+          spec: settings of the network.
+          spaces: of the environment.
+          modules: modules that may be imported for it.
+          training: names the algorithm, and whether actors explore; None: heads for policy and value, no exploration.
+
+        Raises NetworkError if the encoder, the distribution or the algorithm does not fit the spaces, or a module may
+        not be imported.
+        """
         super().__init__()
-        self.distribution = ActionDistribution(spec, spaces, modules)
+        self.distribution = ActionDistribution(spec, spaces, modules, training)
+        self.exploration = Exploration(spaces) if training is not None and training.explores else None
         self.normalizer = ObservationNormalizer(spaces.observations if spec.normalize_observations else {})
         self.encoder = build_encoder(spec, spaces.observations, modules)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)
         self.policy_head = orthogonal(nn.Linear(self.memory.features, self.distribution.parameter_count), _POLICY_GAIN)
-        self.value_head = orthogonal(nn.Linear(self.memory.features, 1))
+        has_values = training is None or training.record.heads == "policy_and_value"
+        self.value_head = orthogonal(nn.Linear(self.memory.features, 1)) if has_values else None
         # Whether the network has convolutions, which then take most of its time.
         self.convolutional = any(isinstance(module, nn.Conv2d) for module in self.modules())
-        separate = spec.separate_value_encoder and spec.memory == "none"
+        separate = spec.separate_value_encoder and spec.memory == "none" and has_values
         self.value_encoder = build_encoder(spec, spaces.observations, modules) if separate else None
 
     @property
     def state_size(self) -> int:
         """S, the size of the memory's state; 0 without a memory."""
         return self.memory.state_size
+
+    @property
+    def uniform_count(self) -> int:
+        """U, uniform random numbers that the choice of one action takes."""
+        return self.distribution.uniform_count + (self.exploration.uniform_count if self.exploration else 0)
 
     def learned_parameters(self) -> list[nn.Parameter]:
         """Return the parameters that have gradients: all but the statistics of the normaliser."""
@@ -68,7 +89,8 @@ class ActorCritic(nn.Module):
           state: [B, S] float32, the memory before row 0.
           starts: [R, B] bool, whether an episode starts with the row, which clears the memory.
 
-        Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast.
+        Returns: parameters of the action distributions [R, B, P] and values [R, B], float32 also under autocast. The
+        values are 0 without a value head.
         """
         flat = {name: values.flatten(0, 1) for name, values in normalized.items()}
         features = self.encoder(flat).unflatten(0, starts.shape)  # [R, B, F]
@@ -78,7 +100,10 @@ class ActorCritic(nn.Module):
         # Both heads in full precision: bfloat16 would round values and logits to 8 bits, which is much of a TD error.
         device = remembered.device.type
         with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
-            return self.policy_head(remembered.float()), self.value_head(critic.float()).squeeze(-1)
+            parameters = self.policy_head(remembered.float())
+            if self.value_head is None:
+                return parameters, parameters.new_zeros(parameters.shape[:-1])
+            return parameters, self.value_head(critic.float()).squeeze(-1)
 
     def step(self, observations: Components, state: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the policies of one row: state [N, S] -> distribution parameters [N, P], next state [N, S]."""
@@ -86,7 +111,13 @@ class ActorCritic(nn.Module):
         return self.policy_head(remembered), state
 
     def act(
-        self, observations: Components, state: Tensor, uniform: Tensor, normal: Tensor, masks: Components
+        self,
+        observations: Components,
+        state: Tensor,
+        uniform: Tensor,
+        normal: Tensor,
+        masks: Components,
+        epsilon: Tensor,
     ) -> tuple[Components, Tensor, Tensor]:
         """Choose the actions of one row of N environments.
 
@@ -96,9 +127,14 @@ class ActorCritic(nn.Module):
           uniform: [N, U] noise from 0 to 1, 1 excluded.
           normal: [N, G] standard normal noise.
           masks: of the masked actions [N, choices] bool.
+          epsilon: [N, 1], the final epsilon of the actor of each row; 0 never explores.
 
-        Returns: actions of each component [N, D], their log-probability [N], next state [N, S].
+        Returns: actions of each component [N, D], their log-probability [N] under the behaviour policy, next state
+        [N, S].
         """
         parameters, state = self.step(observations, state)
+        if self.exploration is not None:
+            explored = self.exploration.act(self.distribution, parameters, uniform, normal, masks, epsilon)
+            return *explored, state
         actions = self.distribution.sample(parameters, uniform, normal, masks)
         return actions, self.distribution.log_prob(parameters, actions, masks), state

@@ -143,7 +143,7 @@ def as_contained(space: gymnasium.Space, value: Any) -> Any:
 def test_a_vector_environment_accepts_the_actions(space: gymnasium.Space, seed: int) -> None:
     """gymnasium splits batched actions among its environments."""
     random = np.random.default_rng(seed)
-    actions = ActionComponents(None, space)
+    actions = ActionComponents(space)
     values = {
         name: random.integers(0, part.counts, (3, part.size))
         if isinstance(part, DiscreteSpace)

@@ -1,7 +1,7 @@
 """make_environments: what it creates, and its errors."""
 
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -11,8 +11,9 @@ from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ContinuousSpace
+from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -119,6 +120,47 @@ def test_table_rows_are_the_actions() -> None:
         assert choices(environments.spaces) == 2
         rewards.append(float(environments.step(np.array([1]))[1][0]))
     assert rewards[0] - rewards[1] == pytest.approx(0.004)
+
+
+PEDALS = {"action_table": ((0.0, 0.0), (1.0, 0.0), (0.0, 0.8)), "action_table_columns": (1, 2)}
+
+
+def test_a_table_of_some_numbers_leaves_the_others_to_the_policy() -> None:
+    space = gymnasium.spaces.Box(np.array([-1.0, 0.0, 0.0], np.float32), 1.0, (3,), np.float32)
+    spec = EnvironmentSpec(id="CarRacing-v3", **PEDALS)
+    transforms = Transforms(spec, gymnasium.spaces.Box(0, 255, (96, 96, 3), np.uint8), space)
+    assert transforms.spaces.actions == {
+        "continuous": ContinuousSpace(low=(-1.0,), high=(1.0,)),
+        "table": DiscreteSpace(counts=(3,)),
+    }
+    chosen = {"continuous": np.array([[-0.5], [3.0]], np.float32), "table": np.array([[2], [1]])}
+    assert transforms.env_actions(chosen) == pytest.approx(np.array([[-0.5, 0.0, 0.8], [1.0, 1.0, 0.0]]))
+    assert transforms.env_action({name: values[:1] for name, values in chosen.items()}).shape == (3,)
+
+
+def test_the_columns_of_a_table_have_their_own_order_and_the_space_its_shape() -> None:
+    spec = EnvironmentSpec(id="x", action_table=((1.0, 2.0), (3.0, 4.0)), action_table_columns=(3, 0))
+    space = gymnasium.spaces.Box(-4.0, 4.0, (2, 2), np.float64)
+    transforms = Transforms(spec, gymnasium.spaces.Box(-1.0, 1.0, (2,)), space)
+    actions = transforms.env_actions({"continuous": np.array([[0.25, -0.5]]), "table": np.array([[1]])})
+    assert actions.tolist() == [[[4.0, 1.0], [-2.0, 3.0]]]
+    assert actions.dtype == space.dtype
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"action_table_columns": (0,)}, "action_table_columns needs environment.action_table: set it, too"),
+        ({**PEDALS, "action_table_columns": (1, 3)}, "action_table_columns names number 3, but an action of space Box"),
+        ({**PEDALS, "action_table_columns": (1, 1)}, r"action_table_columns names a number twice: \[1, 1\]"),
+        ({**PEDALS, "action_table_columns": (1,)}, "row 0 has 2 numbers, but action_table_columns names 1"),
+        ({**PEDALS, "action_table": ((0.0, 0.0), (0.0, -0.8))}, r"row 1 is \(0.0, -0.8\), outside action space Box"),
+    ],
+)
+def test_columns_that_do_not_fit_are_reported(fields: dict[str, Any], reason: str) -> None:
+    space = gymnasium.spaces.Box(np.array([-1.0, 0.0, 0.0], np.float32), 1.0, (3,), np.float32)
+    with pytest.raises(EnvironmentSetupError, match=reason):
+        Transforms(EnvironmentSpec(id="x", **fields), gymnasium.spaces.Box(-1.0, 1.0, (2,)), space)
 
 
 class _Telling(gymnasium.Env):

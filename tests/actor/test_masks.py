@@ -90,7 +90,12 @@ class LegalPolicy(PlainPolicy):
     """A policy that takes the first legal choice."""
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         actions = masks["action"].argmax(1)[:, None]
         return Choice({"action": actions}, np.zeros(len(actions), np.float32), state)

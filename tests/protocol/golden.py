@@ -94,6 +94,7 @@ _ACTOR = ActorStatus(
     lives=2,
     seconds_since_seen=0.25,
     environments=2,
+    epsilon=0.125,
     env_steps=100,
     env_steps_per_second=50.5,
     rollouts_accepted=8,
@@ -126,7 +127,11 @@ MESSAGES: dict[str, Message] = {
     "join_asking": Join(actor="wing-1", incarnation=5),
     "join_failed": Join(actor="wing-1", incarnation=5, origin=_ORIGIN, failure="module 'corridor' is not installed"),
     "welcome": Welcome(
-        run="r", learner_epoch=9, seed=3, spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}))
+        run="r",
+        learner_epoch=9,
+        seed=3,
+        epsilon=0.125,
+        spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1})),
     ),
     "refusal": Refusal(code="mismatch", reason="other spaces"),
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),

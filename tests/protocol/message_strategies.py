@@ -113,6 +113,7 @@ run_specs = st.builds(
 )
 actor_statuses = st.builds(
     ActorStatus,
+    epsilon=floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
     **dict.fromkeys(("actor", "host", "software", "address", "quarantined"), text),
     **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
@@ -282,7 +283,9 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         origin=st.builds(Origin, host=text, software=text, address=text),
         failure=text,
     ),
-    Welcome: st.builds(Welcome, run=text, learner_epoch=counters, seed=counters, spec=run_specs),
+    Welcome: st.builds(
+        Welcome, run=text, learner_epoch=counters, seed=counters, epsilon=st.floats(0, 1), spec=run_specs
+    ),
     Refusal: st.builds(Refusal, reason=text),
     Program: st.builds(Program, hash=text, model=st.binary(max_size=300).map(lambda data: np.frombuffer(data, "|u1"))),
     Rollout: rollouts(),

@@ -95,6 +95,7 @@ class Spectator:
 
     state_size = 0
     noise_size = NoiseSize(0, 0)
+    explores = False
 
     def __init__(self) -> None:
         self.seen: list[np.ndarray] = []
@@ -103,7 +104,12 @@ class Spectator:
         pass
 
     def act(
-        self, observations: dict[str, np.ndarray], state: np.ndarray, noise: Noise, masks: dict[str, np.ndarray]
+        self,
+        observations: dict[str, np.ndarray],
+        state: np.ndarray,
+        noise: Noise,
+        masks: dict[str, np.ndarray],
+        epsilon: np.ndarray | None = None,
     ) -> Choice:
         self.seen.append(observations[NAME].copy())
         rows = len(state)

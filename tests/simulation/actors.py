@@ -57,7 +57,7 @@ class ScriptedCollector:
         self._actor.pass_time(0.1)
         return _SPACES, 1
 
-    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int) -> None:
+    def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
         self._snapshot = None
 
     def load(self, snapshot: Snapshot) -> None:

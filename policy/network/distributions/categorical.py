@@ -6,6 +6,7 @@ from torch import Tensor
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.protocol.spaces import DiscreteSpace
 
+_SMALLEST = 1e-30  # of uniform noise: at 0 a legal choice would be less probable than one that is not
 _ABSENT = -1e30  # logit of a choice that a variable does not have, or that is not legal: its probability is exactly 0
 
 
@@ -24,7 +25,7 @@ class Categorical(Distribution):
 
     def sample(self, parameters: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:
         """See Distribution."""
-        gumbel = -torch.log(-torch.log(uniform))
+        gumbel = -torch.log(-torch.log(uniform.clamp(min=_SMALLEST)))
         return (self._by_variable(parameters) + self._by_variable(gumbel)).argmax(-1)  # [N, D]
 
     def log_prob(self, parameters: Tensor, actions: Tensor) -> Tensor:

@@ -7,12 +7,13 @@ from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGaussian
+from daedalus.policy.network.distributions.greedy import Greedy
 from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
 from daedalus.policy.network.distributions.mixture import GaussianMixture
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 Components = dict[str, Tensor]
 
@@ -24,11 +25,19 @@ class ActionDistribution(nn.Module):
     components lie side by side, in the order of the components.
     """
 
-    def __init__(self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES) -> None:
-        """Raise NetworkError if a distribution does not support its component, or may not be imported."""
+    def __init__(
+        self, spec: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES, training: TrainingSpec | None = None
+    ) -> None:
+        """Raise NetworkError if a distribution does not support its component, or may not be imported.
+
+        `training` names the algorithm, which may learn action values: None stands for one that does not.
+        """
         super().__init__()
         self._names, self._masked = tuple(spaces.actions), frozenset(spaces.masks)
-        distributions = [_distribution(spec, name, space, modules) for name, space in spaces.actions.items()]
+        if training is not None and training.record.heads == "action_values":
+            distributions: list[Distribution] = [Greedy(_only_choice(spaces, training.algorithm))]
+        else:
+            distributions = [_distribution(spec, name, space, modules) for name, space in spaces.actions.items()]
         self.components = nn.ModuleList(distributions)
         self._sizes = [component.parameter_count for component in self._distributions()]
         self.parameter_count = sum(self._sizes)
@@ -77,6 +86,18 @@ class ActionDistribution(nn.Module):
 
 def _sum(terms: list[Tensor]) -> Tensor:
     return terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
+
+
+def _only_choice(spaces: Spaces, algorithm: str) -> DiscreteSpace:
+    """Return the only action, which must be discrete. Raises NetworkError, which names the algorithm, if not."""
+    only = next(iter(spaces.actions.values()))
+    if len(spaces.actions) == 1 and isinstance(only, DiscreteSpace) and only.size == 1:
+        return only
+    table = ", or name discrete actions with environment.action_table" if isinstance(only, ContinuousSpace) else ""
+    raise NetworkError(
+        f"training.algorithm={algorithm} learns the value of each choice of one discrete action, but this environment "
+        f"has {spaces.listed_actions}: use a2c, a3c, impala or appo{table if len(spaces.actions) == 1 else ''}"
+    )
 
 
 def _distribution(

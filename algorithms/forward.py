@@ -1,0 +1,75 @@
+"""The network as an algorithm uses it: forward passes, and the target network."""
+
+import copy
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+
+from daedalus.algorithms.batch import Components
+from daedalus.algorithms.flat_parameters import FlatParameters
+from daedalus.policy.network.actor_critic import ActorCritic
+
+
+class Forward:
+    """Forward passes of the network that is being learned, and of its target network if the algorithm has one."""
+
+    def __init__(self, network: ActorCritic, learned: FlatParameters, *, has_target: bool, is_mixed: bool) -> None:
+        """Construct both; the target network begins as a copy.
+
+        Args:
+          network: the network that is being learned.
+          learned: its parameters that have gradients.
+          has_target: whether there is a target network.
+          is_mixed: whether forward passes compute in bfloat16.
+        """
+        self._network, self._learned, self._is_mixed = network, learned, is_mixed
+        self._target = copy.deepcopy(network) if has_target else None
+        self.target_values = learned.values[:0]  # [P]; [0] without a target network
+        self.target_parameters: dict[str, Tensor] = {}  # views of them, by name
+        if self._target is not None:
+            named = {name: each for name, each in self._target.named_parameters() if each.requires_grad}
+            self.target_values = FlatParameters(named.values()).values
+            self.target_parameters = {name: each.detach() for name, each in named.items()}
+
+    def __call__(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute R rows of B environments with the network.
+
+        Args:
+          observations: normalised, of each component [R, B, *stacked_shape].
+          state: [B, S], the memory before row 0.
+          starts: [R, B] bool, an episode starts with the row.
+
+        Returns: parameters of the action distributions [R, B, P], or the action values; and values [R, B].
+        """
+        with self._precision(starts):
+            return self._network.unroll(observations, state, starts)
+
+    def target(self, observations: Components, state: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the same with the target network, without gradients.
+
+        Raises ValueError if the record of the algorithm has no `target_network`.
+        """
+        target = self._checked_target()
+        with torch.no_grad(), self._precision(starts):
+            return target.unroll(observations, state, starts)
+
+    def update_target(self, share: float = 1.0) -> None:
+        """Move the target network's parameters by a share of the way to the network's: 1 makes both equal.
+
+        Raises ValueError as `target`.
+        """
+        self._checked_target()
+        if share == 1.0:
+            self.target_values.copy_(self._learned.values)
+        else:
+            self.target_values.lerp_(self._learned.values, share)
+
+    def _checked_target(self) -> ActorCritic:
+        if self._target is None:
+            raise ValueError("there is no target network: set target_network in the record of the algorithm")
+        return self._target
+
+    def _precision(self, starts: Tensor) -> AbstractContextManager[object]:
+        # A context for each forward pass: its cache of cast weights must not survive an update of the weights.
+        return torch.autocast(starts.device.type, torch.bfloat16) if self._is_mixed else nullcontext()

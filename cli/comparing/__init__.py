@@ -1,0 +1,1 @@
+"""Statistics of several runs, and what reads, groups and shows them."""

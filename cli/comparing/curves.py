@@ -1,0 +1,63 @@
+"""Curves of groups of runs over env_steps or minutes. Pure functions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RecordedRun
+from daedalus.cli.comparing.statistics import interquartile_interval, interquartile_mean
+
+_POINTS = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Curve:
+    """A column of the metrics over env_steps or minutes, [points] each."""
+
+    x: np.ndarray
+    mean: np.ndarray  # interquartile mean over the runs
+    low: np.ndarray  # of the 95 % interval; NaN for a single run
+    high: np.ndarray
+
+
+def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the known values of a column, [rows], and where they lie, [rows], increasing.
+
+    Rows that a resumed run repeated from its checkpoint on replace the earlier ones.
+
+    Args:
+      run: the run.
+      column: column of its metrics.
+      by: "env_steps" or "minutes".
+    """
+    x = run.metrics[ENV_STEPS] if by == ENV_STEPS else run.metrics[SECONDS] / 60.0
+    y = run.metrics[column]
+    known = ~np.isnan(y) & ~np.isnan(x)
+    x, y = x[known], y[known]
+    least_later = np.append(np.minimum.accumulate(x[::-1])[::-1][1:], np.inf)
+    newest = x < least_later
+    return x[newest], y[newest]
+
+
+def group_curve(runs: Sequence[RecordedRun], column: str, by: str) -> Curve | None:
+    """Return the curve of the interquartile mean over runs, or None if a run has no value.
+
+    It begins where all runs have a value. A finished run keeps its last value, because runs that reach their target end
+    early; the curve ends where the first unfinished run ends.
+
+    Args: as of `points`.
+    """
+    lines = [points(run, column, by) for run in runs]
+    if any(len(x) == 0 for x, _ in lines):
+        return None
+    begin = max(x[0] for x, _ in lines)
+    last = [x[-1] for x, _ in lines]
+    running = [end for end, run in zip(last, runs, strict=True) if run.unfinished]
+    end = min([max(last), *running])
+    if end < begin:
+        return None
+    grid = np.linspace(begin, end, _POINTS)
+    values = np.stack([np.interp(grid, x, y) for x, y in lines])  # [runs, points]
+    interval = interquartile_interval([values])
+    return Curve(x=grid, mean=interquartile_mean(values, 0), low=interval.low, high=interval.high)

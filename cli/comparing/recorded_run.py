@@ -1,0 +1,186 @@
+"""Runs as their directories record them: settings, metrics and summary. Imports no module of a run."""
+
+import csv
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
+from daedalus.learner.run.settings import SettingsError, run_spec
+
+SEED, ENVIRONMENT = "training.seed", "environment.id"
+RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
+
+
+class RunDataError(Exception):
+    """Error for a run directory that cannot be used. The message is one line."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedRun:
+    """One run, from the files in its directory."""
+
+    directory: Path
+    settings: Mapping[str, Any]  # by `section.key`; empty without config.toml
+    metrics: Mapping[str, np.ndarray]  # columns of metrics.csv, [rows]; NaN: no value
+    summary: Mapping[str, Any]  # summary.json; empty before the end of training
+
+    @property
+    def unfinished(self) -> str:
+        """Why the run has no result yet, or an empty string."""
+        done = self.metrics[ENV_STEPS][-1]
+        budget = self.settings.get("training.env_steps", math.nan)
+        ended = self.summary.get("finished") or self.evaluation is not None
+        # A run that was resumed with a larger budget has made more steps than its summary says.
+        if ended and done <= self.summary.get("env_steps", math.inf):
+            return ""
+        return (
+            f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): "
+            f"continue it with: daedalus resume {self.directory}"
+        )
+
+    @property
+    def evaluation(self) -> float | None:
+        """Mean return of the final evaluation, or None without one."""
+        return self.summary.get("evaluation_return_mean")
+
+    @property
+    def training_return(self) -> float:
+        """Mean return of the last training episodes; NaN if no episode has ended."""
+        means = self.metrics[RETURN]
+        known = means[~np.isnan(means)]
+        return float(known[-1]) if len(known) else math.nan
+
+    @property
+    def target(self) -> float | None:
+        """The target return of the run, or None."""
+        return self.settings.get("training.target_return")
+
+    def reached(self, threshold: float) -> tuple[float, float]:
+        """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
+
+        Infinite if the mean did not reach the threshold. The precision is that of the rows of metrics.csv, except for
+        the target of a run that stopped at the target. The metrics need wall_seconds.
+        """
+        at_target = self.summary.get("solved") and threshold == self.target
+        seconds = self.summary.get("seconds_to_target")
+        if at_target and seconds is not None and self.settings.get("training.stop_when_solved"):
+            return float(self.summary["env_steps"]), seconds / 60.0
+        above = self.metrics[RETURN] >= threshold
+        episodes = self.metrics.get("episodes")
+        if episodes is not None:  # the mean of fewer episodes may be luck
+            above &= episodes >= self.settings.get("training.target_episodes", 1)
+        if not above.any():
+            return math.inf, math.inf
+        row = int(above.argmax())
+        return float(self.metrics[ENV_STEPS][row]), float(self.metrics[SECONDS][row]) / 60.0
+
+
+def find_runs(paths: Iterable[Path]) -> list[Path]:
+    """Return the run directories that paths name. A folder of run directories, such as runs/, stands for all of them.
+
+    Raises RunDataError for a path that is neither.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if (path / CONFIG).exists() or (path / METRICS).exists():
+            found.append(path)
+            continue
+        inside = sorted(config.parent for config in path.glob(f"*/{CONFIG}"))
+        if not inside:
+            raise RunDataError(
+                f"{path} is not a run directory: it has neither {CONFIG} nor {METRICS}"
+                if path.exists()
+                else f"{path} does not exist: name a run directory, or a folder of run directories"
+            )
+        found += inside
+    return list(dict.fromkeys(found))
+
+
+def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
+    """Return the run in a directory; its metrics have at least env_steps, the return and `columns`.
+
+    Raises RunDataError.
+    """
+    return RecordedRun(
+        directory=directory,
+        settings=_settings(directory / CONFIG),
+        metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
+        summary=_summary(directory / SUMMARY),
+    )
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    try:
+        settings = tomllib.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise RunDataError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RunDataError(f"{path} is damaged: {error}") from None
+    with suppress(SettingsError):  # another release may have had settings that this one does not have
+        # With the defaults of settings that an earlier release did not have.
+        settings = run_spec(settings).model_dump(mode="json")
+    return {
+        f"{section}.{key}": value
+        for section, values in settings.items()
+        if isinstance(values, dict)
+        for key, value in values.items()
+    }
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise RunDataError(f"{path}: {error.strerror}") from None
+    except ValueError:
+        raise RunDataError(f"{path} is damaged: it is not valid JSON") from None
+    if not isinstance(content, dict):
+        raise RunDataError(f"{path} is damaged: it is not a JSON object")
+    return content
+
+
+def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out."""
+    path = directory / METRICS
+    nothing = f"{directory} has no metrics yet: wait until the run has made its first updates"
+    try:
+        text = path.read_bytes().decode("utf-8")
+        header, *rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+    except FileNotFoundError:
+        raise RunDataError(nothing) from None
+    except OSError as error:
+        raise RunDataError(f"{path}: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RunDataError(f"{path} is damaged: {error}") from None
+    except ValueError:  # no line at all
+        raise RunDataError(nothing) from None
+    missing = [column for column in columns if column not in header]
+    if missing:
+        raise RunDataError(
+            f"{path} has no column {missing[0]}: it is not the metrics of a run, or those of an old release"
+        )
+    if not rows:
+        raise RunDataError(nothing)
+    values = [_numbers(path, number, row, len(header)) for number, row in enumerate(rows, start=2)]
+    return dict(zip(header, np.array(values).T, strict=True))
+
+
+def _numbers(path: Path, line: int, row: Sequence[str], cells: int) -> list[float]:
+    if len(row) != cells:
+        raise RunDataError(f"{path} is damaged: line {line} has {len(row)} cells, and the header has {cells}")
+    try:
+        return [float(cell) if cell else math.nan for cell in row]
+    except ValueError as error:
+        raise RunDataError(f"{path} is damaged: line {line}: {error}") from None

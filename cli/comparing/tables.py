@@ -1,0 +1,97 @@
+"""A comparison as a table for a terminal, and as CSV. Pure functions."""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+
+from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
+
+
+def as_text(comparison: Comparison) -> str:
+    """Return the table of a comparison, with what its columns mean."""
+    header = ["group", "runs", "final return"]
+    threshold = comparison.threshold
+    if threshold is not None:
+        header += ["reached", f"env_steps to {threshold:g}", f"minutes to {threshold:g}"]
+    if len(comparison.results) > 1:
+        header.append("P(> first)")
+    rows = [_cells(result, comparison) for result in comparison.results]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in [header, *rows]
+    ]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join([*lines, "", *_notes(comparison)])
+
+
+def _cells(result: GroupResult, comparison: Comparison) -> list[str]:
+    cells = [result.group, str(result.runs), _estimate(result.final_return, _number)]
+    if result.env_steps is not None and result.minutes is not None:
+        cells.append(f"{result.reached} of {result.runs}")
+        cells += [_estimate(result.env_steps, lambda value: f"{value:,.0f}"), _estimate(result.minutes, _number)]
+    if len(comparison.results) > 1:
+        improvement = result.improvement
+        cells.append("" if improvement is None else _estimate(improvement, lambda value: f"{value:.2f}"))
+    return cells
+
+
+def _notes(comparison: Comparison) -> list[str]:
+    kind = "the final evaluation" if comparison.evaluated else "the last training episodes"
+    lines = [
+        f"{comparison.environment or 'runs'}: interquartile mean over the runs [95 % bootstrap interval]; "
+        f"final return: mean of {kind}"
+    ]
+    if len(comparison.results) > 1:
+        lines.append(
+            "P(> first): probability that a run has a higher final return than one of the first group; "
+            "0.5 if they are equal"
+        )
+    if comparison.threshold is None:
+        lines.append("env_steps and minutes to a return: name the return with --threshold")
+    single = [result.group for result in comparison.results if result.runs == 1]
+    if single:
+        named = " and ".join(single) if len(single) < 3 else f"{len(single)} groups"
+        lines.append(f"one run only, so without an interval: {named}; train more seeds")
+    return lines
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+
+
+def _estimate(estimate: Estimate, form: Callable[[float], str]) -> str:
+    def shown(value: float) -> str:
+        return "-" if math.isnan(value) else "never" if math.isinf(value) else form(value)
+
+    if math.isnan(estimate.low) or estimate.low == estimate.high == math.inf:
+        return shown(estimate.value)
+    return f"{shown(estimate.value)} [{shown(estimate.low)}, {shown(estimate.high)}]"
+
+
+_ESTIMATES = ("final_return", "env_steps", "minutes", "improvement")
+_HEADER = [
+    "group",
+    "runs",
+    "reached",
+    "threshold",
+    *(f"{name}{end}" for name in _ESTIMATES for end in ("", "_low", "_high")),
+]
+
+
+def as_csv(comparison: Comparison) -> str:
+    """Return the table as CSV, one line for each group; blank: unknown; inf: not reached."""
+    stream = io.StringIO()
+    writer = csv.writer(stream)
+    writer.writerow(_HEADER)
+    for result in comparison.results:
+        numbers: list[float | None] = [result.reached, comparison.threshold]
+        for name in _ESTIMATES:
+            numbers += getattr(result, name) or (None, None, None)
+        writer.writerow([result.group, result.runs, *_blank(numbers)])
+    return stream.getvalue()
+
+
+def _blank(numbers: Sequence[float | None]) -> list[str]:
+    return ["" if number is None or math.isnan(number) else f"{number:.10g}" for number in numbers]

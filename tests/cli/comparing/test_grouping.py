@@ -1,0 +1,86 @@
+"""Test of cli/comparing/grouping.py."""
+
+from pathlib import Path
+
+import pytest
+from recorded_runs import record
+
+from daedalus.cli.comparing.grouping import by_settings, by_user, check_comparable, text
+from daedalus.cli.comparing.recorded_run import RecordedRun, RunDataError, read_run
+
+
+def run(folder: Path, name: str, *settings: str, seed: int = 1, preset: str = "cartpole") -> RecordedRun:
+    return read_run(record(folder / name, seed=seed, settings=settings, preset=preset))
+
+
+def names(*runs: RecordedRun) -> list[tuple[str, list[str]]]:
+    return [(group.name, [run.directory.name for run in group.runs]) for group in by_settings(runs)]
+
+
+def test_seeds_of_one_setting_are_one_group(tmp_path: Path) -> None:
+    runs = [run(tmp_path, f"s{seed}", seed=seed) for seed in (1, 2)]
+    assert names(*runs) == [("CartPole-v1, impala", ["s1", "s2"])]
+
+
+def test_groups_have_the_name_of_what_differs_and_its_order(tmp_path: Path) -> None:
+    runs = [run(tmp_path, f"n{n}", f"collection.rollout_length={n}") for n in (64, 5, 20)]
+    assert names(*runs) == [
+        ("rollout_length=5", ["n5"]),
+        ("rollout_length=20", ["n20"]),
+        ("rollout_length=64", ["n64"]),
+    ]
+
+
+def test_one_setting_names_the_groups_if_it_is_enough(tmp_path: Path) -> None:
+    """The algorithm first: other settings of a preset depend on it."""
+    other = ("training.algorithm=a3c", "collection.rollout_length=16", "training.learning_rate=0.001")
+    assert names(run(tmp_path, "a"), run(tmp_path, "b", *other)) == [
+        ("algorithm=a3c", ["b"]),
+        ("algorithm=impala", ["a"]),
+    ]
+
+
+def test_two_settings_name_the_groups_of_a_grid(tmp_path: Path) -> None:
+    grid = [(n, rate) for n in (5, 20) for rate in (0.1, 0.01)]
+    runs = [
+        run(tmp_path, f"{n}-{rate}", f"collection.rollout_length={n}", f"training.learning_rate={rate}")
+        for n, rate in grid
+    ]
+    assert [name for name, _ in names(*runs)] == [
+        "rollout_length=5, learning_rate=0.01",
+        "rollout_length=5, learning_rate=0.1",
+        "rollout_length=20, learning_rate=0.01",
+        "rollout_length=20, learning_rate=0.1",
+    ]
+
+
+def test_named_settings_name_the_groups(tmp_path: Path) -> None:
+    runs = [run(tmp_path, f"n{n}", f"collection.rollout_length={n}") for n in (5, 20)]
+    groups = by_settings(runs, ["training.learning_rate", "collection.rollout_length"])
+    assert [group.name for group in groups] == [
+        "learning_rate=0.003, rollout_length=5",
+        "learning_rate=0.003, rollout_length=20",
+    ]
+
+
+def test_groups_of_the_user_keep_their_order(tmp_path: Path) -> None:
+    parts = [[run(tmp_path, "b", "policy.hidden=[64]")], [run(tmp_path, "a", "policy.hidden=[32,32]")]]
+    assert [group.name for group in by_user(parts)] == ["hidden=[64]", "hidden=[32,32]"]
+
+
+def test_groups_of_the_user_that_no_setting_tells_apart_have_the_names_of_runs(tmp_path: Path) -> None:
+    mixed = [run(tmp_path, "a"), run(tmp_path, "b", "policy.hidden=[64]")]
+    same = [run(tmp_path, "c")]
+    assert [group.name for group in by_user([mixed, same])] == ["a and 1 more", "c"]
+
+
+def test_runs_of_different_environments_are_refused(tmp_path: Path) -> None:
+    runs = [run(tmp_path, "a"), run(tmp_path, "b", preset="acrobot")]
+    with pytest.raises(RunDataError, match="the runs play different environments, whose returns cannot be compared"):
+        check_comparable(runs)
+    check_comparable(runs[:1])
+
+
+def test_values_are_short_texts() -> None:
+    values = [1, True, 0.0003, 1e-10, [64, 64], None, "tanh"]
+    assert [text(value) for value in values] == ["1", "true", "0.0003", "1e-10", "[64,64]", "unset", "tanh"]

@@ -1,0 +1,127 @@
+"""Test of `daedalus compare`."""
+
+import csv
+import re
+from pathlib import Path
+
+import pytest
+from recorded_runs import record
+
+from daedalus.cli.commands.compare import compare
+
+FAST, SLOW = ("collection.rollout_length=5",), ("collection.rollout_length=64",)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def five(folder: Path, name: str, settings: tuple[str, ...], evaluation: float, env_steps: int) -> None:
+    """Record five seeds that reach the target after `env_steps` or up to 4 env_steps later."""
+    for seed in range(5):
+        record(
+            folder / f"{name}-s{seed}",
+            seed=seed,
+            settings=settings,
+            evaluation=evaluation + seed,
+            env_steps=(1000, 2000, env_steps + seed),
+            solved=True,
+            seconds_to_target=60.0 + seed,
+        )
+
+
+def test_groups_are_found_and_compared(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    five(folder / "runs", "slow", SLOW, 400.0, 9000)
+    five(folder / "runs", "fast", FAST, 480.0, 3000)
+    assert compare(["runs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    header, _, fast, slow = (" ".join(line.split()) for line in lines[:4])
+    assert header == "group runs final return reached env_steps to 475 minutes to 475 P(> first)"
+    interval = r"\[(\S+), (\S+)\]"
+    assert re.fullmatch(rf"rollout_length=5 5 482\.0 {interval} 5 of 5 3,002 {interval} 1\.03 {interval}", fast)
+    match = re.match(rf"rollout_length=64 5 402\.0 {interval} 5 of 5 9,002 {interval} 1\.03 {interval}", slow)
+    assert match is not None
+    assert 400.0 <= float(match[1]) < 402.0 < float(match[2]) <= 404.0
+    assert slow.endswith(" 0.00 [0.00, 0.00]")
+    assert "final return: mean of the final evaluation" in lines[-2]
+
+
+def test_groups_can_be_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    five(folder, "slow", SLOW, 400.0, 9000)
+    five(folder, "fast", FAST, 480.0, 3000)
+    slow, fast = ([str(path) for path in sorted(folder.glob(f"{name}-*"))] for name in ("slow", "fast"))
+    assert compare([*slow, "--threshold", "300", "--", *fast, "--csv", "table.csv"]) == 0
+    assert "env_steps to 300" in capsys.readouterr().out
+    with open("table.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["group"] for row in rows] == ["rollout_length=64", "rollout_length=5"]
+    assert [float(row["improvement"] or "nan") for row in rows[1:]] == [1.0]
+    assert rows[0]["improvement"] == ""
+    assert [(float(row["env_steps"]), float(row["minutes"])) for row in rows] == [(2000.0, 2.0)] * 2
+
+
+def test_runs_without_an_evaluation_are_compared_by_their_training(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(folder / "a", seed=1, evaluation=None)
+    record(folder / "b", seed=2, evaluation=9.0, returns=(1.0, 2.0, 470.0))
+    assert compare(["a", "b"]) == 0
+    output = capsys.readouterr().out
+    assert "475.0 [470.0, 480.0]" in output
+    assert "final return: mean of the last training episodes" in output
+    assert "never" in output  # a half of the runs did not reach the target
+
+
+def test_one_seed_has_no_interval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "a", settings=FAST)
+    record(folder / "b", settings=SLOW)
+    assert compare(["a", "b"]) == 0
+    output = capsys.readouterr().out
+    assert "[" not in output.splitlines()[2]
+    assert "one run only, so without an interval: rollout_length=5 and rollout_length=64; train more seeds" in output
+
+
+def test_runs_with_other_targets_have_no_threshold(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "a")
+    record(folder / "b", settings=["training.target_return=none"])
+    assert compare(["a", "b"]) == 0
+    output = capsys.readouterr().out
+    assert "env_steps and minutes to a return: name the return with --threshold" in output
+    assert "minutes to 475" not in output
+
+
+def test_runs_that_cannot_be_used_are_left_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "good")
+    record(folder / "running", finished=False, evaluation=None)
+    (record(folder / "damaged") / "metrics.csv").write_text("env_steps,episode_return_mean,wall_seconds\n1,2\n")
+    assert compare(["good", "running", "damaged"]) == 0
+    running, damaged = capsys.readouterr().err.splitlines()
+    assert running == (
+        "daedalus compare: left out: running is not finished (3,000 of 1,500,000 env_steps): "
+        "continue it with: daedalus resume running"
+    )
+    assert damaged == (
+        "daedalus compare: left out: damaged/metrics.csv is damaged: line 2 has 2 cells, and the header has 3"
+    )
+
+
+def test_nothing_to_compare_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record(folder / "a")
+    record(folder / "b", preset="acrobot")
+    record(folder / "running", finished=False, evaluation=None)
+    (folder / "empty").mkdir()
+    for words, message in (
+        (["nowhere"], "nowhere does not exist"),
+        (["empty"], "empty is not a run directory"),
+        (["running"], "running is not finished"),
+        (["a", "--", "running"], "running is not finished"),
+        (["a", "b"], "the runs play different environments"),
+        (["a", "--csv", "no/table.csv"], "no/table.csv: No such file or directory"),
+    ):
+        assert compare(words) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        assert captured.err.startswith(f"daedalus compare: {message}")
