@@ -177,7 +177,7 @@ class GatewayService:
 
     async def _close(self) -> None:
         if self._camera is not None:
-            self._camera.stop()
+            await self._camera.close()
         if self._monitor is not None:
             await asyncio.to_thread(self._monitor.close)
         if self._gateway.done():

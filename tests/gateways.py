@@ -18,7 +18,7 @@ from daedalus.gateway.gateway import Gateway, GatewayConfig
 from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
-from daedalus.gateway.tokens import Tokens
+from daedalus.gateway.tokens import OperatorToken, Tokens
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -31,15 +31,23 @@ CARTPOLE = {
 class RunningGateway:
     """A gateway with its web server, on a thread of its own."""
 
-    def __init__(self, network: MemoryNetwork, certificates: Path | None = None, *, follows: bool = True) -> None:
+    def __init__(
+        self,
+        network: MemoryNetwork,
+        certificates: Path | None = None,
+        *,
+        follows: bool = True,
+        operator: OperatorToken | None = None,
+    ) -> None:
         """Start a gateway.
 
         Args:
           network: the network that it connects to.
           certificates: folder of a gateway; None: plain WebSockets on loopback.
+          operator: token for orders.
           follows: whether it follows a run; otherwise it serves raw clients only.
         """
-        self._follows = follows
+        self._follows, self._operator = follows, operator
         self._open_transport = lambda: MemoryTransport(network)
         self._transport = self._open_transport()
         self._tokens = None if certificates is None else Tokens(certificates)
@@ -61,7 +69,7 @@ class RunningGateway:
             gateway.open()
         self.data = PageData()
         ready.set_result(gateway)
-        rules = guard(LOOPBACK, self.port, [], self._tokens)
+        rules = guard(LOOPBACK, self.port, [], self._tokens, self._operator)
         raw = RawEndpoint(self._open_transport, rules, self._config.actor_name)
 
         async def close() -> None:

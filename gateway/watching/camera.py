@@ -52,12 +52,15 @@ class CameraProcess:
         self._changed = asyncio.Event()
         self._viewers = 0
         self._task: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()  # also those that are ending
 
     async def frames(self) -> AsyncIterator[bytes]:
         """See Camera."""
         self._viewers += 1
         if self._task is None:
             self._task = asyncio.create_task(self._run())
+            self._tasks.add(self._task)
+            self._task.add_done_callback(self._tasks.discard)
         seen = self._number if self._viewers == 1 else self._number - 1  # one that is long over is not shown
         try:
             while True:
@@ -70,13 +73,18 @@ class CameraProcess:
         finally:
             self._viewers -= 1
             if not self._viewers:
-                self.stop()
+                self._stop()
 
-    def stop(self) -> None:
-        """End the process."""
+    def _stop(self) -> None:
         if self._task is not None:
             self._task.cancel()
             self._task = None
+
+    async def close(self) -> None:
+        """End the process. At most about 3 s."""
+        self._stop()
+        if self._tasks:
+            await asyncio.wait(list(self._tasks), timeout=_END_SECONDS + 1.0)
 
     def _show(self, frame: bytes) -> None:
         self._frame, self._number = frame, self._number + 1
@@ -159,3 +167,4 @@ async def _ended(process: asyncio.subprocess.Process) -> None:
         finally:
             if process.returncode is None:
                 process.kill()
+                await process.wait()
