@@ -28,14 +28,15 @@ _logger = logging.getLogger("daedalus.cli")
 
 FRAMES_PER_SECOND = 15.0
 _NICENESS = 19
+_READ_BYTES = 1 << 20
 _BETWEEN_EPISODES_SECONDS = 0.7
 
 
 class _Input:
     """What the gateway sends, read on a thread of its own."""
 
-    def __init__(self, stream: BinaryIO, stop: threading.Event) -> None:
-        self._stream, self._stop = stream, stop
+    def __init__(self, descriptor: int, stop: threading.Event) -> None:
+        self._descriptor, self._stop = descriptor, stop  # not a buffered stream, whose lock the thread would hold
         self.newest: Snapshot | None = None
 
     def begin(self) -> tuple[Welcome, Program]:
@@ -66,10 +67,13 @@ class _Input:
         return decode(self._exactly(length), LEARNER_LIMITS)
 
     def _exactly(self, length: int) -> bytes:
-        data = self._stream.read(length)
-        if len(data) != length:
-            raise EOFError
-        return data
+        data = bytearray()
+        while len(data) < length:
+            part = os.read(self._descriptor, min(length - len(data), _READ_BYTES))
+            if not part:
+                raise EOFError
+            data += part
+        return bytes(data)
 
 
 class _Output:
@@ -98,10 +102,12 @@ def main(output: BinaryIO) -> int:
     arguments = options.parse_args()
     configure_logging("warning", as_json=False, process="camera")
     os.nice(_NICENESS)
+    for name in ("SDL_VIDEODRIVER", "SDL_AUDIODRIVER"):  # a picture needs neither a window nor sound
+        os.environ.setdefault(name, "dummy")
     stop = stop_on_signals(exit_if_stuck=True)
     frames = _Output(output, stop)
     try:
-        _film(_Input(sys.stdin.buffer, stop), frames, UserModules(frozenset(arguments.allow_module), "the run"), stop)
+        _film(_Input(sys.stdin.fileno(), stop), frames, UserModules(frozenset(arguments.allow_module), "the run"), stop)
     except EOFError:
         return 0
     except ImportError:

@@ -1,7 +1,7 @@
 """The newest observation on the event loop, and the viewers that wait for changes."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Protocol
 
 from daedalus.gateway.errors import ClientError
@@ -17,7 +17,7 @@ GiveOrder = Callable[[Order], str]  # waits for the learner; returns why it is n
 class Camera(Protocol):
     """What shows episodes to viewers."""
 
-    def frames(self) -> AsyncIterator[bytes]:
+    def frames(self) -> AsyncGenerator[bytes, None]:
         """Yield frames as soon as there are any, and the newest only, until the caller stops."""
         ...
 

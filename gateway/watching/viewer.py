@@ -111,8 +111,9 @@ class ViewerConnection:
     async def _show_camera(self) -> None:
         assert self._data.camera is not None
         with contextlib.suppress(OSError):
-            async for frame in self._data.camera.frames():
-                await self._send_event({"type": "websocket.send", "bytes": frame})
+            async with contextlib.aclosing(self._data.camera.frames()) as frames:
+                async for frame in frames:
+                    await self._send_event({"type": "websocket.send", "bytes": frame})
 
     async def _finish(self, error: ClientError) -> None:
         """Say why the connection ends, and close it."""

@@ -43,7 +43,7 @@ def test_rows_have_a_value_for_each_column_that_any_of_them_has() -> None:
 
 def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history_module, "MAX_ROWS", 8)
-    history = MetricsHistory()
+    history, steps = MetricsHistory(), list[float]()
     for step in range(1000):
         history.add({"env_steps": step})
         steps = column(history, "env_steps")
