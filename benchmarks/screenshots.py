@@ -19,7 +19,7 @@ from PIL import Image
 COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 SETTINGS = ["--set", "training.stop_when_solved=false", "--env-steps", "4000000", "--set", "evaluation.seconds=8"]
 SETTINGS += ["--set", "collection.envs_per_actor=8"]  # slow enough for a curve
-COLOURS = 128  # of a picture: small files
+COLOURS = 256  # of a picture: small files
 LIMIT = 120_000  # milliseconds for each step
 
 

@@ -186,7 +186,8 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
 def _gateway_options(run: LocalRun) -> tuple[str, ...]:
     """Return the options of the gateway with the page."""
     level = "debug" if run.log_level == "debug" else "warning"  # it prints its address at any level
-    camera = allow_settings(run.spec.environment.user_modules) if run.camera else ["--no-camera"]
+    filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
+    camera = filming if run.camera else ["--no-camera"]
     token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
     return *_logging_options(level, run.log_json), *token, *camera
 

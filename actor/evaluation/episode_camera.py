@@ -1,7 +1,7 @@
 """Episodes played for somebody who watches: a picture of each step, and what the policy makes of it. No network."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,13 @@ _LARGEST_SIDE = 640  # of a picture, in pixels
 _SEEDS = 2**30
 
 
+Estimate = Callable[[dict[str, np.ndarray], np.ndarray], float | None]
+
+
+def _unknown(observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+    return None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Moment:
     """One step of an episode."""
@@ -32,14 +39,19 @@ class Moment:
     step: int  # from 1 in each episode
     reward: float
     total: float  # of the rewards of this episode
+    value: float | None  # estimate before the step; None if it is not known
     actions: list[dict[str, Any]]  # see action_facts
 
 
 class EpisodeCamera:
     """Episodes of one environment, rendered."""
 
-    def __init__(self, spec: RunSpec, modules: UserModules) -> None:
-        """Make the environment. Raises EnvironmentSetupError."""
+    def __init__(self, spec: RunSpec, modules: UserModules, estimate: Estimate = _unknown) -> None:
+        """Make the environment. Raises EnvironmentSetupError.
+
+        `estimate` returns the value of observations [1, *stacked_shape] and the policy's memory [1, S].
+        """
+        self._estimate = estimate
         environment = as_on_gymnasium(spec.environment).model_copy(update={"processes": False})
         self._picture = np.zeros((1, 1, 3), np.uint8)
         self._environments = make_environments(
@@ -64,13 +76,16 @@ class EpisodeCamera:
         state, total = np.zeros((1, runtime.state_size), np.float32), 0.0
         for step in range(1, self._longest + 1):
             choice = self._choose(runtime, stacks.observations, state, observed)
+            value = self._estimate(stacks.observations, state)
             state = choice.state[:1]
             taken = {name: values[:1] for name, values in choice.actions.items()}
             observed, rewards, terminated, truncated = environments.step(taken)
             stacks.push(observed.frames, np.zeros(1, np.bool_))
             total += float(rewards[0])
             facts = action_facts(spaces, choice)
-            yield Moment(picture=self._picture, step=step, reward=float(rewards[0]), total=total, actions=facts)
+            yield Moment(
+                picture=self._picture, step=step, reward=float(rewards[0]), total=total, value=value, actions=facts
+            )
             if terminated[0] or truncated[0]:
                 return
 

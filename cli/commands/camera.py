@@ -10,11 +10,13 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import BinaryIO
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
 from daedalus.cli.arguments import add_allow_module
+from daedalus.cli.checkpoint_values import CheckpointValues
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.gateway.watching.camera import LENGTH, frame, note
@@ -85,6 +87,7 @@ class _Output:
     def show(self, moment: Moment, version: int) -> None:
         """Write a frame when it is due."""
         facts = {"version": version, "step": moment.step, "reward": moment.reward, "total": moment.total}
+        facts |= {"value": moment.value}
         self._stop.wait(max(self._due - time.monotonic(), 0.0))
         self._due = max(self._due + 1.0 / FRAMES_PER_SECOND, time.monotonic())
         self.write(frame({**facts, "actions": moment.actions}, jpeg(moment.picture)))
@@ -99,6 +102,7 @@ def main(output: BinaryIO) -> int:
     """Play until the gateway closes standard input, and return the exit status."""
     options = argparse.ArgumentParser(description=__doc__)
     add_allow_module(options, "the run")
+    options.add_argument("--checkpoints", type=Path, help="run directory, for value estimates")
     arguments = options.parse_args()
     configure_logging("warning", as_json=False, process="camera")
     os.nice(_NICENESS)
@@ -107,7 +111,8 @@ def main(output: BinaryIO) -> int:
     stop = stop_on_signals(exit_if_stuck=True)
     frames = _Output(output, stop)
     try:
-        _film(_Input(sys.stdin.fileno(), stop), frames, UserModules(frozenset(arguments.allow_module), "the run"), stop)
+        modules = UserModules(frozenset(arguments.allow_module), "the run")
+        _film(_Input(sys.stdin.fileno(), stop), frames, modules, arguments.checkpoints, stop)
     except EOFError:
         return 0
     except ImportError:
@@ -120,15 +125,21 @@ def main(output: BinaryIO) -> int:
     return 0
 
 
-def _film(given: _Input, frames: _Output, modules: UserModules, stop: threading.Event) -> None:
+def _film(
+    given: _Input, frames: _Output, modules: UserModules, checkpoints: Path | None, stop: threading.Event
+) -> None:
     welcome, program = given.begin()
     runtime = OnnxRuntime(program.model.tobytes(), stop)
-    camera = EpisodeCamera(welcome.spec, modules)
+    is_its_directory = checkpoints is not None and checkpoints.resolve().name == welcome.run
+    values = CheckpointValues(checkpoints, modules) if checkpoints is not None and is_its_directory else None
+    camera = EpisodeCamera(welcome.spec, modules) if values is None else EpisodeCamera(welcome.spec, modules, values)
     try:
         while not stop.is_set():
             snapshot = given.newest
             assert snapshot is not None
             runtime.load(snapshot.weights)
+            if values is not None:
+                values.refresh()
             for moment in camera.play(runtime):
                 frames.show(moment, snapshot.policy_version)
                 if stop.is_set():

@@ -109,6 +109,12 @@ def parser() -> argparse.ArgumentParser:
         help="folder of an operator's certificate, with which the page reads the status (with --tls)",
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page")
+    options.add_argument(
+        "--checkpoints",
+        type=Path,
+        metavar="RUN_DIR",
+        help="directory of the run, on this machine: its newest checkpoint estimates values for the camera, with torch",
+    )
     add_allow_module(options, "the run")
     add_tls(options)
     add_insecure(options)
@@ -187,9 +193,10 @@ def main() -> int:
         listener.close()
 
 
-def _camera(modules: list[str]) -> tuple[str, ...]:
+def _camera(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the command of the camera's process."""
-    return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(modules))
+    values = [] if arguments.checkpoints is None else ["--checkpoints", str(arguments.checkpoints)]
+    return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(arguments.allow_module), *values)
 
 
 def _announce(address: str) -> None:
@@ -214,7 +221,7 @@ async def _serve(
         origins=arguments.allow_origin,
         operator_token=chosen.operator_token,
         other_runs=chosen.other_runs,
-        camera=None if arguments.no_camera else _camera(arguments.allow_module),
+        camera=None if arguments.no_camera else _camera(arguments),
         announce=_announce if arguments.exit_with_parent else None,
     )
     await GatewayService(settings, stop).run(listener)

@@ -3,7 +3,7 @@
 import { byId, element, setText } from "./dom.js";
 import { number, percent, whole } from "./format.js";
 
-const FACTS = ["Policy version", "Step", "Reward", "Return so far"];
+const FACTS = ["Policy version", "Step", "Reward", "Return so far", "Value estimate"];
 
 export class Camera {
   #on = false;
@@ -56,8 +56,8 @@ export class Camera {
     this.#describe(facts);
   }
 
-  #describe({ version, step, reward, total, actions }) {
-    const texts = [whole(version), whole(step), number(reward), number(total)];
+  #describe({ version, step, reward, total, value, actions }) {
+    const texts = [whole(version), whole(step), number(reward), number(total), value === null ? "not known" : number(value)];
     FACTS.forEach((name, index) => setText(this.#facts.get(name), texts[index]));
     this.#actions.replaceChildren(...actions.flatMap(described));
   }
