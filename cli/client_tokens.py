@@ -1,8 +1,9 @@
-"""The tokens of a gateway's clients, in the folder of `daedalus certs`.
+"""The tokens of a gateway's clients, and of operators, in the folder of `daedalus certs`.
 
 ca/tokens.json         what is kept of each token: its digest and when it expires
 gateway/tokens.json    a copy for the gateway, which reads it again when it changes
 client-NAME/           token and ca.pem, for the client
+operator-NAME/         token, beside the operator's certificate
 """
 
 import json
@@ -11,7 +12,7 @@ import shutil
 import time
 from pathlib import Path
 
-from daedalus.gateway.tokens import TOKENS, digest, new_token
+from daedalus.gateway.tokens import OPERATOR, TOKENS, digest, new_token
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CA, CredentialsError
 
@@ -29,7 +30,8 @@ class ClientTokens:
     def days_left(self) -> dict[str, float]:
         """Return the days until each client's token expires, by name."""
         now = time.time()
-        return {name: (entry["expires"] - now) / _DAY for name, entry in self._read().items()}
+        clients = {name: entry for name, entry in self._read().items() if not name.startswith(OPERATOR)}
+        return {name: (entry["expires"] - now) / _DAY for name, entry in clients.items()}
 
     def issue(self, names: list[str], days: int) -> None:
         """Issue tokens, new or in place of those before. Raises ValueError or CredentialsError for a wrong name."""
@@ -37,13 +39,30 @@ class ClientTokens:
             keys.check_name(name, "client name")
             if "." in name:
                 raise CredentialsError(f"{name!r} has a '.': a token for NAME is valid for NAME.ANYTHING too")
-        known = self._read()
         for name in names:
-            token, folder = new_token(), self.directory / f"client-{name}"
-            known[name] = {"sha256": digest(token), "expires": time.time() + days * _DAY}
+            folder = self.directory / f"client-{name}"
             folder.mkdir(exist_ok=True)
             shutil.copyfile(self.directory / "ca" / CA, folder / CA)
-            _replace(folder / "token", token + "\n")
+        self._issue({name: f"client-{name}" for name in names}, days)
+
+    def issue_operators(self, folders: dict[str, str], days: int) -> None:
+        """Issue tokens of operators, into the folders of their certificates, by name."""
+        self._issue({OPERATOR + name: folder for name, folder in folders.items()}, days)
+
+    def revoke_operators(self, names: list[str]) -> None:
+        """Withdraw the tokens of operators whose certificates are revoked."""
+        known = self._read()
+        for name in names:
+            known.pop(OPERATOR + name, None)
+        self._write(known)
+
+    def _issue(self, folders: dict[str, str], days: int) -> None:
+        """Write new tokens into folders, by the name that is kept."""
+        known = self._read()
+        for name, folder in folders.items():
+            token = new_token()
+            known[name] = {"sha256": digest(token), "expires": time.time() + days * _DAY}
+            _replace(self.directory / folder / "token", token + "\n")
         self._write(known)
 
     def revoke(self, names: list[str]) -> None:

@@ -13,9 +13,18 @@ from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.confirmation import confirmation, confirmation_arguments
+from daedalus.cli.processes import ORDERED
 from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.select_best import EvaluationFailedError, play, select_best
-from daedalus.cli.supervisor import FailedError, Supervised, start, stop, supervised_actor
+from daedalus.cli.supervisor import (
+    GATEWAY,
+    FailedError,
+    Supervised,
+    start,
+    stop,
+    supervised_actor,
+    supervised_gateway,
+)
 from daedalus.learner.run import run_directory
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spaces import Spaces
@@ -26,6 +35,7 @@ _logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
 _EVALUATOR = "evaluator"
+_HELPERS = {_EVALUATOR, GATEWAY}  # processes without which a run goes on
 _FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
 _SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
 
@@ -62,6 +72,8 @@ class LocalRun:
     insecure: bool = False
     log_level: str = "info"  # of the learner and the evaluation; actors log warnings, or everything at "debug"
     log_json: bool = False
+    watch: bool = False  # start a gateway with the page of the run
+    camera: bool = True  # with a camera
     observer: RunObserver = field(default_factory=RunObserver)
 
 
@@ -88,9 +100,10 @@ def run_locally(
 
     Raises RunFailedError or RunStoppedError.
     """
+    page: list[Supervised] = []
     try:
-        status = _train(run, stopping, output, learner_streams) if run.trained is None else run.trained
-        if stopping.is_set():
+        status = _train(run, stopping, output, learner_streams, page) if run.trained is None else run.trained
+        if stopping.is_set() or status == ORDERED:
             raise RunStoppedError
         if status not in _FINISHED:
             raise RunFailedError(status=status)
@@ -100,20 +113,36 @@ def run_locally(
             raise RunStoppedError from None
         unshown = output.unshown(error.name) if isinstance(error, FailedError) else []
         raise RunFailedError("\n".join([*unshown, str(error)])) from None
+    finally:
+        stop([gateway.process for gateway in page])  # until now it has shown the result
 
 
-def _train(run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams) -> int:
-    """Run the learner and the actors; return the learner's exit status. Raises FailedError."""
+def _train(
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams,
+    page: list[Supervised],
+) -> int:
+    """Run the learner and the actors; return the learner's exit status. Raises FailedError.
+
+    Adds the gateway to `page`, which the caller stops.
+    """
     run.observer.begin()
     try:
         with private_address() as address:
-            return _train_at(address, run, stopping, output, learner_streams)
+            return _train_at(address, run, stopping, output, learner_streams, page)
     finally:
         run.observer.end()
 
 
 def _train_at(
-    address: str, run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams
+    address: str,
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams,
+    page: list[Supervised],
 ) -> int:
     """Run the learner, and connect this machine's actors to it at an address."""
     spec, options = run.spec, _actor_options(run)
@@ -136,7 +165,9 @@ def _train_at(
         )
         if spec.evaluation.seconds is not None:
             actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
-        return watch(learner, actors, spec, stopping, run.observer)
+        if run.watch:
+            page.append(supervised_gateway(address, _gateway_options(run), output.pipes))
+        return watch(learner, [*actors, *page], spec, stopping, run.observer)
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
 
@@ -150,6 +181,15 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     # The learner reports the progress of all actors: the records of each one are for debugging.
     level = "debug" if run.log_level == "debug" else "warning"
     return *_logging_options(level, run.log_json), *allow_settings(run.spec.actor_modules)
+
+
+def _gateway_options(run: LocalRun) -> tuple[str, ...]:
+    """Return the options of the gateway with the page."""
+    level = "debug" if run.log_level == "debug" else "warning"  # it prints its address at any level
+    filming = [*allow_settings(run.spec.user_modules), "--checkpoints", str(run.directory)]
+    camera = filming if run.camera else ["--no-camera"]
+    token = ("--operator-token", str(run.directory / run_directory.OPERATOR_TOKEN))
+    return *_logging_options(level, run.log_json), *token, *camera
 
 
 def _listening(run: LocalRun, own: str) -> list[str]:
@@ -179,7 +219,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
-    return Supervised("the learner", begin, ended=_FINISHED)
+    return Supervised("the learner", begin, ended=_FINISHED | {ORDERED})
 
 
 def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
@@ -217,11 +257,11 @@ def watch(
             except FailedError as error:
                 actors.remove(actor)
                 stop([actor.process])
-                playing = sum(other.name != _EVALUATOR for other in actors)
+                playing = sum(other.name not in _HELPERS for other in actors)
                 needed = (
                     not playing or spec.algorithm.synchronous
                 )  # a synchronous algorithm waits for all actors at its start
-                if needed and actor.name != _EVALUATOR:
+                if needed and actor.name not in _HELPERS:
                     raise
                 _warn(f"{error}; training continues without this process")
     return 1

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from daedalus.cli.child_output import OpenStreams, Streams, inherited
 from daedalus.cli.processes import STOPPED
 
+GATEWAY = "gateway"  # name of its process
+
 _MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
 _SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
 _MOST_RESTARTS = 1000  # of one process that is killed by signals
@@ -126,12 +128,30 @@ def supervised_actor(
         arguments = ["--connect", connect, "--name", name, *options]
         with open_streams(name) as streams:
             process = start("daedalus.cli.commands.actor", *arguments, streams=streams, one_thread=True)
-        with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
-            niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
-            os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
+        _yield_to_learner(process)
         return process
 
     return Supervised(name, begin, ended={0})
+
+
+def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:
+    """Start the gateway of a run under supervision, at an address of this machine, for whoever watches the run."""
+
+    def begin(_first: bool) -> subprocess.Popen[bytes]:
+        arguments = ["--connect", connect, "--or-any-port", *options]
+        with open_streams(GATEWAY) as streams:
+            process = start("daedalus.cli.commands.gateway", *arguments, streams=streams, one_thread=True)
+        _yield_to_learner(process)
+        return process
+
+    return Supervised(GATEWAY, begin, ended={0})
+
+
+def _yield_to_learner(process: subprocess.Popen[bytes]) -> None:
+    """Let the learner run first."""
+    with suppress(AttributeError, OSError):  # not on every system; and the process may have ended
+        niceness = os.getpriority(os.PRIO_PROCESS, 0) + _ACTORS_NICENESS
+        os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
 
 
 def stop(processes: list[subprocess.Popen[bytes]], grace_seconds: float = _GRACE_SECONDS) -> None:

@@ -1,5 +1,6 @@
 """The gateway's addresses, as an ASGI application."""
 
+import asyncio
 import importlib.resources
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -9,16 +10,22 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
+from daedalus.gateway.assets import Asset, read_assets
 from daedalus.gateway.connection import ClientConnection
 from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import HEADERS, Guard
+from daedalus.gateway.watching.page_data import PageData
+from daedalus.gateway.watching.viewer import ViewerConnection
 
 Application = Callable[[Any, Any, Any], Awaitable[None]]
 
 
-def application(gateway: Gateway, raw: RawEndpoint, guard: Guard) -> Application:
-    """Return the application: every request passes the guard first."""
+def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Guard, data: PageData) -> Application:
+    """Return the application: every request passes the guard first.
+
+    `gateway` has its result when the network is reached; clients wait for it.
+    """
 
     class Actor:
         """The WebSocket of one client."""
@@ -32,12 +39,39 @@ def application(gateway: Gateway, raw: RawEndpoint, guard: Guard) -> Application
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             await raw.serve(scope, receive, send)
 
+    class Watch:
+        """The WebSocket of one page."""
+
+        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+            await ViewerConnection(data, guard, receive, send).serve()
+
+    assets = read_assets()
+
+    async def asset(request: Request) -> Response:
+        return _response(assets.get(request.path_params["name"]))
+
+    async def run_page(request: Request) -> Response:
+        return _response(assets["index.html"])
+
+    async def play_page(request: Request) -> Response:
+        return _response(assets["play.html"])
+
     routes: list[BaseRoute] = [
         WebSocketRoute("/actor", Actor()),
         WebSocketRoute("/raw", Raw()),
+        WebSocketRoute("/watch", Watch()),
+        Route("/", run_page),
+        Route("/play", play_page),
+        Route("/page/{name}", asset),
         Route("/protocol.json", _protocol),
     ]
     return _Guarded(Starlette(routes=routes), guard)
+
+
+def _response(asset: Asset | None) -> Response:
+    if asset is None:
+        return PlainTextResponse("there is no such page\n", 404)
+    return Response(asset.content, media_type=asset.media_type)
 
 
 async def _protocol(request: Request) -> Response:

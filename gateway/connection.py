@@ -9,7 +9,7 @@ from typing import Any
 from daedalus.gateway import messages
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.gateway import Gateway
+from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.messages import TRANSITIONS, Act, EndEpisode, Hello, Reward, State
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import Guard
@@ -25,8 +25,9 @@ _OK, _FAULT, _TRY_LATER = 1000, 1008, 1013  # codes of RFC 6455
 class ClientConnection:
     """The conversation with one client."""
 
-    def __init__(self, gateway: Gateway, guard: Guard, scope: Any, receive: Any, send: Any) -> None:
-        self._gateway, self._guard, self._scope = gateway, guard, scope
+    def __init__(self, gateway: "asyncio.Future[Gateway]", guard: Guard, scope: Any, receive: Any, send: Any) -> None:
+        """`gateway` has its result when the network is reached."""
+        self._reached, self._guard, self._scope = gateway, guard, scope
         self._receive_event, self._send_event = receive, send
         self._state: State = "new"
         self._as_text = True
@@ -68,41 +69,49 @@ class ClientConnection:
         assert isinstance(hello, Hello)
         self._guard.check_token(hello.name, hello.token)
         address = self._address()
-        actor = await self._gateway.admit(hello, address, self.end)
+        gateway = await self._reach()
+        actor = await gateway.admit(hello, address, self.end)
         try:
             self._scope["extensions"]["daedalus.limit"](actor.spaces.max_message_bytes)
-            session = self._gateway.session
+            session = gateway.session
             if session is not None:
                 await self._send(messages.welcome(session.run, session.spec.environment.id, hello.name))
             _logger.info("client %s connected from %s", actor.name, address)
             self._state = "ready"
-            await self._serve_actor(actor)
+            await self._serve_actor(gateway, actor)
         finally:
-            self._gateway.leave(actor)
+            gateway.leave(actor)
             _logger.info("client %s disconnected", actor.name)
+
+    async def _reach(self) -> Gateway:
+        try:
+            async with asyncio.timeout(JOIN_SECONDS):
+                return await asyncio.shield(self._reached)
+        except TimeoutError:
+            raise ClientError("unavailable", f"no learner came within {JOIN_SECONDS:g} s: try again later") from None
 
     def _address(self) -> str:
         host, port = self._scope.get("client") or ("", 0)
         return f"ws/{host}:{port}"
 
-    async def _serve_actor(self, actor: ClientActor) -> None:
+    async def _serve_actor(self, gateway: Gateway, actor: ClientActor) -> None:
         faults = 0
         while (data := await self._receive()) is not None:
             actor.heard_at = time.monotonic()
             if pause := self._rate.take(actor.heard_at):
                 await asyncio.sleep(pause)
             try:
-                await self._answer(actor, messages.read(data, self._state))
+                await self._answer(gateway, actor, messages.read(data, self._state))
             except ClientError as error:
                 faults += 1
                 if faults == _MAX_FAULTS:
                     raise
                 await self._send(messages.error(error))
 
-    async def _answer(self, actor: ClientActor, message: messages.ClientMessage) -> None:
+    async def _answer(self, gateway: Gateway, actor: ClientActor, message: messages.ClientMessage) -> None:
         match message:
             case Act():
-                action = await self._gateway.act(actor, message)
+                action = await gateway.act(actor, message)
                 self._state = TRANSITIONS[self._state, "act"]
                 await self._send(messages.action(action))
             case Reward():

@@ -24,7 +24,7 @@ from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.learner_link import LearnerLink
+from daedalus.gateway.learner_link import LearnerLink, NewestPolicy
 from daedalus.gateway.messages import Act, Hello
 from daedalus.gateway.policy_version import PolicyVersion
 from daedalus.protocol import keys
@@ -35,7 +35,7 @@ _logger = logging.getLogger(__name__)
 
 MAX_CLIENTS = 1024
 _JOIN_THREADS = 16
-_JOIN_SECONDS = 60.0  # for a learner and its first policy to come
+JOIN_SECONDS = 60.0  # for a learner and its first policy to come
 _TICK_SECONDS = 0.05
 _RETRY_SECONDS = 0.2  # between requests to join
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier gateway is dead
@@ -102,6 +102,8 @@ class Gateway:
         self._next_policy: PolicyVersion | None = None  # that waits for an older one to be released
         self._versions: weakref.WeakSet[PolicyVersion] = weakref.WeakSet()
         self.last_run_end = ""  # how the last run ended, until another begins
+        self.followed_run = ""  # name of the run that is or was followed
+        self.on_run_change: Callable[[], None] = lambda: None  # called when a learner was found, or a run has ended
         self._seats: dict[str, _Seat] = {}  # by the name towards the learner
         self._admitting = 0
         self._parked: dict[str, tuple[float, ClientActor]] = {}  # by name, the oldest first
@@ -124,6 +126,15 @@ class Gateway:
         self._joins.shutdown(wait=False, cancel_futures=True)
         if self._thread.is_alive():
             await asyncio.to_thread(self._thread.join, 3.0)
+
+    @property
+    def newest_policy(self) -> NewestPolicy | None:
+        """The newest policy as messages; None before the first."""
+        return self._link.newest_policy
+
+    def fetch_policy(self) -> None:
+        """Ask the learner for a newer policy, although no client has heard of one."""
+        self._link.fetch()
 
     def _start(self, work: Any) -> None:
         task = self._loop.create_task(work)
@@ -159,12 +170,12 @@ class Gateway:
         actor = self._returning(name, spaces) or self._new_actor(name, spaces, address)
         seat = self._seats[name] = _Seat(actor, on_end)
         try:
-            async with asyncio.timeout(_JOIN_SECONDS):
+            async with asyncio.timeout(JOIN_SECONDS):
                 await self._enter(seat)
         except TimeoutError:
             self.leave(actor)
             missing = "learner" if self.session is None else "policy"
-            raise ClientError("unavailable", f"no {missing} came within {_JOIN_SECONDS:g} s: try again later") from None
+            raise ClientError("unavailable", f"no {missing} came within {JOIN_SECONDS:g} s: try again later") from None
         except BaseException:
             self.leave(actor)
             raise
@@ -328,7 +339,9 @@ class Gateway:
     def _on_learner(self, session: Welcome) -> None:
         other_run = self.session is not None and self.session.run != session.run
         self.session, self.last_run_end, self._newest_version = session, "", -1
+        self.followed_run = session.run
         self._announce()
+        self.on_run_change()
         for seat in list(self._seats.values()):
             if other_run and seat.presence is not None:
                 seat.presence.close()
@@ -339,6 +352,7 @@ class Gateway:
     def _on_run_over(self, reason: str) -> None:
         self.session = self._policy = self._next_policy = None
         self.last_run_end = reason
+        self.on_run_change()
         while self._parked:
             self._forget_parked()
         self._newest_version = -1

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from daedalus.actor.session.learner_presence import LearnerPresence
@@ -14,7 +15,7 @@ from daedalus.actor.session.state_lock import StateLock
 from daedalus.gateway.policy_version import PolicyVersion
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Join, Welcome
+from daedalus.protocol.messages import Join, Snapshot, Welcome
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
@@ -24,6 +25,15 @@ _FIRST_PUSH_SECONDS, _MISSED_PUSH_SECONDS = 0.1, 1.0  # without the program or t
 _SILENCE_SECONDS = 10.0  # without a message for so long, ask whether the learner is there
 _NEXT_RUN_SECONDS = 1.0  # after the end of a run, before the next is looked for
 _FETCH_SHARE = 4.0  # a fetch begins this many times its own duration after the last
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NewestPolicy:
+    """The newest policy as messages, for another process."""
+
+    session: Welcome
+    program: bytes
+    snapshot: Snapshot
 
 
 class LinkEvents(Protocol):
@@ -68,10 +78,16 @@ class LearnerLink:
         self._feed = SnapshotFeed(transport, self.queries, self._end, join.actor, self.presence.heard)
         self._watched: set[str] = set()
         self._look_again = False  # an actor was fenced: another learner may have begun
+        self._fetch_wanted = False
+        self.newest_policy: NewestPolicy | None = None
 
     def look_again(self) -> None:
         """Look for the learner: an actor was fenced. From any thread."""
         self._look_again = True
+
+    def fetch(self) -> None:
+        """Ask the learner for a newer snapshot, although no client has heard of one. From any thread."""
+        self._fetch_wanted = True
 
     def run(self) -> None:
         """Follow learners until `stop` is set. Raises ActorError, PolicyError or TransportError."""
@@ -100,7 +116,8 @@ class LearnerLink:
         self._feed.begin(session)
         self._feed.subscribe()
         self._events.on_learner(session)
-        policy = OnnxRuntime(self._await_program(session.run), self._stop)
+        program = self._await_program(session.run)
+        policy = OnnxRuntime(program, self._stop)
         self._await_snapshot()
         self._feed.use_fetches()
         loaded = -1
@@ -110,12 +127,15 @@ class LearnerLink:
                 runtime = policy.fork()
                 runtime.load(newest.weights)
                 loaded = newest.policy_version
+                self.newest_policy = NewestPolicy(session=session, program=program, snapshot=newest)
                 size = sum(array.nbytes for array in newest.weights.values())
                 self._events.on_policy(
                     PolicyVersion(session=session, version=loaded, runtime=runtime, size=max(size, 1))
                 )
             self._wait(_TICK_SECONDS)
-            if self.newest_version() > loaded and time.monotonic() > self._feed.fetched_at + self._pause():
+            due = self._fetch_wanted or self.newest_version() > loaded
+            if due and time.monotonic() > self._feed.fetched_at + self._pause():
+                self._fetch_wanted = False
                 self._feed.fetch()
             self._feed.read()
 

@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from daedalus.gateway.tokens import Tokens
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.tokens import OperatorToken, Tokens
 
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 HEADERS = {
@@ -23,7 +24,8 @@ class Guard:
 
     hosts: frozenset[str]  # in the Host header, with the port: another name may point here to reach this machine
     origins: frozenset[str]  # of pages that may connect, such as `http://127.0.0.1:8080`
-    tokens: Tokens | None  # None: on loopback nobody needs a token
+    tokens: Tokens | None  # None: on loopback clients and viewers need no token
+    operator: OperatorToken | None = None  # of a gateway without `tokens`
 
     def refusal(self, headers: Iterable[tuple[bytes, bytes]]) -> str:
         """Return why a request is refused, or an empty string.
@@ -43,8 +45,31 @@ class Guard:
         if self.tokens is not None:
             self.tokens.check(name, token)
 
+    def check_viewer(self, token: str) -> None:
+        """Raise ClientError if a page needs another token to read."""
+        if self.tokens is not None:
+            self.tokens.check_viewer(token)
 
-def guard(names: Iterable[str], port: int, allowed: Iterable[str], tokens: Tokens | None) -> Guard:
+    @property
+    def takes_orders(self) -> bool:
+        """Whether there is any token with which a page may give orders."""
+        return self.tokens is not None or self.operator is not None
+
+    def check_operator(self, token: str) -> None:
+        """Raise ClientError unless a page may give orders with this token."""
+        tokens = self.tokens or self.operator
+        if tokens is None:
+            raise ClientError("refused", "this gateway takes no orders: start it with --operator-token FILE")
+        tokens.check_operator(token)
+
+
+def guard(
+    names: Iterable[str],
+    port: int,
+    allowed: Iterable[str],
+    tokens: Tokens | None,
+    operator: OperatorToken | None = None,
+) -> Guard:
     """Return the rules of a gateway.
 
     Args:
@@ -52,10 +77,11 @@ def guard(names: Iterable[str], port: int, allowed: Iterable[str], tokens: Token
       port: where it listens.
       allowed: further origins.
       tokens: of the clients; with them the gateway uses TLS.
+      operator: the token for orders of a gateway without `tokens`.
     """
     scheme, default = ("https", 443) if tokens is not None else ("http", 80)
     hosts = {f"{name.lower()}:{port}" for name in names}
     if port == default:
         hosts |= {name.lower() for name in names}
     origins = {f"{scheme}://{host}" for host in hosts} | {origin.lower().rstrip("/") for origin in allowed}
-    return Guard(hosts=frozenset(hosts), origins=frozenset(origins), tokens=tokens)
+    return Guard(hosts=frozenset(hosts), origins=frozenset(origins), tokens=tokens, operator=operator)

@@ -1,8 +1,12 @@
-"""The tokens of clients: which are valid, by the file that `daedalus certs` writes. Reads that file when it changes."""
+"""The tokens of clients and operators: which are valid, by the file that `daedalus certs` writes.
+
+The file is read again when it changes.
+"""
 
 import hashlib
 import hmac
 import json
+import os
 import re
 import secrets
 import time
@@ -11,8 +15,11 @@ from typing import Any
 
 from daedalus.gateway.errors import ClientError
 
-TOKENS = "tokens.json"  # in the folder of a gateway: {NAME: {"sha256": HEX, "expires": SECONDS_SINCE_1970}}
+# In the folder of a gateway: {NAME: {"sha256": HEX, "expires": SECONDS_SINCE_1970}}; of an operator OPERATOR + NAME.
+TOKENS = "tokens.json"
+OPERATOR = "operator:"  # no name of a client has a colon
 _MAX_FILE_BYTES = 16 << 20
+_MIN_TOKEN, _MAX_TOKEN = 16, 256  # characters
 
 
 def new_token() -> str:
@@ -36,19 +43,39 @@ class Tokens:
         self._read_if_changed()
 
     def check(self, name: str, token: str) -> None:
-        """Raise ClientError unless the token is that of this name, or of the name before its first dot."""
-        try:
-            self._read_if_changed()
-        except (OSError, ValueError):
-            raise ClientError("unavailable", "the gateway cannot read its tokens: tell its operator") from None
+        """Raise ClientError unless the token is that of this client, or of the name before its first dot."""
+        self._read()
         known, expires = self._tokens.get(name) or self._tokens.get(name.partition(".")[0]) or ("", 0.0)
         if not hmac.compare_digest(known, digest(token)):
             raise ClientError(
                 "refused",
                 "the token is not one of this name: the operator issues one with `daedalus certs issue client NAME`",
             )
-        if time.time() > expires:
-            raise ClientError("refused", "the token has expired: the operator renews it with `daedalus certs renew`")
+        _check_expiry(expires)
+
+    def check_viewer(self, token: str) -> None:
+        """Raise ClientError unless the token is that of any client or operator."""
+        self._read()
+        self._check_among(self._tokens, token, "the page needs a token: of a client, or of an operator")
+
+    def check_operator(self, token: str) -> None:
+        """Raise ClientError unless the token is that of an operator."""
+        self._read()
+        operators = {name: entry for name, entry in self._tokens.items() if name.startswith(OPERATOR)}
+        self._check_among(operators, token, "this needs an operator's token (daedalus certs issue operator NAME)")
+
+    def _check_among(self, tokens: dict[str, tuple[str, float]], token: str, refusal: str) -> None:
+        given = digest(token)
+        found = [expires for known, expires in tokens.values() if hmac.compare_digest(known, given)]
+        if not found:
+            raise ClientError("refused", refusal)
+        _check_expiry(max(found))
+
+    def _read(self) -> None:
+        try:
+            self._read_if_changed()
+        except (OSError, ValueError):
+            raise ClientError("unavailable", "the gateway cannot read its tokens: tell its operator") from None
 
     def _read_if_changed(self) -> None:
         state = self._path.stat()
@@ -59,6 +86,11 @@ class Tokens:
             raise ValueError(f"{self._path} is too large")
         self._tokens = _parsed(json.loads(self._path.read_text("utf-8")))
         self._read_at = stamp
+
+
+def _check_expiry(expires: float) -> None:
+    if time.time() > expires:
+        raise ClientError("refused", "the token has expired: the operator renews it with `daedalus certs renew`")
 
 
 def _parsed(content: Any) -> dict[str, tuple[str, float]]:
@@ -72,3 +104,25 @@ def _parsed(content: Any) -> dict[str, tuple[str, float]]:
             case _:
                 raise ValueError(f"the token of {name!a} is damaged")
     return tokens
+
+
+class OperatorToken:
+    """The operator's token of a gateway without certificates, in a file that only its owner may read."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file; write a new token first if there is no file. Raises OSError or ValueError."""
+        try:
+            with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+                file.write(new_token() + "\n")
+        except FileExistsError:
+            pass
+        with open(path, encoding="ascii") as file:
+            token = file.read(_MAX_TOKEN + 1).strip()
+        if not _MIN_TOKEN <= len(token) <= _MAX_TOKEN:
+            raise ValueError(f"{path} has no token of {_MIN_TOKEN} to {_MAX_TOKEN} characters: delete the file")
+        self._digest = digest(token)
+
+    def check_operator(self, token: str) -> None:
+        """Raise ClientError unless this is the token."""
+        if not hmac.compare_digest(self._digest, digest(token)):
+            raise ClientError("refused", "this is not the operator's token: it is in the file of --operator-token")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.report import Health
@@ -22,10 +23,11 @@ from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.rollout_length import check_rollout_length
-from daedalus.learner.run.run_directory import SUMMARY, write_json
+from daedalus.learner.run.run_directory import METRICS, SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.serving.orders import Orders
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -54,6 +56,7 @@ class Outcome:
     finished: bool  # solved or out of budget; False if the run was stopped before
     saved: bool  # whether the last checkpoint was saved, or there was nothing to save
     seconds_to_target: float | None  # seconds until the target return was reached; None if it was not
+    ordered: bool = False  # whether an operator stopped the run
 
 
 class LearnerService:
@@ -107,6 +110,7 @@ class LearnerService:
         self._health = Health(
             started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
         )
+        self._orders = Orders(stop)
         self._server = ActorServer(
             directory.name,
             spec,
@@ -116,6 +120,7 @@ class LearnerService:
             learner_epoch=epoch,
             start_version=restored.policy.policy_version if restored else 0,
             spaces=restored.policy.spaces if restored else spaces,
+            orders=self._orders,
         )
         self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
@@ -142,11 +147,12 @@ class LearnerService:
         """
         try:
             self._server.open()
+            self._load_history()
             from daedalus.learner.training.learner import Learner
 
             fleet = self._server.fleet
             if fleet.spaces is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
-                return _stopped_without_actors()
+                return self._stopped_without_actors()
             spaces = fleet.spaces
             assert spaces is not None
             check_rollout_length(self._spec, spaces)
@@ -165,11 +171,27 @@ class LearnerService:
             if self._initial is not None:
                 checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
             if self._restored is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
-                return _stopped_without_actors()
+                return self._stopped_without_actors()
             return self._learn(learner, checkpointer)
         finally:
             self._server.close(_STOPPED)  # unless it is closed
             self._heartbeat.clear()
+
+    def _stopped_without_actors(self) -> Outcome:
+        _logger.info("stopped before the first actor joined")
+        ordered = self._orders.stopped
+        return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None, ordered=ordered)
+
+    def _load_history(self) -> None:
+        """Continue the metrics of the processes before, as far as the checkpoint."""
+        if self._restored is None:
+            return
+        try:
+            for row in read_rows(self._directory / METRICS):
+                if row["env_steps"] <= self._counters.env_steps:
+                    self._server.history.add(row)
+        except (OSError, ValueError) as error:
+            _logger.warning("the metrics before the checkpoint cannot be read: %s", error)
 
     def _checkpointer(self, learner: "Learner") -> "Checkpointer":
         """Publish the policy and return its checkpointer."""
@@ -203,7 +225,7 @@ class LearnerService:
         finally:
             ended = time.monotonic()
             self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
-            recorder.record(self._reporter.row(learner, ended, last=True), self._reporter.details(learner))
+            self._record(recorder, learner, ended, last=True)
             recorder.close()
             saved = checkpointer.save()
         solved = seconds_to_target is not None
@@ -215,7 +237,13 @@ class LearnerService:
             _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
         else:
             _logger.error("stopped; the checkpoint at %s could not be saved: %s", env_steps, self._health.save_fault)
-        return Outcome(solved=solved, finished=finished, saved=saved is not None, seconds_to_target=seconds_to_target)
+        return Outcome(
+            solved=solved,
+            finished=finished,
+            saved=saved is not None,
+            seconds_to_target=seconds_to_target,
+            ordered=self._orders.stopped,
+        )
 
     def _is_finished(self, seconds_to_target: float | None) -> bool:
         """Return whether the run is over, rather than stopped."""
@@ -239,14 +267,19 @@ class LearnerService:
                 break
             self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             if now >= log_at:
-                recorder.record(self._reporter.row(learner, now), self._reporter.details(learner))
+                self._record(recorder, learner, now)
                 log_at = now + service.log_seconds
                 if hint := self._reporter.hint():
                     _logger.warning("%s", hint)
-            if now >= save_at:
+            if now >= save_at or self._orders.take_checkpoint():
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds
         return seconds_to_target
+
+    def _record(self, recorder: Recorder, learner: "Learner", now: float, *, last: bool = False) -> None:
+        row = self._reporter.row(learner, now, last=last)
+        self._server.history.add(row)
+        recorder.record(row, self._reporter.details(learner))
 
     def _is_solved(self) -> bool:
         """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""
@@ -298,11 +331,6 @@ class LearnerService:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:
             _logger.warning("summary not written: %s", error.strerror)
-
-
-def _stopped_without_actors() -> Outcome:
-    _logger.info("stopped before the first actor joined")
-    return Outcome(solved=False, finished=False, saved=True, seconds_to_target=None)
 
 
 def _resumed_annealing(restored: "Checkpoint", spec: RunSpec) -> Annealing:

@@ -63,6 +63,11 @@ def drain(run: str, actor: str) -> str:
     return f"daedalus/{run}/drain/{actor}"
 
 
+def orders(run: str) -> str:
+    """Return the key of an operator's orders to the learner."""
+    return f"daedalus/{run}/orders"
+
+
 def presence(run: str, actor: str, incarnation: int | str) -> str:
     """Return the liveliness token of one incarnation of an actor (`*` for all)."""
     return f"daedalus/{run}/actors/{actor}/{incarnation}"

@@ -43,3 +43,4 @@ LEARNER_LIMITS = Limits(max_bytes=1 << 30)  # any message of the learner: weight
 
 # Read by operators.
 STATUS_LIMITS = Limits(max_bytes=0, max_arrays=0)  # one page of actors
+METRICS_LIMITS = Limits(max_bytes=1 << 20, max_arrays=2)  # one page of rows

@@ -14,6 +14,8 @@ import numpy as np
 
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.keys import check_name
+from daedalus.protocol.metrics import MetricsReport, MetricsRequest
+from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
@@ -450,4 +452,7 @@ Message = (
     | EventsRequest
     | EventsReport
     | ClientReport
+    | MetricsRequest
+    | MetricsReport
+    | OrderRequest
 )

@@ -18,7 +18,8 @@ from daedalus.gateway.gateway import Gateway, GatewayConfig
 from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
-from daedalus.gateway.tokens import Tokens
+from daedalus.gateway.tokens import OperatorToken, Tokens
+from daedalus.gateway.watching.page_data import PageData
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 CARTPOLE = {
@@ -30,15 +31,23 @@ CARTPOLE = {
 class RunningGateway:
     """A gateway with its web server, on a thread of its own."""
 
-    def __init__(self, network: MemoryNetwork, certificates: Path | None = None, *, follows: bool = True) -> None:
+    def __init__(
+        self,
+        network: MemoryNetwork,
+        certificates: Path | None = None,
+        *,
+        follows: bool = True,
+        operator: OperatorToken | None = None,
+    ) -> None:
         """Start a gateway.
 
         Args:
           network: the network that it connects to.
           certificates: folder of a gateway; None: plain WebSockets on loopback.
+          operator: token for orders.
           follows: whether it follows a run; otherwise it serves raw clients only.
         """
-        self._follows = follows
+        self._follows, self._operator = follows, operator
         self._open_transport = lambda: MemoryTransport(network)
         self._transport = self._open_transport()
         self._tokens = None if certificates is None else Tokens(certificates)
@@ -58,15 +67,18 @@ class RunningGateway:
         gateway = Gateway(self._transport, self._config, self._fail)
         if self._follows:
             gateway.open()
+        self.data = PageData()
         ready.set_result(gateway)
-        rules = guard(LOOPBACK, self.port, [], self._tokens)
+        rules = guard(LOOPBACK, self.port, [], self._tokens, self._operator)
         raw = RawEndpoint(self._open_transport, rules, self._config.actor_name)
 
         async def close() -> None:
             await raw.close()
             await gateway.close()
 
-        await Server(application(gateway, raw, rules), self._tls).run_until(self._stop, self.listener, close)
+        reached: asyncio.Future[Gateway] = self.loop.create_future()
+        reached.set_result(gateway)
+        await Server(application(reached, raw, rules, self.data), self._tls).run_until(self._stop, self.listener, close)
 
     def _fail(self, error: Exception) -> None:
         self.failure = error

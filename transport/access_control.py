@@ -117,9 +117,9 @@ def _own_rules(actor: str) -> list[dict[str, Any]]:
 
 
 def _operators_rules() -> list[dict[str, Any]]:
-    """Return the rules of operators: query the status, drain actors, and watch the presence of actors and learner."""
+    """Return the rules of operators: query the status, drain actors, give orders, and watch the presence."""
     present = [keys.presence(_RUN, "*", "*"), keys.learner(_RUN)]
-    queried = [keys.status(_RUN), keys.drain(_RUN, "*")]
+    queried = [keys.status(_RUN), keys.drain(_RUN, "*"), keys.orders(_RUN)]
     return [
         _rule(
             "operators query",

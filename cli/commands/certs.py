@@ -35,10 +35,11 @@ examples:
   daedalus certs issue client phone-1     (a token for a client of the gateway)
 
 The certificate of an actor allows it to play under its name NAME or NAME.ANYTHING. The certificate of an operator
-allows `daedalus status` and `daedalus exporter`. Learners and routers notice within seconds that a file in their folder
-has changed: after `issue` and `revoke`, copy {CLIENTS} to their folders if they run elsewhere. Nothing has to be
-restarted. A renewed certificate is used from the next connection on. A client of a gateway has a token in place of a
-certificate, valid for its name NAME and for NAME.ANYTHING; copy gateway/tokens.json if the gateway runs elsewhere.
+allows `daedalus status` and `daedalus exporter`; the token beside it is for the buttons on the page of a gateway.
+Learners and routers notice within seconds that a file in their folder has changed: after `issue` and `revoke`, copy
+{CLIENTS} to their folders if they run elsewhere. Nothing has to be restarted. A renewed certificate is used from the
+next connection on. A client of a gateway has a token in place of a certificate, valid for its name NAME and for
+NAME.ANYTHING; copy gateway/tokens.json if the gateway runs elsewhere.
 
 exit status: 0 done, 1 failed, 2 bad usage"""
 
@@ -123,6 +124,7 @@ def _init(parsed: argparse.Namespace) -> list[str]:
 
     directory = parsed.directory
     folder = CertificateFolder.create(directory, parsed.host, _lifetime(parsed))
+    _issue_operators(folder, [Identity("operator", "operator")], parsed.days)
     return [
         f"{directory}/ca          the keys of the CA: keep them secret",
         f"{directory}/learner     for the option --tls of daedalus learner",
@@ -138,8 +140,17 @@ def _issue(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
         return _issue_tokens(folder, [identity.name for identity in _named(parsed)], parsed.days)
     identities = _named(parsed)
     folder.issue(identities, _lifetime(parsed), parsed.host)
-    ClientTokens(folder.directory).copy_to_gateway()
+    _issue_operators(folder, identities, parsed.days)
     return _issued(folder, identities)
+
+
+def _issue_operators(folder: "CertificateFolder", identities: "list[Identity]", days: int) -> None:
+    """Issue the tokens of the operators among the identities, for the page of a gateway."""
+    tokens = ClientTokens(folder.directory)
+    operators = {identity.name: identity.folder for identity in identities if identity.role == "operator"}
+    if operators:
+        tokens.issue_operators(operators, days)
+    tokens.copy_to_gateway()
 
 
 def _issue_tokens(folder: "CertificateFolder", names: list[str], days: int) -> list[str]:
@@ -168,6 +179,7 @@ def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
         if unknown:
             raise CredentialsError(f"no certificate was issued for {', '.join(unknown)}: see `daedalus certs list`")
     folder.issue(identities, _lifetime(parsed))
+    _issue_operators(folder, identities, parsed.days)
     return _issued(folder, identities)
 
 
@@ -176,6 +188,8 @@ def _revoke(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str
         ClientTokens(folder.directory).revoke(parsed.names)
         return [f"a gateway on another host: copy {folder.directory}/gateway/tokens.json to its folder"]
     folder.revoke(_named(parsed))
+    if parsed.role == "operator":
+        ClientTokens(folder.directory).revoke_operators(parsed.names)
     return [_copy_clients(folder)]
 
 

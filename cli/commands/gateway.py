@@ -1,21 +1,24 @@
-"""`daedalus gateway`: actors in any language, over WebSockets.
+"""`daedalus gateway`: actors in any language, over WebSockets, and the page of a run.
 
 Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
 """
 
 import argparse
 import asyncio
-import logging
+import errno
 import os
 import re
 import socket
 import sys
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.cli.arguments import add_connect, add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
+from daedalus.cli.gateway_packages import INSTALL
 from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
     exit_status,
@@ -23,25 +26,22 @@ from daedalus.cli.processes import (
     raise_descriptor_limit,
     stop_on_signals,
 )
+from daedalus.gateway.tokens import OperatorToken
 from daedalus.policy.acting.runtime import PolicyError
+from daedalus.policy.user_modules import allow_words
 from daedalus.protocol import keys
 from daedalus.transport.addresses import AddressError, check_listening
-from daedalus.transport.connecting import connect, connect_with_retry
 from daedalus.transport.credentials import Credentials, load
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
-_logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
-
 LISTEN = "127.0.0.1:8080"
-INSTALL = 'the gateway needs starlette, uvicorn and websockets: pip install "daedalus-rl[gateway]"'
-_HEARTBEAT_SECONDS = 0.2
 
 DESCRIPTION = """\
 Lets programs in any language be actors, over a WebSocket: they send observations and rewards, and the gateway runs the
 policy, collects the rollouts and sends them to the learner. Programs that run the policy themselves exchange the
 messages of docs/wire.md with it. On loopback everybody may connect; any other address needs --serve-tls, and each
-client a token."""
+client a token. Its page shows the run live in a browser."""
 
 EXAMPLES = """\
 examples:
@@ -49,7 +49,8 @@ examples:
   daedalus certs issue gateway --host play.example
   daedalus certs issue client phone-1
   daedalus gateway --connect tcp/127.0.0.1:7447 --listen 0.0.0.0:8443 --serve-tls certs/gateway
-  daedalus gateway --connect tls/gpu-box:7447 --tls certs/actor-gateway
+  daedalus gateway --connect tls/gpu-box:7447 --tls certs/actor-gateway --operator certs/operator
+  daedalus gateway --connect tcp/127.0.0.1:7447 --compare runs/cartpole-a2c-s1 runs/cartpole-appo-s1
 
 exit status: 0 stopped by a signal, 1 failed, 2 bad usage"""
 
@@ -85,10 +86,41 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--run", default=keys.ANY_RUN, metavar="NAME", help="run to follow, if several runs share a network"
     )
+    options.add_argument(
+        "--compare",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=Path,
+        metavar="RUN_DIR",
+        help="run directories whose curves the page shows beside those of the run",
+    )
+    options.add_argument(
+        "--operator-token",
+        type=Path,
+        metavar="FILE",
+        help="file with the token that the page's buttons need; it is written if it is missing. Without it the page is "
+        "read-only. With --serve-tls, operators have the tokens of `daedalus certs`",
+    )
+    options.add_argument(
+        "--operator",
+        type=Path,
+        metavar="DIR",
+        help="folder of an operator's certificate, with which the page reads the status (with --tls)",
+    )
+    options.add_argument("--no-camera", action="store_true", help="play no episodes for the page")
+    options.add_argument(
+        "--checkpoints",
+        type=Path,
+        metavar="RUN_DIR",
+        help="directory of the run, on this machine: its newest checkpoint estimates values for the camera, with torch",
+    )
+    add_allow_module(options, "the run")
     add_tls(options)
     add_insecure(options)
     add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    options.add_argument("--or-any-port", action="store_true", help=argparse.SUPPRESS)
     return options
 
 
@@ -98,6 +130,33 @@ def _origin(text: str) -> str:
     return text
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chosen:
+    """What the files that the command line names contain."""
+
+    credentials: Credentials | None
+    operator: Credentials | None
+    serving: Credentials | None
+    operator_token: OperatorToken | None
+    other_runs: OtherRuns
+
+    @classmethod
+    def of(cls, arguments: argparse.Namespace) -> "_Chosen":
+        """Read the files. Raises SECURITY_ERRORS, OSError or ValueError."""
+        if arguments.operator is not None and arguments.tls is None:
+            raise ValueError("--operator is for networks with certificates: use --tls too, or leave it out")
+        if arguments.operator_token is not None and arguments.serve_tls is not None:
+            raise ValueError("--operator-token is for gateways without --serve-tls: operators have tokens of their own")
+        token = None if arguments.operator_token is None else OperatorToken(arguments.operator_token)
+        return cls(
+            credentials=credentials_to_connect(arguments.connect, arguments.tls, "actor"),
+            operator=None if arguments.operator is None else load(arguments.operator, "operator"),
+            serving=None if arguments.serve_tls is None else load(arguments.serve_tls, "gateway"),
+            operator_token=token,
+            other_runs=OtherRuns(arguments.compare),
+        )
+
+
 def main() -> int:
     """Run `daedalus gateway` and return its exit status."""
     arguments = parser().parse_args()
@@ -105,10 +164,9 @@ def main() -> int:
     try:
         if arguments.run != keys.ANY_RUN:
             keys.check_name(arguments.run, "run")
-        credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
-        serving = None if arguments.serve_tls is None else load(arguments.serve_tls, "gateway")
-        host, port = _listening_address(arguments.listen, serving is not None, arguments.insecure)
-    except (ValueError, *SECURITY_ERRORS) as error:
+        chosen = _Chosen.of(arguments)
+        host, port = _listening_address(arguments.listen, chosen.serving is not None, arguments.insecure)
+    except (ValueError, OSError, *SECURITY_ERRORS) as error:
         print(f"daedalus gateway: {error}", file=sys.stderr)
         return 2
     raise_descriptor_limit()
@@ -116,18 +174,15 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop)
     try:
-        listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        listener = _listen(host, port, arguments.or_any_port)
     except OSError as error:
         print(
             f"daedalus gateway: cannot listen on {arguments.listen}: {os.strerror(error.errno or 0)}", file=sys.stderr
         )
         return 1
-    transport: Transport | None = None
     try:
-        transport = connect_with_retry(arguments.connect, stop, None, credentials)
-        if transport is None:
-            return 0
-        return asyncio.run(_serve(arguments, transport, listener, credentials, serving, stop))
+        asyncio.run(_serve(arguments, chosen, listener, stop))
+        return 0
     except (ActorError, PolicyError, TransportError, OSError, ValueError) as error:
         print(f"daedalus gateway: {error}", file=sys.stderr)
         return 1
@@ -136,8 +191,51 @@ def main() -> int:
         return 1
     finally:
         listener.close()
-        if transport is not None:
-            transport.close()
+
+
+def _camera(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the command of the camera's process."""
+    values = [] if arguments.checkpoints is None else ["--checkpoints", str(arguments.checkpoints)]
+    return (sys.executable, "-P", "-m", "daedalus.cli.commands.camera", *allow_words(arguments.allow_module), *values)
+
+
+def _announce(address: str) -> None:
+    """Print the address of the page, for the person who started the run."""
+    print(f"watch the run at {address}", flush=True)
+
+
+async def _serve(
+    arguments: argparse.Namespace, chosen: "_Chosen", listener: socket.socket, stop: threading.Event
+) -> None:
+    # Imported here, because its packages are an extra.
+    from daedalus.cli.gateway_service import GatewayService, GatewaySettings
+
+    settings = GatewaySettings(
+        connect=arguments.connect,
+        shown_host=arguments.listen.rpartition(":")[0],
+        run=arguments.run,
+        credentials=chosen.credentials,
+        operator=chosen.operator,
+        serving=chosen.serving,
+        hosts=arguments.host,
+        origins=arguments.allow_origin,
+        operator_token=chosen.operator_token,
+        other_runs=chosen.other_runs,
+        camera=None if arguments.no_camera else _camera(arguments),
+        announce=_announce if arguments.exit_with_parent else None,
+    )
+    await GatewayService(settings, stop).run(listener)
+
+
+def _listen(host: str, port: int, or_any: bool) -> socket.socket:
+    """Return a listening socket, at another port if the port is taken and any will do. Raises OSError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if not or_any or error.errno != errno.EADDRINUSE:
+            raise
+        return socket.create_server((host, 0), family=family)
 
 
 def _listening_address(listen: str, tls: bool, insecure: bool) -> tuple[str, int]:
@@ -153,64 +251,6 @@ def _listening_address(listen: str, tls: bool, insecure: bool) -> tuple[str, int
             f"gateway), listen on {LISTEN}, or add --insecure on a network that you trust"
         ) from None
     return host.strip("[]"), int(port)
-
-
-async def _serve(
-    arguments: argparse.Namespace,
-    transport: Transport,
-    listener: socket.socket,
-    credentials: Credentials | None,
-    serving: Credentials | None,
-    stop: threading.Event,
-) -> int:
-    """Serve until a signal, or until the gateway fails; raises what made it fail."""
-    from daedalus.gateway.app import application
-    from daedalus.gateway.gateway import Gateway, GatewayConfig
-    from daedalus.gateway.raw.endpoint import RawEndpoint
-    from daedalus.gateway.security import LOOPBACK, guard
-    from daedalus.gateway.server import Server, tls_context
-    from daedalus.gateway.tokens import Tokens
-
-    ended, failures = asyncio.Event(), []
-
-    def fail(error: Exception) -> None:
-        failures.append(error)
-        ended.set()
-
-    owner = credentials.name if credentials else ""
-    name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
-    tokens = None if serving is None else Tokens(serving.directory)
-    tls = None if serving is None else tls_context(serving.directory)
-    port = listener.getsockname()[1]
-    names = [*LOOPBACK, *arguments.host, *([] if serving is None else _bracketed(serving.hosts()))]
-    config = GatewayConfig(name=name, owner=owner, run=arguments.run)
-    gateway = Gateway(transport, config, fail)
-    gateway.open()
-    watch = asyncio.create_task(_set_when_stopped(stop, ended))
-    rules = guard([*names, socket.gethostname()], port, arguments.allow_origin, tokens)
-    shown = arguments.listen.rpartition(":")[0]
-    _logger.info("clients connect to %s://%s:%d/actor", "wss" if tls else "ws", shown, port)
-    raw = RawEndpoint(lambda: connect(arguments.connect, credentials), rules, config.actor_name)
-
-    async def close() -> None:
-        await raw.close()
-        await gateway.close()
-
-    await Server(application(gateway, raw, rules), tls).run_until(ended, listener, close)
-    watch.cancel()
-    if failures:
-        raise failures[0]
-    return 0
-
-
-async def _set_when_stopped(stop: threading.Event, ended: asyncio.Event) -> None:
-    while not stop.is_set():
-        await asyncio.sleep(_HEARTBEAT_SECONDS)
-    ended.set()
-
-
-def _bracketed(hosts: list[str]) -> list[str]:
-    return [f"[{host}]" if ":" in host else host for host in hosts]
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
-learner that a signal stopped exits with processes.STOPPED.
+learner that a signal stopped exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from daedalus.cli.arguments import allowing
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
+    ORDERED,
     STOPPED,
     exit_on_thread_exceptions,
     exit_status,
@@ -249,6 +250,8 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
 def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
     """Return the exit status for the end of a run; `stopped` is that of a run that was stopped."""
     if not outcome.finished:
+        if outcome.ordered and stopped and outcome.saved:
+            return ORDERED
         return stopped if outcome.saved else FAILED
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED

@@ -3,11 +3,13 @@
 import argparse
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TextIO
 
 from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allowing, command_parser
 from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
@@ -48,6 +50,7 @@ examples:
   daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
   daedalus train cartpole --init-from runs/cartpole-impala-s1-20261121-101500 --set training.learning_rate=0.0001
   daedalus train cartpole --set training.stop_when_solved=false --env-steps 5000000
+  daedalus train cartpole --watch                (shows the run in a browser)
 
 exit status: 0 the target was reached, or all steps were done without a target to stop at, 3 the budget was used up
 before the target, 1 failed or stopped, 2 bad usage"""
@@ -77,6 +80,7 @@ def train(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
+        _check_watching(parsed)
         spec, directory = resolve(parsed)
         if parsed.run_dir is not None:
             run_directory.check_free(directory)  # before the environment is made
@@ -107,6 +111,7 @@ def resume(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
+        _check_watching(parsed)
         spec = _resumed_spec(parsed)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
@@ -175,10 +180,23 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         metavar="tcp/HOST:PORT",
         help="address where more actors may join (default: none; the processes of the run use a private Unix socket)",
     )
+    options.add_argument(
+        "--watch",
+        action="store_true",
+        help="show the run on a page in a browser, at http://127.0.0.1:8080, or at another port if that is taken. The "
+        "token for its buttons is in RUN_DIR/operator-token",
+    )
+    options.add_argument("--no-camera", action="store_true", help="play no episodes for the page (with --watch)")
     add_tls(options)
     add_insecure(options)
     add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)  # for `daedalus sweep`
+
+
+def _check_watching(parsed: argparse.Namespace) -> None:
+    """Raise SettingsError if the gateway's packages are missing."""
+    if parsed.watch and not all(map(find_spec, GATEWAY_PACKAGES)):
+        raise SettingsError(f"--watch: {INSTALL}")
 
 
 def _check_listening(parsed: argparse.Namespace) -> None:
@@ -209,6 +227,8 @@ def _run(
         listen=parsed.listen,
         tls=parsed.tls,
         insecure=parsed.insecure,
+        watch=parsed.watch,
+        camera=not parsed.no_camera,
         log_level=parsed.log_level,
         log_json=parsed.log_json,
     )

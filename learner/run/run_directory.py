@@ -26,6 +26,7 @@ from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
+OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
 OUTPUT = "output.log"
 _PACKAGES = (
     "daedalus-rl",
@@ -105,7 +106,17 @@ def remove_failed(directory: Path) -> None:
     """Remove the files of a run that failed before it had a result, and the directory unless it has other files."""
     if (directory / METRICS).exists() or any((directory / "checkpoints").glob("*")):
         return
-    for pattern in (CONFIG, VERSIONS, SUMMARY, f"{OUTPUT}*", LOCK, HEARTBEAT, "events.out.*", ".*.partial"):
+    for pattern in (
+        CONFIG,
+        VERSIONS,
+        SUMMARY,
+        f"{OUTPUT}*",
+        LOCK,
+        HEARTBEAT,
+        OPERATOR_TOKEN,
+        "events.out.*",
+        ".*.partial",
+    ):
         for file in directory.glob(pattern):
             with suppress(OSError):
                 file.unlink()

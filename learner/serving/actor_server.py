@@ -15,16 +15,18 @@ import time
 from collections.abc import Callable
 from types import MappingProxyType
 
+from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.fleet_status import page
 from daedalus.learner.serving.gradient_checks import Shapes
+from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.rollout_intake import HEARTBEAT_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
+from daedalus.learner.serving.status_responses import StatusResponses
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import (
@@ -37,18 +39,13 @@ from daedalus.protocol.limits import (
 )
 from daedalus.protocol.messages import (
     Acknowledgement,
-    ActorsReport,
-    ActorsRequest,
-    EventsReport,
-    EventsRequest,
-    Message,
     Refusal,
     RunEnded,
-    StatusReport,
 )
+from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.status import ActorsPage, EventsPage, RunStatus
+from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Request, Transport, TransportError
 
 _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of this run
@@ -74,6 +71,7 @@ class ActorServer:
         learner_epoch: int,
         start_version: int,
         spaces: Spaces | None,
+        orders: Orders | None = None,
     ) -> None:
         """Construct the server.
 
@@ -86,13 +84,17 @@ class ActorServer:
           learner_epoch: epoch of this learner process.
           start_version: policy version of the checkpoint that the run continues from, else 0.
           spaces: spaces that all actors must have; None: those of the first actor.
+          orders: receives the orders of operators; None: nobody carries them out.
         """
         self.lock = threading.Condition()  # guards the fleet, the counters and the state shared with other parts
         self.fleet = Fleet(spec.training.seed, spaces, spec.training.epsilons)
-        self._run, self._transport, self._status, self._epoch = run, transport, status, learner_epoch
+        self._run, self._transport, self._epoch = run, transport, learner_epoch
         self._ended, self._ended_at = b"", 0.0  # the encoded RunEnded, after the end
         self._were_cut_off = False  # whether actors were absent at the end that were seen shortly before
         self.events = EventLog()
+        self.history = MetricsHistory()
+        self._orders = orders or Orders(threading.Event())
+        self._status = StatusResponses(run, learner_epoch, status, self.fleet, self.lock, self.events, self.history)
         self._responses = QueryResponses(run, spec, learner_epoch, start_version, self.fleet, self.lock, self.events)
         start = {"learner_epoch": learner_epoch, "start_version": start_version}
         self.publisher = SnapshotPublisher(
@@ -121,6 +123,7 @@ class ActorServer:
         self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
         self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
         self._serve(keys.reports(run, "*"), self._on_report, CLIENT_REPORT_LIMITS)
+        self._serve(keys.orders(run), self._on_order, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
@@ -237,23 +240,18 @@ class ActorServer:
             _logger.info("actor %s is drained: it leaves after its current rollout", name)
         request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
 
-    def _on_status(self, request: Request) -> None:
-        request.reply(encode(self._status_answer(request)))
-
-    def _status_answer(self, request: Request) -> Message:
-        """Return the answer to a status query: the status, or what an ActorsRequest or EventsRequest asks for."""
-        if not request.size:
-            with self.lock:
-                return StatusReport(status=self._status())
+    def _on_order(self, request: Request) -> None:
         try:
             message = decode(request.payload, STATUS_REQUEST_LIMITS)
         except ProtocolError as error:
-            return Refusal(code="malformed", reason=str(error))
-        if isinstance(message, EventsRequest):
-            page_of_events = EventsPage(run=self._run, learner_epoch=self._epoch, events=self.events.report())
-            return EventsReport(page=page_of_events)
-        if not isinstance(message, ActorsRequest):
-            return Refusal(code="malformed", reason="expected an ActorsRequest or EventsRequest message")
-        with self.lock:
-            actors = page(self.fleet, message.after, time.monotonic())
-        return ActorsReport(page=ActorsPage(learner_epoch=self._epoch, actors=actors))
+            request.reply(encode(Refusal(code="malformed", reason=str(error))))
+            return
+        if not isinstance(message, OrderRequest):
+            request.reply(encode(Refusal(code="malformed", reason="expected an OrderRequest message")))
+            return
+        _logger.info("an operator orders: %s", message.order)
+        self._orders.give(message.order)
+        request.reply(encode(Acknowledgement(verdict="accepted")))
+
+    def _on_status(self, request: Request) -> None:
+        request.reply(encode(self._status.answer(request)))

@@ -261,7 +261,7 @@ def test_client_waits_for_a_learner(network: MemoryNetwork, connect: Connect) ->
 
 
 def test_client_is_told_that_no_learner_came(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_module, "_JOIN_SECONDS", 0.3)
+    monkeypatch.setattr(gateway_module, "JOIN_SECONDS", 0.3)
     client = connect()
     error = client.hello("early")
     assert error["code"] == "unavailable"

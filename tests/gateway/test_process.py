@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import socket
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -12,7 +13,7 @@ from processes import Running, until
 from websockets.exceptions import ConnectionClosed
 
 from daedalus.cli.status_query import ask
-from daedalus.transport.connecting import connect
+from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import Transport
 
 Start = Callable[..., Running]
@@ -39,7 +40,8 @@ def play_until(client: JsonClient, condition: Callable[[], object]) -> None:
 def test_clients_return_after_their_gateway_was_killed(start: Start, address: str) -> None:
     start("learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS)
     gateway, port = start_gateway(start, address, 0)
-    transport = connect([address])
+    transport = connect_with_retry([address], threading.Event())
+    assert transport is not None
     try:
         client = JsonClient(port)
         assert client.hello("phone")["run"] == "run"

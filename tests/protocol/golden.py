@@ -35,6 +35,8 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
+from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
+from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
@@ -240,6 +242,13 @@ MESSAGES: dict[str, Message] = {
     ),
     "actors_request": ActorsRequest(after="wing-0"),
     "actors_report": ActorsReport(page=ActorsPage(learner_epoch=9, actors=(_ACTOR,))),
+    "metrics_request": MetricsRequest(first=4),
+    "metrics_report": MetricsReport(
+        page=MetricsPage(run="r", learner_epoch=9, columns=("env_steps", "entropy")),
+        numbers=np.array([4, 6], np.int64),
+        values=np.array([[128.0, 0.5], [256.0, -0.25]]),
+    ),
+    "order_request": OrderRequest(order="checkpoint"),
 }
 
 

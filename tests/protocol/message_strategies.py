@@ -30,6 +30,8 @@ from daedalus.protocol.messages import (
     StatusReport,
     Welcome,
 )
+from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
+from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import (
     CollectionSpec,
@@ -265,6 +267,16 @@ def snapshot_parts(draw: st.DrawFn) -> SnapshotPart:
     )
 
 
+@st.composite
+def metrics_reports(draw: st.DrawFn) -> MetricsReport:
+    random, columns, rows = draw(generators), draw(st.lists(text, max_size=4)), draw(st.integers(0, 4))
+    return MetricsReport(
+        page=MetricsPage(run=draw(text), learner_epoch=draw(counters), columns=tuple(columns)),
+        numbers=bits(random, "<i8", (rows,)),
+        values=bits(random, "<f8", (rows, len(columns))),
+    )
+
+
 KINDS: dict[type, st.SearchStrategy[Any]] = {
     Join: st.builds(
         Join,
@@ -313,6 +325,9 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
         page=st.builds(EventsPage, run=text, learner_epoch=counters, events=st.lists(events, max_size=3).map(tuple)),
     ),
     ActorsRequest: st.builds(ActorsRequest, after=text),
+    MetricsRequest: st.builds(MetricsRequest, first=counters),
+    MetricsReport: metrics_reports(),
+    OrderRequest: st.builds(OrderRequest, order=st.sampled_from(["stop", "checkpoint"])),
     ActorsReport: st.builds(
         ActorsReport,
         page=st.builds(ActorsPage, learner_epoch=counters, actors=st.lists(actor_statuses, max_size=3).map(tuple)),

@@ -55,6 +55,7 @@ def address(certificates: Path) -> Iterator[str]:
             keys.snapshots("r"),
             keys.status("r"),
             keys.drain("r", "*"),
+            keys.orders("r"),
         ):
             learner.serve(key, lambda request: request.reply(b"the learner's"))
         yield where
@@ -174,6 +175,10 @@ def drains(scene: Scene) -> bool:
     return scene.answered(keys.drain("r", scene.name)) or scene.answered(keys.drain("r", "box"))
 
 
+def gives_orders(scene: Scene) -> bool:
+    return scene.answered(keys.orders("r"))
+
+
 OPERATIONS = (
     joins,
     joins_as_another,
@@ -185,6 +190,7 @@ OPERATIONS = (
     watches_presence,
     reads_the_status,
     drains,
+    gives_orders,
 )
 PLAYS = {joins, uploads_as_itself, reads_publications}
 ALLOWED = {
@@ -192,7 +198,7 @@ ALLOWED = {
     "actor": PLAYS,
     "one of an actor's host": PLAYS,
     "another actor": PLAYS,
-    "operator": {watches_presence, reads_the_status, drains},
+    "operator": {watches_presence, reads_the_status, drains, gives_orders},
 }
 
 

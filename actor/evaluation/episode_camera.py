@@ -1,0 +1,159 @@
+"""Episodes played for somebody who watches: a picture of each step, and what the policy makes of it. No network."""
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
+from daedalus.actor.environments.interface import Observed
+from daedalus.actor.environments.make import make_environments
+from daedalus.policy.acting.noise import Noise, draw_noise, neutral_noise
+from daedalus.policy.acting.runtime import Choice, OnnxRuntime
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.frames import ObservationStacks
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.spec import RunSpec
+
+_SAMPLES, _FEW_SAMPLES = 64, 8  # of the action, for its probabilities; few where the observation is large
+_LARGE = 4096  # numbers in an observation
+_MOST_SHOWN = 12  # choices or numbers of one component of the action
+_LARGEST_SIDE = 640  # of a picture, in pixels
+_SEEDS = 2**30
+
+
+Estimate = Callable[[dict[str, np.ndarray], np.ndarray], float | None]
+
+
+def _unknown(observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """One step of an episode."""
+
+    picture: np.ndarray  # [height, width, 3] uint8, after the step
+    step: int  # from 1 in each episode
+    reward: float
+    total: float  # of the rewards of this episode
+    value: float | None  # estimate before the step; None if it is not known
+    actions: list[dict[str, Any]]  # see action_facts
+
+
+class EpisodeCamera:
+    """Episodes of one environment, rendered."""
+
+    def __init__(self, spec: RunSpec, modules: UserModules, estimate: Estimate = _unknown) -> None:
+        """Make the environment. Raises EnvironmentSetupError.
+
+        `estimate` returns the value of observations [1, *stacked_shape] and the policy's memory [1, S].
+        """
+        self._estimate = estimate
+        environment = as_on_gymnasium(spec.environment).model_copy(update={"processes": False})
+        self._picture = np.zeros((1, 1, 3), np.uint8)
+        self._environments = make_environments(
+            environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, for_evaluation=True
+        )
+        self._longest = spec.evaluation.max_episode_env_steps
+        self._random = np.random.default_rng()
+
+    def _film(self, picture: np.ndarray) -> None:
+        self._picture = picture
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._environments.close()
+
+    def play(self, runtime: OnnxRuntime) -> Iterator[Moment]:
+        """Play one episode with the most probable actions, and yield each step. Raises EnvironmentSetupError."""
+        environments, spaces = self._environments, self._environments.spaces
+        stacks = ObservationStacks(spaces, 1)
+        observed = environments.reset(int(self._random.integers(_SEEDS)))
+        stacks.push(observed.frames, np.ones(1, np.bool_))
+        state, total = np.zeros((1, runtime.state_size), np.float32), 0.0
+        for step in range(1, self._longest + 1):
+            choice = self._choose(runtime, stacks.observations, state, observed)
+            value = self._estimate(stacks.observations, state)
+            state = choice.state[:1]
+            taken = {name: values[:1] for name, values in choice.actions.items()}
+            observed, rewards, terminated, truncated = environments.step(taken)
+            stacks.push(observed.frames, np.zeros(1, np.bool_))
+            total += float(rewards[0])
+            facts = action_facts(spaces, choice)
+            yield Moment(
+                picture=self._picture, step=step, reward=float(rewards[0]), total=total, value=value, actions=facts
+            )
+            if terminated[0] or truncated[0]:
+                return
+
+    def _choose(
+        self, runtime: OnnxRuntime, observations: dict[str, np.ndarray], state: np.ndarray, observed: Observed
+    ) -> Choice:
+        """Return the most probable action in row 0, and samples in the other rows."""
+        samples = _FEW_SAMPLES if sum(values.size for values in observations.values()) > _LARGE else _SAMPLES
+        neutral, drawn = neutral_noise(runtime.noise_size, 1), draw_noise(runtime.noise_size, samples, self._random)
+        noise = Noise(
+            uniform=np.concatenate([neutral.uniform, drawn.uniform]),
+            normal=np.concatenate([neutral.normal, drawn.normal]),
+        )
+
+        def repeated(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {name: values.repeat(samples + 1, axis=0) for name, values in arrays.items()}
+
+        return runtime.act(repeated(observations), state.repeat(samples + 1, axis=0), noise, repeated(observed.masks))
+
+
+def action_facts(spaces: Spaces, choice: Choice) -> list[dict[str, Any]]:
+    """Return what is known of the action, by component.
+
+    A discrete one has `choices`: lists of a label, the probability and whether it was taken. The probabilities are
+    exact if it is the whole action, since the program computes them for each sample; otherwise they are the shares of
+    the samples. A continuous one has `numbers`: lists of the number taken and the standard deviation of the samples.
+
+    Args:
+      spaces: of the run.
+      choice: the action taken in row 0, samples in the others.
+    """
+    facts: list[dict[str, Any]] = []
+    sole = len(spaces.actions) == 1
+    for name, space in spaces.actions.items():
+        values = choice.actions[name]
+        if not isinstance(space, DiscreteSpace):
+            spreads = values[1:].std(axis=0)
+            pairs = [[float(taken), float(spread)] for taken, spread in zip(values[0], spreads, strict=True)]
+            facts.append({"name": name, "numbers": pairs[:_MOST_SHOWN]})
+            continue
+        for variable in range(space.size):
+            title = name if space.size == 1 else f"{name} {variable}"
+            column = values[:, variable]
+            if sole and space.size == 1:
+                chances = np.exp(np.minimum(choice.log_probs, 0.0))
+                shares = dict(zip(column.tolist(), chances.tolist(), strict=True))
+            else:
+                found, counts = np.unique(column[1:], return_counts=True)
+                shares = dict(zip(found.tolist(), (counts / counts.sum()).tolist(), strict=True))
+            facts.append({"name": title, "choices": _choices(shares, int(column[0]), space.counts[variable])})
+    return facts[:_MOST_SHOWN]
+
+
+def _choices(shares: dict[int, float], taken: int, count: int) -> list[list[Any]]:
+    """Return the choices in their order; of very many, the most probable ones."""
+    shown = range(count)
+    if count > _MOST_SHOWN:
+        likely = sorted(shares, key=lambda choice: (choice != taken, -shares[choice]))
+        shown = sorted(likely[:_MOST_SHOWN])
+    return [[str(choice), round(shares.get(choice, 0.0), 4), choice == taken] for choice in shown]
+
+
+def jpeg(picture: np.ndarray) -> bytes:
+    """Return a picture as a JPEG of moderate size. Raises ImportError without Pillow."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(picture[..., :3], np.uint8))
+    image.thumbnail((_LARGEST_SIDE, _LARGEST_SIDE))
+    data = io.BytesIO()
+    image.save(data, "jpeg", quality=80)
+    return data.getvalue()

@@ -1,0 +1,86 @@
+"""Make the pictures of the page that the documentation shows, from a short run of CartPole: `make screenshots`.
+
+It needs Debian's chromium and playwright (the extra `browser`).
+"""
+
+import argparse
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+COMMAND = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
+SETTINGS = ["--set", "training.stop_when_solved=false", "--env-steps", "4000000", "--set", "evaluation.seconds=8"]
+SETTINGS += ["--set", "collection.envs_per_actor=8"]  # slow enough for a curve
+COLOURS = 256  # of a picture: small files
+LIMIT = 120_000  # milliseconds for each step
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=45.0, help="duration of the run (default: %(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("docs/images"), help="folder (default: %(default)s)")
+    parsed = parser.parse_args()
+    parsed.output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        words = [*COMMAND, "train", "cartpole", "--watch", "--run-dir", "cartpole-impala-s1", *SETTINGS]
+        run = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
+        try:
+            address = page_address(run)
+            _take(address, parsed.output, parsed.seconds)
+        finally:
+            run.terminate()
+            run.wait()
+
+
+def page_address(run: subprocess.Popen[str]) -> str:
+    """Return the address of the page of a run, and read the rest of its output on a thread."""
+    assert run.stdout is not None
+    for line in run.stdout:
+        if match := re.search(r"watch the run at (\S+)", line):
+            threading.Thread(target=run.stdout.read, daemon=True).start()
+            return match[1]
+    raise SystemExit("the run did not start")
+
+
+def _take(address: str, folder: Path, seconds: float) -> None:
+    sync_api: Any = importlib.import_module("playwright.sync_api")  # an extra
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        desktop = {"width": 1200, "height": 900}
+        pages = {
+            "page_light": browser.new_page(viewport=desktop, color_scheme="light"),
+            "page_dark": browser.new_page(viewport=desktop, color_scheme="dark"),
+            "page_phone": browser.new_page(viewport={"width": 390, "height": 844}, color_scheme="light"),
+        }
+        for page in pages.values():
+            page.goto(address)
+        light = pages["page_light"]
+        light.wait_for_timeout(1000 * seconds)
+        for name, page in pages.items():
+            page.screenshot(path=str(folder / f"{name}.png"))
+            _shrink(folder / f"{name}.png")
+        light.locator("#camera-switch:enabled").click()
+        light.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=LIMIT)
+        light.wait_for_timeout(2000)
+        light.locator("#camera").scroll_into_view_if_needed()
+        light.locator("#camera").screenshot(path=str(folder / "page_camera.png"))
+        _shrink(folder / "page_camera.png")
+        browser.close()
+
+
+def _shrink(path: Path) -> None:
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"wrote {path}: {path.stat().st_size / 1024:.0f} KiB")
+
+
+if __name__ == "__main__":
+    main()

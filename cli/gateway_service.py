@@ -1,0 +1,191 @@
+"""One gateway, from its first connection to its end: the web server, the clients' actors and the page of the run.
+
+The web server answers before the network is reached: clients wait, and the page says so.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+from daedalus.cli.run_source import LearnerSource
+from daedalus.gateway.app import application
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.gateway import JOIN_SECONDS, Gateway, GatewayConfig
+from daedalus.gateway.raw.endpoint import RawEndpoint
+from daedalus.gateway.security import LOOPBACK, guard
+from daedalus.gateway.server import Server, tls_context
+from daedalus.gateway.tokens import OperatorToken, Tokens
+from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.gateway.watching.monitor import RunMonitor
+from daedalus.gateway.watching.observation import Observation
+from daedalus.gateway.watching.page_data import PageData
+from daedalus.gateway.watching.source import OtherRun
+from daedalus.protocol.codec import ProtocolError
+from daedalus.protocol.orders import Order
+from daedalus.transport.connecting import connect_with_retry
+from daedalus.transport.credentials import Credentials
+from daedalus.transport.interface import Transport, TransportError
+
+_logger = logging.getLogger("daedalus.cli")
+
+_HEARTBEAT_SECONDS = 0.2
+_FORBIDDEN = (
+    "this gateway connects with the certificate of an actor, which may not read the status of the run: start it with "
+    "--operator certs/operator too"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatewaySettings:
+    """What the command line decides."""
+
+    connect: list[str]  # addresses of the network
+    shown_host: str  # where clients connect, as the user wrote it
+    run: str
+    credentials: Credentials | None = None  # of an actor
+    operator: Credentials | None = None  # of an operator, to read the status
+    serving: Credentials | None = None  # of the web server
+    hosts: list[str] = field(default_factory=list)  # further names of this gateway
+    origins: list[str] = field(default_factory=list)  # of pages that may connect
+    operator_token: OperatorToken | None = None
+    other_runs: Callable[[], list[OtherRun]] = lambda: []
+    camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
+    announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
+
+
+class GatewayService:
+    """The parts of one gateway. Construct it in a running event loop."""
+
+    def __init__(self, settings: GatewaySettings, stop: threading.Event) -> None:
+        """`stop` ends the gateway."""
+        self._settings, self._stop = settings, stop
+        self._loop = asyncio.get_running_loop()
+        self._ended, self._failures = asyncio.Event(), list[Exception]()
+        self._gateway: asyncio.Future[Gateway] = self._loop.create_future()
+        self._monitor: RunMonitor | None = None
+        self._camera = None if settings.camera is None else CameraProcess(settings.camera)
+        self._data = PageData(settings.other_runs, self._camera)
+        self._transports = ExitStack()
+        owner = settings.credentials.name if settings.credentials else ""
+        name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
+        self._config = GatewayConfig(name=name, owner=owner, run=settings.run)
+
+    async def run(self, listener: socket.socket) -> None:
+        """Serve until `stop` is set. Raises what makes the gateway fail."""
+        settings, port = self._settings, listener.getsockname()[1]
+        tokens = None if settings.serving is None else Tokens(settings.serving.directory)
+        tls = None if settings.serving is None else tls_context(settings.serving.directory)
+        certified = [] if settings.serving is None else _bracketed(settings.serving.hosts())
+        names = [*LOOPBACK, *settings.hosts, *certified, socket.gethostname()]
+        rules = guard(names, port, settings.origins, tokens, settings.operator_token)
+        raw = RawEndpoint(self._raw_transport, rules, self._config.actor_name)
+        where, secure = f"{settings.shown_host}:{port}", "s" if tls else ""
+        _logger.info("clients connect to ws%s://%s/actor", secure, where)
+        if settings.announce is None:
+            _logger.info("the page of the run is at http%s://%s/", secure, where)
+        else:
+            settings.announce(f"http{secure}://{where}/")
+        tasks = [asyncio.create_task(self._await_stop()), asyncio.create_task(self._reach_network())]
+
+        async def close() -> None:
+            await raw.close()
+            await self._close()
+
+        try:
+            await Server(application(self._gateway, raw, rules, self._data), tls).run_until(
+                self._ended, listener, close
+            )
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.to_thread(self._transports.close)
+        if self._failures:
+            raise self._failures[0]
+
+    def _raw_transport(self) -> Transport:
+        """Return the transport of one raw client. Waits for the network, on the thread of that client."""
+        settings = self._settings
+        transport = connect_with_retry(settings.connect, self._stop, JOIN_SECONDS, settings.credentials)
+        if transport is None:
+            raise TransportError("the gateway stops")
+        return transport
+
+    def _fail(self, error: Exception) -> None:
+        self._failures.append(error)
+        self._ended.set()
+
+    async def _await_stop(self) -> None:
+        while not self._stop.is_set():
+            await asyncio.sleep(_HEARTBEAT_SECONDS)
+        self._ended.set()
+
+    async def _reach_network(self) -> None:
+        try:
+            transport = await self._connect(self._settings.credentials)
+            if transport is None:
+                return
+            gateway = Gateway(transport, self._config, self._fail)
+            gateway.open()
+            self._gateway.set_result(gateway)
+            if self._camera is not None:
+                self._camera.newest_policy = lambda: gateway.newest_policy
+                self._camera.fetch_policy = gateway.fetch_policy
+            watching = transport
+            if self._settings.operator is not None:
+                watching = await self._connect(self._settings.operator)
+            elif self._settings.credentials is not None:
+                self._data.show(Observation(state="forbidden", reason=_FORBIDDEN))
+                return
+            if watching is not None:
+                self._begin_to_watch(watching, gateway)
+        except Exception as error:  # broad: any error, ours too, ends the gateway
+            self._fail(error)
+
+    async def _connect(self, credentials: Credentials | None) -> Transport | None:
+        """Return a transport once the network is reached, or None if stopped before."""
+        transport = await asyncio.to_thread(connect_with_retry, self._settings.connect, self._stop, None, credentials)
+        if transport is not None:
+            self._transports.callback(transport.close)
+        return transport
+
+    def _begin_to_watch(self, transport: Transport, gateway: Gateway) -> None:
+        source = LearnerSource(transport, self._settings.run, lambda: gateway.followed_run)
+
+        def show(seen: Observation) -> None:
+            if not self._stop.is_set():
+                self._loop.call_soon_threadsafe(self._data.show, seen)
+
+        def give(order: Order) -> str:
+            status = self._data.seen.status
+            if status is None:
+                return "no learner has answered yet"
+            try:
+                return source.order(status, order)
+            except (TransportError, ProtocolError) as error:
+                return str(error)
+
+        self._monitor = RunMonitor(source, show, lambda: gateway.last_run_end)
+        gateway.on_run_change = self._monitor.look
+        self._data.on_watch, self._data.give_order = self._monitor.watch, give
+        self._monitor.watch(self._data.is_watched)
+        self._monitor.open()
+
+    async def _close(self) -> None:
+        if self._camera is not None:
+            await self._camera.close()
+        if self._monitor is not None:
+            await asyncio.to_thread(self._monitor.close)
+        if self._gateway.done():
+            await self._gateway.result().close()
+        else:
+            self._gateway.set_exception(ClientError("unavailable", "the gateway stops"))
+            self._gateway.exception()  # read, whether or not a client waits
+
+
+def _bracketed(hosts: list[str]) -> list[str]:
+    return [f"[{host}]" if ":" in host else host for host in hosts]

@@ -1,0 +1,59 @@
+"""The learner of one run as the page of a gateway reads it."""
+
+from collections.abc import Callable
+
+from daedalus.cli.status_query import ask, ask_events
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS, METRICS_LIMITS
+from daedalus.protocol.messages import Acknowledgement, Refusal
+from daedalus.protocol.metrics import MetricsReport, MetricsRequest
+from daedalus.protocol.orders import Order, OrderRequest
+from daedalus.protocol.status import EventsPage, RunStatus
+from daedalus.transport.interface import Transport
+
+_ANSWER_SECONDS = 5.0
+
+
+class LearnerSource:
+    """A RunSource over a transport (gateway/watching/source.py)."""
+
+    def __init__(self, transport: Transport, run: str = keys.ANY_RUN, chosen: Callable[[], str] = lambda: "") -> None:
+        """Construct the source.
+
+        Args:
+          transport: the network.
+          run: name of the run, or `*`.
+          chosen: returns the run to prefer if several learners answer; empty if there is no preference.
+        """
+        self._transport, self._run, self._chosen = transport, run, chosen
+
+    def status(self, max_actors: int) -> RunStatus | None:
+        """See RunSource."""
+        statuses = ask(self._transport, self._run, max_actors=max_actors)
+        chosen = self._chosen()
+        return min(statuses, key=lambda status: (status.run != chosen, status.run), default=None)
+
+    def events(self, status: RunStatus) -> EventsPage | None:
+        """See RunSource."""
+        return ask_events(self._transport, status)
+
+    def metrics(self, status: RunStatus, first: int) -> MetricsReport | None:
+        """See RunSource."""
+        request = encode(MetricsRequest(first=first))
+        for answer in self._transport.query(keys.status(status.run), request, timeout=_ANSWER_SECONDS):
+            report = decode(answer, METRICS_LIMITS)
+            if isinstance(report, MetricsReport) and report.page.learner_epoch == status.learner_epoch:
+                return report
+        return None
+
+    def order(self, status: RunStatus, order: Order) -> str:
+        """See RunSource."""
+        request = encode(OrderRequest(order=order))
+        for answer in self._transport.query(keys.orders(status.run), request, timeout=_ANSWER_SECONDS):
+            match decode(answer, ACKNOWLEDGEMENT_LIMITS):
+                case Acknowledgement(verdict="accepted"):
+                    return ""
+                case Refusal(reason=reason):
+                    return reason
+        return "the learner does not answer: try again later"

@@ -1,0 +1,141 @@
+// A line chart in SVG: one line with its band, marks, and the lines of other runs.
+
+import { element, setText, shape } from "./dom.js";
+import { number } from "./format.js";
+
+const MARGIN = { top: 8, right: 10, bottom: 20, left: 46 };
+
+/** Return round numbers between two ends, about `count` of them. */
+export function ticks(low, high, count) {
+  const rough = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].find((factor) => factor * power >= rough) * power;
+  const found = [];
+  for (let index = Math.ceil(low / step - 1e-9); index * step <= high + 1e-9 * step; index++) found.push(index * step);
+  return found;
+}
+
+/** Return at most two points for each pixel: the lowest and the highest of those that share it. */
+export function thinned(points, width) {
+  if (points.length <= 2 * width) return points;
+  const size = Math.ceil(points.length / width);
+  const kept = [];
+  for (let first = 0; first < points.length; first += size) {
+    const part = points.slice(first, first + size);
+    const low = part.reduce((best, point) => (point[1] < best[1] ? point : best));
+    const high = part.reduce((best, point) => (point[1] > best[1] ? point : best));
+    kept.push(...(low[0] <= high[0] ? [low, high] : [high, low]));
+  }
+  return [...new Set(kept)];
+}
+
+/** Return the lowest and highest y of points with their bands; null without points. */
+export function range(lists) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const points of lists) {
+    for (const [, y, width] of points) {
+      low = Math.min(low, y - width);
+      high = Math.max(high, y + width);
+    }
+  }
+  if (low > high) return null;
+  const pad = high > low ? 0.05 * (high - low) : Math.abs(high) * 0.1 || 1;
+  return [low - pad, high + pad];
+}
+
+export class Chart {
+  #series = { line: [], marks: [], others: [] };
+  #scale = null;
+
+  /** `title` names the metric; `xText` returns the text of a place on the x axis. */
+  constructor(title, { wide = false, xText = number } = {}) {
+    this.title = title;
+    this.xText = xText;
+    this.svg = shape("svg", { role: "img", "aria-label": `${title}: no values yet` });
+    this.reading = element("span", { class: "reading" });
+    const caption = element("figcaption", {}, element("h3", {}, title), this.reading);
+    this.figure = element("figure", { class: wide ? "chart wide" : "chart" }, caption, this.svg);
+    this.svg.addEventListener("pointermove", (event) => this.#point(event.offsetX));
+    this.svg.addEventListener("pointerleave", () => this.draw(this.#series));
+    new ResizeObserver(() => this.draw(this.#series)).observe(this.svg);
+  }
+
+  /** Draw points [x, y, half width of the band] of the line, the marks, and [number, points] of other runs. */
+  draw(series) {
+    this.#series = series;
+    const { clientWidth: width, clientHeight: height } = this.svg;
+    if (!width) return; // hidden
+    this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    const all = [series.line, series.marks, ...series.others.map(([, points]) => points)];
+    const ys = range(all);
+    if (ys === null) {
+      this.#scale = null;
+      const none = shape("text", { x: width / 2, y: height / 2, "text-anchor": "middle", class: "empty" }, "no values yet");
+      this.svg.replaceChildren(none);
+      return setText(this.reading, "");
+    }
+    const places = all.flatMap((points) => (points.length ? [points[0][0], points.at(-1)[0]] : []));
+    const [first, last] = [Math.min(...places), Math.max(...places)];
+    const plot = { left: MARGIN.left, right: width - MARGIN.right, top: MARGIN.top, bottom: height - MARGIN.bottom };
+    const x = (value) => plot.left + ((value - first) / (last - first || 1)) * (plot.right - plot.left);
+    const y = (value) => plot.bottom - ((value - ys[0]) / (ys[1] - ys[0])) * (plot.bottom - plot.top);
+    this.#scale = { x, y, plot };
+    const points = thinned(series.line, plot.right - plot.left);
+    this.svg.replaceChildren(
+      ...this.#axes(first, last, ys, plot, x, y),
+      ...(points.some(([, , size]) => size > 0) ? [shape("path", { class: "band", d: band(points, x, y) })] : []),
+      ...series.others.map(([place, other]) =>
+        shape("path", { class: `other series-${place}`, d: path(thinned(other, plot.right - plot.left), x, y) }),
+      ),
+      shape("path", { class: "line", d: path(points, x, y) }),
+      ...(points.length === 1 ? points : series.marks).map(([at, value]) => shape("circle", { class: "mark", cx: x(at), cy: y(value), r: 3 })),
+    );
+    this.#describe(first, last);
+  }
+
+  #axes(first, last, ys, plot, x, y) {
+    const across = ticks(...ys, 4).map((value) => [
+      shape("line", { class: "grid", x1: plot.left, x2: plot.right, y1: y(value), y2: y(value) }),
+      shape("text", { x: plot.left - 6, y: y(value) + 4, "text-anchor": "end" }, number(value)),
+    ]);
+    const wanted = Math.max(3, Math.floor((plot.right - plot.left) / 110));
+    const along = (last > first ? ticks(first, last, wanted) : [first]).map((value) =>
+      shape("text", { x: x(value), y: plot.bottom + 15, "text-anchor": "middle" }, this.xText(value)),
+    );
+    return [...across.flat(), ...along];
+  }
+
+  #describe(first, last) {
+    const { line } = this.#series;
+    const newest = line.length ? number(line.at(-1)[1]) : "-";
+    setText(this.reading, newest);
+    const where = `from ${this.xText(first)} to ${this.xText(last)}`;
+    this.svg.setAttribute("aria-label", `${this.title}: ${newest} at the end, ${where}`);
+  }
+
+  /** Show the value below the pointer. */
+  #point(at) {
+    const { line } = this.#series;
+    if (!line.length || this.#scale === null) return;
+    const { x, y, plot } = this.#scale;
+    const nearest = line.reduce((best, point) => (Math.abs(x(point[0]) - at) < Math.abs(x(best[0]) - at) ? point : best));
+    this.svg.querySelectorAll(".cursor").forEach((old) => old.remove());
+    const place = x(nearest[0]);
+    this.svg.append(
+      shape("line", { class: "cursor", x1: place, x2: place, y1: plot.top, y2: plot.bottom }),
+      shape("circle", { class: "mark cursor", cx: place, cy: y(nearest[1]), r: 3 }),
+    );
+    const width = nearest[2] ? ` ± ${number(nearest[2])}` : "";
+    setText(this.reading, `${number(nearest[1])}${width} at ${this.xText(nearest[0])}`);
+  }
+}
+
+function path(points, x, y) {
+  return points.map(([at, value], index) => `${index ? "L" : "M"}${x(at).toFixed(1)},${y(value).toFixed(1)}`).join("");
+}
+
+function band(points, x, y) {
+  const above = points.map(([at, value, width]) => [at, value + width]);
+  const below = points.map(([at, value, width]) => [at, value - width]).reverse();
+  return `${path([...above, ...below], x, y)}Z`;
+}

@@ -1,0 +1,39 @@
+// Numbers, durations and shares as texts.
+
+/** Return a number with few digits: 0.123, 12.3, 1,234, 123k, 1.2M. */
+export function number(value, digits = 3) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "-";
+  const size = Math.abs(value);
+  if (size >= 1e6) return `${trimmed(value / 10 ** (size >= 1e9 ? 9 : 6), 3)}${size >= 1e9 ? "G" : "M"}`;
+  if (size >= 1e5) return `${trimmed(value / 1000, 3)}k`;
+  if (size >= 1000) return Math.round(value).toLocaleString("en");
+  if (size > 0 && size < 0.001) return value.toExponential(1);
+  return trimmed(value, digits);
+}
+
+function trimmed(value, digits) {
+  return String(Number(value.toPrecision(digits)));
+}
+
+/** Return a whole number with separators. */
+export function whole(value) {
+  return value === null || value === undefined ? "-" : Math.round(value).toLocaleString("en");
+}
+
+/** Return a duration in seconds as 45 s, 12 min or 3.5 h. */
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "-";
+  if (seconds < 100) return `${Math.round(Math.max(seconds, 0))} s`;
+  if (seconds < 6000) return `${Math.round(seconds / 60)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+}
+
+/** Return a share from 0 to 1 in percent. */
+export function percent(share) {
+  return `${Math.round(100 * share)} %`;
+}
+
+/** Return a count with its noun. */
+export function counted(count, noun) {
+  return `${whole(count)} ${noun}${count === 1 ? "" : "s"}`;
+}

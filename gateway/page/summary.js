@@ -1,0 +1,111 @@
+// The run in a few figures, and how it is.
+
+import { byId, element, setText } from "./dom.js";
+import { counted, duration, number, percent, whole } from "./format.js";
+
+const STATES = {
+  connecting: "connecting to the network",
+  forbidden: "the status may not be read",
+  waiting: "waiting for a learner",
+  running: "running",
+  lost: "the learner does not answer",
+  ended: "ended",
+  closed: "the gateway does not answer",
+};
+const EXPLANATIONS = {
+  connecting: "The gateway has not reached its network yet. This page shows the run as soon as it does.",
+  waiting: "No learner has answered yet. This page shows the run as soon as there is one.",
+  lost: "The learner does not answer. The figures are the last ones.",
+  closed: "The gateway does not answer. The figures are the last ones; this page connects again by itself.",
+};
+
+export class Summary {
+  #seen = { state: "connecting", reason: "", status: null };
+  #tiles = new Map();
+
+  constructor(metrics) {
+    this.metrics = metrics;
+  }
+
+  /** Show a message about the run. */
+  show(message) {
+    this.#seen = message;
+    const { state, status } = message;
+    byId("state").dataset.state = state;
+    setText(byId("state"), STATES[state]);
+    this.#notice(message);
+    if (status === null) return;
+    setText(byId("run"), status.run);
+    setText(byId("what"), `${status.environment}, ${status.algorithm}`);
+    byId("play").hidden = !/^CartPole-v[01]$/.test(status.environment) || state === "ended";
+    this.#progress(status);
+    this.tiles();
+    document.title = `${status.run}: ${number(status.episode_return_mean)} - Daedalus`;
+  }
+
+  /** Show that the gateway is gone, with the last figures. */
+  lost() {
+    if (this.#seen.state !== "ended") this.show({ ...this.#seen, state: "closed", reason: "" });
+  }
+
+  #notice({ state, reason, status }) {
+    const notices = [];
+    if (state === "ended") notices.push(["notice good", `The run has ended: ${reason}. ${this.#result(status)}`]);
+    else if (EXPLANATIONS[state]) notices.push(["notice", EXPLANATIONS[state] + (reason ? ` (${reason})` : "")]);
+    else if (reason) notices.push(["notice", reason]);
+    if (state === "running") for (const problem of status?.problems ?? []) notices.push(["notice", `Problem: ${problem}`]);
+    const shown = [...byId("notices").children].map((child) => child.textContent).join("\n");
+    if (shown === notices.map(([, text]) => text).join("\n")) return; // a screen reader hears each notice once
+    byId("notices").replaceChildren(...notices.map(([style, text]) => element("p", { class: style }, text)));
+  }
+
+  #result(status) {
+    if (status === null) return "";
+    const mean = number(status.episode_return_mean);
+    return `Result: return ${mean} after ${whole(status.env_steps)} env_steps and ${whole(status.updates)} updates.`;
+  }
+
+  #progress(status) {
+    const share = status.env_steps_budget ? Math.min(status.env_steps / status.env_steps_budget, 1) : 0;
+    byId("budget").value = share;
+    const left = (status.env_steps_budget - status.env_steps) / status.env_steps_per_second;
+    const rest = this.#seen.state === "running" && Number.isFinite(left) && left > 0 ? `, about ${duration(left)} left` : "";
+    const text = `${whole(status.env_steps)} of ${whole(status.env_steps_budget)} env_steps (${percent(share)})${rest}`;
+    setText(byId("progress-text"), text);
+  }
+
+  /** Show the figures; those of the metrics may have come after the status. */
+  tiles() {
+    const { status } = this.#seen;
+    if (status === null) return;
+    const metrics = this.metrics;
+    const deviation = metrics.newest("episode_return_std");
+    const evaluated = metrics.newest("evaluation_env_steps");
+    const saved = status.checkpoint_age_seconds;
+    this.#tile("Return", number(status.episode_return_mean), deviation === null ? "no episode yet" : `± ${number(deviation)} between episodes`);
+    this.#tile(
+      "Evaluation",
+      number(metrics.newest("evaluation_return_mean")),
+      evaluated === null ? "none yet" : `± ${number(metrics.newest("evaluation_return_std"))} at ${number(evaluated)} env_steps`,
+    );
+    this.#tile("env_steps/s", number(status.env_steps_per_second), `${number(status.updates_per_second)} updates/s`);
+    this.#tile("Policy lag", number(status.policy_lag_mean), "updates, mean of the last second");
+    const absent = [[status.actors_quarantined, "quarantined"], [status.actors_gone, "gone"]];
+    const others = absent.filter(([count]) => count).map(([count, what]) => `${whole(count)} ${what}`);
+    this.#tile("Actors", whole(status.actors_alive), others.join(", ") || "none gone");
+    this.#tile("Running for", duration(status.uptime_seconds), saved === null ? "no checkpoint yet" : `checkpoint ${duration(saved)} ago`);
+    const rejected = Object.values(status.rollouts_rejected).reduce((sum, count) => sum + count, 0);
+    this.#tile("Rollouts", number(status.rollouts_accepted), rejected ? `${counted(rejected, "rejection")}` : "none rejected");
+  }
+
+  #tile(title, value, more) {
+    if (!this.#tiles.has(title)) {
+      const parts = [element("dd", { class: "value" }), element("dd", { class: "more" })];
+      byId("tiles").append(element("div", { class: "tile" }, element("dt", {}, title), ...parts));
+      this.#tiles.set(title, parts);
+    }
+    const [large, small] = this.#tiles.get(title);
+    setText(large, value);
+    setText(small, more);
+  }
+}

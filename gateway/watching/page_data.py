@@ -1,0 +1,72 @@
+"""The newest observation on the event loop, and the viewers that wait for changes."""
+
+import asyncio
+from collections.abc import AsyncGenerator, Callable
+from typing import Protocol
+
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.watching.observation import Observation
+from daedalus.gateway.watching.source import OtherRun
+from daedalus.protocol.orders import Order
+
+MAX_VIEWERS = 32
+
+GiveOrder = Callable[[Order], str]  # waits for the learner; returns why it is not accepted, or an empty string
+
+
+class Camera(Protocol):
+    """What shows episodes to viewers."""
+
+    def frames(self) -> AsyncGenerator[bytes, None]:
+        """Yield frames as soon as there are any, and the newest only, until the caller stops."""
+        ...
+
+
+def _nobody(order: Order) -> str:
+    return "the learner was not reached yet: try again later"
+
+
+class PageData:
+    """What all viewers see. For the event loop."""
+
+    def __init__(self, other_runs: Callable[[], list[OtherRun]] = lambda: [], camera: Camera | None = None) -> None:
+        """Construct the data.
+
+        Args:
+          other_runs: reads the runs to compare with; it may take long.
+          camera: shows episodes; None: there is no camera.
+        """
+        self.other_runs, self.camera = other_runs, camera
+        self.seen = Observation()
+        self.give_order: GiveOrder = _nobody
+        self.on_watch: Callable[[bool], None] = lambda watched: None  # receives whether anybody watches
+        self._viewers = 0
+        self._changed = asyncio.Event()
+
+    def enter(self) -> None:
+        """Count a viewer. Raises ClientError if there are too many."""
+        if self._viewers >= MAX_VIEWERS:
+            raise ClientError("unavailable", f"{MAX_VIEWERS} pages are open already: close one")
+        self._viewers += 1
+        self.on_watch(True)
+
+    def leave(self) -> None:
+        """Count a viewer no more."""
+        self._viewers -= 1
+        self.on_watch(self._viewers > 0)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether anybody watches."""
+        return self._viewers > 0
+
+    def show(self, seen: Observation) -> None:
+        """Show an observation to all viewers."""
+        self.seen = seen
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    @property
+    def news(self) -> asyncio.Event:
+        """An event that the next observation sets."""
+        return self._changed

@@ -1,0 +1,166 @@
+"""One page that watches: its WebSocket. An ASGI application for one connection."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from typing import Any
+
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.rate_limit import RateLimit
+from daedalus.gateway.security import Guard
+from daedalus.gateway.watching import observation, viewer_messages
+from daedalus.gateway.watching.observation import Observation
+from daedalus.gateway.watching.page_data import PageData
+from daedalus.gateway.watching.viewer_messages import ViewerCamera, ViewerHello, ViewerOrder
+
+_logger = logging.getLogger(__name__)
+
+_HELLO_SECONDS = 10.0
+_SEND_SECONDS = 5.0  # for the last message
+_MAX_FAULTS = 5  # of one page; then it is disconnected
+_RATE, _BURST = 2.0, 20.0  # messages of one page a second
+_FAULT, _TRY_LATER = 1008, 1013  # codes of RFC 6455
+
+
+class ViewerConnection:
+    """The conversation with one page. It receives what has changed, and no more than it can take."""
+
+    def __init__(self, data: PageData, guard: Guard, receive: Any, send: Any) -> None:
+        self._data, self._guard, self._receive, self._send_event = data, guard, receive, send
+        self._rate = RateLimit(_RATE, _BURST)
+        self._sent = Observation()
+        self._has_rows = False
+        self._camera: asyncio.Task[None] | None = None
+
+    async def serve(self) -> None:
+        """Serve the page until it is closed."""
+        await self._receive()  # the request to connect
+        await self._send_event({"type": "websocket.accept"})
+        try:
+            await self._greet()
+            self._data.enter()
+            try:
+                await self._converse()
+            finally:
+                self._data.leave()
+        except ClientError as error:
+            await self._finish(error)
+        except (OSError, EOFError):
+            pass  # the page is closed
+
+    async def _greet(self) -> None:
+        try:
+            async with asyncio.timeout(_HELLO_SECONDS):
+                message = await self._next()
+        except TimeoutError:
+            raise ClientError("malformed", f"no hello came within {_HELLO_SECONDS:g} s") from None
+        if not isinstance(message, ViewerHello):
+            raise ClientError("out_of_turn", "the first message must be a hello")
+        self._guard.check_viewer(message.token)
+
+    async def _converse(self) -> None:
+        hello = {"type": "hello", "orders": self._guard.takes_orders, "camera": self._data.camera is not None}
+        await self._send(hello)
+        showing = asyncio.create_task(self._show())
+        try:
+            await self._obey()
+        finally:
+            for task in (showing, self._camera):
+                if task is not None:
+                    task.cancel()
+
+    # ------------------------------------------------------------------------------------------- to the page
+
+    async def _show(self) -> None:
+        """Send what has changed, again and again."""
+        with contextlib.suppress(OSError):  # the page is closed
+            others = await asyncio.to_thread(self._data.other_runs)
+            await self._send_texts(
+                [{"type": "comparison", "name": run.name, **observation.table(run.rows)} for run in others]
+            )
+            while True:
+                news = self._data.news
+                seen = self._data.seen
+                await self._send_texts(await asyncio.to_thread(self._changes, seen))
+                self._sent = seen
+                await news.wait()
+
+    def _changes(self, seen: Observation) -> list[dict[str, Any]]:
+        sent, messages = self._sent, [observation.run_message(seen)]
+        if seen.actors is not sent.actors:
+            messages.append(observation.actors_message(seen.actors))
+        if seen.events is not sent.events:
+            messages.append(observation.events_message(seen.events))
+        if seen.rows is not sent.rows:
+            begun = self._has_rows and sent.generation == seen.generation
+            first = sent.rows[-1][0] + 1 if begun and sent.rows else 0
+            messages.append(observation.metrics_message(seen, begun, first))
+            self._has_rows = True
+        return messages
+
+    async def _send_texts(self, messages: list[dict[str, Any]]) -> None:
+        for message in messages:
+            await self._send(message)
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        text = await asyncio.to_thread(json.dumps, message, separators=(",", ":"), allow_nan=False)
+        await self._send_event({"type": "websocket.send", "text": text})
+
+    async def _show_camera(self) -> None:
+        assert self._data.camera is not None
+        with contextlib.suppress(OSError):
+            async with contextlib.aclosing(self._data.camera.frames()) as frames:
+                async for frame in frames:
+                    await self._send_event({"type": "websocket.send", "bytes": frame})
+
+    async def _finish(self, error: ClientError) -> None:
+        """Say why the connection ends, and close it."""
+        code = _TRY_LATER if error.code == "unavailable" else _FAULT
+        message = {"type": "error", "code": error.code, "reason": error.reason}
+        with contextlib.suppress(TimeoutError, OSError):
+            async with asyncio.timeout(_SEND_SECONDS):
+                await self._send(message)
+                await self._send_event({"type": "websocket.close", "code": code})
+
+    # ----------------------------------------------------------------------------------------- from the page
+
+    async def _next(self) -> viewer_messages.ViewerMessage:
+        """Return the next message. Raises EOFError if the page is closed, ClientError if the message is malformed."""
+        event = await self._receive()
+        if event["type"] == "websocket.disconnect":
+            raise EOFError
+        return viewer_messages.read(event.get("text"))
+
+    async def _obey(self) -> None:
+        faults = 0
+        while True:
+            try:
+                message = await self._next()
+                if pause := self._rate.take(time.monotonic()):
+                    await asyncio.sleep(pause)
+                await self._answer(message)
+            except ClientError as error:
+                faults += 1
+                if faults == _MAX_FAULTS:
+                    raise
+                await self._send({"type": "refused", "reason": error.reason})
+
+    async def _answer(self, message: viewer_messages.ViewerMessage) -> None:
+        match message:
+            case ViewerOrder():
+                self._guard.check_operator(message.token)
+                _logger.info("a page orders: %s", message.order)
+                reason = await asyncio.to_thread(self._data.give_order, message.order)
+                if reason:
+                    raise ClientError("unavailable", reason)
+                await self._send({"type": "ordered", "order": message.order})
+            case ViewerCamera(on=on):
+                if self._camera is not None:
+                    self._camera.cancel()
+                self._camera = None
+                if on and self._data.camera is not None:
+                    self._camera = asyncio.create_task(self._show_camera())
+            case ViewerHello():
+                raise ClientError("out_of_turn", "a connection has one hello")

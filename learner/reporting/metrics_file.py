@@ -1,0 +1,39 @@
+"""Reading metrics.csv, which may be damaged or of another release."""
+
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+_MAX_COLUMNS = 256
+
+
+def read_rows(path: Path) -> Iterator[dict[str, float]]:
+    """Yield the rows of a file: its finite numbers by column. Damaged rows are left out.
+
+    Raises OSError if the file cannot be read, ValueError if it is not the metrics of a run.
+    """
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        lines = csv.reader(file)
+        try:
+            columns = next(lines, [])
+            if "env_steps" not in columns or len(columns) > _MAX_COLUMNS:
+                raise ValueError(f"{path} has no column env_steps: it is not the metrics of a run")
+            for cells in lines:
+                row = _numbers(columns, cells)
+                if "env_steps" in row:
+                    yield row
+        except csv.Error as error:
+            raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def _numbers(columns: list[str], cells: list[str]) -> dict[str, float]:
+    row = {}
+    for name, cell in zip(columns, cells, strict=False):
+        try:
+            value = float(cell)
+        except ValueError:
+            continue  # empty, or damaged
+        if math.isfinite(value):
+            row[name] = value
+    return row

@@ -1,0 +1,28 @@
+"""Orders of operators. State; the transport's threads give them, and the learner's thread takes them."""
+
+import threading
+
+from daedalus.protocol.orders import Order
+
+
+class Orders:
+    """The orders that were not carried out yet."""
+
+    def __init__(self, stop: threading.Event) -> None:
+        """`stop` ends the run."""
+        self._stop, self._save = stop, threading.Event()
+        self.stopped = False  # whether an operator stopped the run
+
+    def give(self, order: Order) -> None:
+        """Note an order."""
+        if order == "checkpoint":
+            self._save.set()
+        else:
+            self.stopped = True
+            self._stop.set()
+
+    def take_checkpoint(self) -> bool:
+        """Return whether a checkpoint was ordered since the last call."""
+        ordered = self._save.is_set()
+        self._save.clear()
+        return ordered

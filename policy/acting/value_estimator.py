@@ -1,0 +1,52 @@
+"""Value estimates of a saved policy, for somebody who watches an episode. Imports torch: actors never use it."""
+
+import numpy as np
+import torch
+
+from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.saving.saved_policy import SavedPolicy
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import DiscreteSpace
+
+
+class ValueEstimator:
+    """The critic of one checkpoint."""
+
+    def __init__(self, policy: SavedPolicy, modules: UserModules) -> None:
+        """Build the network. Raises PolicyError if the parameters do not fit it, or a module may not be imported."""
+        torch.set_num_threads(1)
+        spec, spaces = policy.spec, policy.spaces
+        try:
+            network = ActorCritic(spec.policy, spaces, modules, spec.training)
+            given = {name: torch.from_numpy(values.copy()) for name, values in policy.weights.items()}
+            network.load_state_dict(given, strict=False)
+        except (NetworkError, RuntimeError) as error:
+            raise PolicyError(str(error).splitlines()[0]) from None
+        missing = dict(network.named_parameters()).keys() - given.keys()
+        if missing:
+            raise PolicyError(f"the checkpoint lacks the parameters {min(missing)!r}")
+        self._network = network.eval().requires_grad_(False)
+        self._discrete = {name for name, space in spaces.observations.items() if isinstance(space, DiscreteSpace)}
+        # Of an algorithm of action values, the value of a state is that of its best action.
+        self._is_known = network.value_head is not None or network.distribution.parameter_count == sum(
+            space.choices for space in spaces.actions.values() if isinstance(space, DiscreteSpace) and space.size == 1
+        )
+
+    def __call__(self, observations: dict[str, np.ndarray], state: np.ndarray) -> float | None:
+        """Return the value of one observation, in the scale of the rewards that the learner sees; None if unknown.
+
+        Args:
+          observations: of each component [1, *stacked_shape].
+          state: [1, S] float32, the policy's memory.
+        """
+        if not self._is_known:
+            return None
+        row = {
+            name: torch.from_numpy(values.astype(np.int64) if name in self._discrete else values.copy())[None]
+            for name, values in observations.items()
+        }
+        starts = torch.zeros((1, 1), dtype=torch.bool)
+        parameters, values = self._network(row, torch.from_numpy(state.copy()), starts)
+        return float(parameters.max() if self._network.value_head is None else values[0, 0])

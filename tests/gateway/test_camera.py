@@ -1,0 +1,173 @@
+"""The camera: what it says of an action, the episodes that it plays, and its process."""
+
+import asyncio
+import json
+import os
+import struct
+import sys
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from processes import LIMIT
+from scripted_learner import POLICY, SPEC
+
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
+from daedalus.gateway.learner_link import NewestPolicy
+from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
+from daedalus.policy.user_modules import NO_MODULES
+from daedalus.protocol.messages import Snapshot, Welcome
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import RunSpec
+
+COMMAND = (sys.executable, "-P", "-m", "daedalus.cli.commands.camera")
+STATE = np.zeros((3, 0), np.float32)
+
+
+def weights() -> dict[str, np.ndarray]:
+    return {name: value.detach().numpy() for name, value in POLICY.network.named_parameters()}
+
+
+def runtime() -> OnnxRuntime:
+    made = OnnxRuntime(POLICY.model)
+    made.load(weights())
+    return made
+
+
+def policy(spec: RunSpec = SPEC, version: int = 4) -> NewestPolicy:
+    welcome = Welcome(run="r", learner_epoch=1, seed=1, epsilon=0.0, spec=spec)
+    name = program_hash(POLICY.model)
+    snapshot = Snapshot(learner_epoch=1, policy_version=version, program=name, weights=weights())
+    return NewestPolicy(session=welcome, program=POLICY.model, snapshot=snapshot)
+
+
+def spaces(**actions: DiscreteSpace | ContinuousSpace) -> Spaces:
+    return Spaces(observations={"observation": ArraySpace(shape=(1,), dtype="float32")}, actions=actions)
+
+
+def test_probabilities_of_the_only_choice_are_those_of_the_program() -> None:
+    choice = Choice({"action": np.array([[1], [0], [1]])}, np.log(np.array([0.75, 0.25, 0.75], np.float32)), STATE)
+    (facts,) = action_facts(spaces(action=DiscreteSpace(counts=(3,))), choice)
+    assert facts == {"name": "action", "choices": [["0", 0.25, False], ["1", 0.75, True], ["2", 0.0, False]]}
+
+
+def test_probabilities_of_several_variables_are_shares_of_the_samples() -> None:
+    choice = Choice(
+        {"action": np.array([[1, 2], [0, 2], [1, 2], [1, 0], [1, 2]])}, np.zeros(5, np.float32), np.zeros((5, 0))
+    )
+    first, second = action_facts(spaces(action=DiscreteSpace(counts=(2, 3))), choice)
+    assert first["choices"] == [["0", 0.25, False], ["1", 0.75, True]]
+    assert second["choices"] == [["0", 0.25, False], ["1", 0.0, False], ["2", 0.75, True]]
+
+
+def test_numbers_are_shown_with_the_spread_of_the_samples() -> None:
+    choice = Choice({"arm": np.array([[0.5], [1.0], [3.0]], np.float32)}, np.zeros(3, np.float32), STATE)
+    (facts,) = action_facts(spaces(arm=ContinuousSpace(low=(None,), high=(None,))), choice)
+    assert facts == {"name": "arm", "numbers": [[0.5, 1.0]]}
+
+
+def test_of_very_many_choices_the_likely_ones_are_shown() -> None:
+    taken = np.array([[900], [3], [900]])
+    choice = Choice({"action": taken}, np.log(np.array([0.2, 0.1, 0.2], np.float32)), STATE)
+    (facts,) = action_facts(spaces(action=DiscreteSpace(counts=(1000,))), choice)
+    assert facts["choices"] == [["3", 0.1, False], ["900", 0.2, True]]
+
+
+def test_an_episode_is_played_with_pictures() -> None:
+    camera = EpisodeCamera(SPEC, NO_MODULES)
+    try:
+        moments = list(camera.play(runtime()))
+        again = next(camera.play(runtime()))
+    finally:
+        camera.close()
+    assert [moment.step for moment in moments] == list(range(1, len(moments) + 1))
+    assert moments[-1].total == len(moments)
+    assert again.step == 1
+    shares = [share for _, share, _ in moments[0].actions[0]["choices"]]
+    assert sum(shares) == pytest.approx(1.0, abs=1e-3)
+    assert sum(taken for _, _, taken in moments[0].actions[0]["choices"]) == 1
+    assert jpeg(moments[0].picture)[:3] == b"\xff\xd8\xff"
+
+
+def test_large_pictures_are_made_smaller() -> None:
+    with Image.open(BytesIO(jpeg(np.zeros((900, 1800, 3), np.uint8)))) as image:
+        assert image.size == (640, 320)
+
+
+def test_module_that_is_not_allowed_is_not_imported() -> None:
+    spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "evil:Evil-v0"})})
+    with pytest.raises(EnvironmentSetupError, match="may not be imported here"):
+        EpisodeCamera(spec, NO_MODULES)
+
+
+def facts_of(frame: bytes) -> dict[str, Any]:
+    (length,) = struct.unpack_from("<I", frame)
+    return json.loads(frame[4 : 4 + length])
+
+
+def test_the_process_runs_while_somebody_watches_only() -> None:
+    async def watch() -> None:
+        camera = CameraProcess(COMMAND)
+        newest: list[NewestPolicy | None] = [None]
+        camera.newest_policy = lambda: newest[0]
+        frames = camera.frames()
+        async with asyncio.timeout(LIMIT):
+            assert "no policy yet" in facts_of(await anext(frames))["error"]
+            newest[0] = policy()
+            while "error" in (facts := facts_of(frame := await anext(frames))):
+                pass
+            assert facts["version"] == 4
+            assert frame[-2:] == b"\xff\xd9"  # a complete JPEG
+            newest[0] = _newer(newest[0])
+            while facts_of(await anext(frames))["version"] == 4:
+                pass
+            (process,) = children()
+            await frames.aclose()
+            while children() == [process]:
+                await asyncio.sleep(0.05)
+            await camera.close()
+
+    asyncio.run(watch())
+    assert children() == []
+
+
+def _newer(old: NewestPolicy | None) -> NewestPolicy:
+    assert old is not None
+    return NewestPolicy(session=old.session, program=old.program, snapshot=policy(version=5).snapshot)
+
+
+def children() -> list[int]:
+    """Return the ids of the camera processes of this test."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if parent == os.getpid() and b"daedalus.cli.commands.camera" in words:
+            found.append(int(entry.name))
+    return found
+
+
+def test_the_page_is_told_why_there_is_no_picture() -> None:
+    spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "None-v0"})})
+
+    newest = policy(spec)
+
+    async def watch() -> str:
+        camera = CameraProcess(COMMAND)
+        camera.newest_policy = lambda: newest
+        frames = camera.frames()
+        async with asyncio.timeout(LIMIT):
+            facts = facts_of(await anext(frames))
+        await frames.aclose()
+        await camera.close()
+        return facts["error"]
+
+    assert "The camera cannot play: " in asyncio.run(watch())

@@ -1,0 +1,220 @@
+"""The page in a real browser: of a real run, and of runs that no test can wait for."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import Visit, chromium
+from gateways import RunningGateway
+from processes import LIMIT, Running, starting, until
+from watched import HOSTILE, actor_status, observed, run_status
+
+from daedalus.cli.status_query import ask
+from daedalus.protocol.status import Event
+from daedalus.transport.connecting import connect
+from daedalus.transport.memory import MemoryNetwork
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Debian's chromium")
+MILLISECONDS = 1000 * LIMIT
+ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
+Open = Callable[..., Visit]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as one:
+        yield one
+
+
+@pytest.fixture
+def visit(browser: Any) -> Iterator[Open]:
+    """Function that opens a page; at the end no page may have complained, or asked another host."""
+    visits: list[Visit] = []
+
+    def visit_one(address: str, **options: Any) -> Visit:
+        visits.append(Visit(browser, address, **options))
+        return visits[-1]
+
+    yield visit_one
+    for one in visits:
+        one.close()
+    for one in visits:
+        assert one.complaints == []
+        assert one.strange_requests == []
+
+
+@pytest.fixture
+def gateway(network: MemoryNetwork) -> Iterator[RunningGateway]:
+    running = RunningGateway(network, follows=False)
+    yield running
+    running.close()
+
+
+def show(gateway: RunningGateway, *arguments: Any, **fields: Any) -> None:
+    gateway.call(lambda: gateway.data.show(observed(*arguments, **fields)))
+
+
+def text_of(page: Any, selector: str) -> str:
+    return page.locator(selector).inner_text()
+
+
+# ------------------------------------------------------------------------------------------------- a real run
+
+
+class Run:
+    """`daedalus train --watch`."""
+
+    def __init__(self, process: Running) -> None:
+        self.process = process
+        self.learner = process.expect(r" at (unixsock-stream/\S+);")[1]
+        self.address = process.expect(r"watch the run at (http\S+)")[1]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[tuple[Run, Callable[..., Running]]]:
+    """A run, and a function that starts further commands. Asking for the browser first skips without one."""
+    with starting(tmp_path_factory.mktemp("watched")) as start:
+        process = start("train", "cartpole", "--watch", "--run-dir", "run", "--actors", 1, *ENDLESS)
+        yield Run(process), start
+
+
+def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable[..., Running]], visit: Open) -> None:
+    watched, start = run
+    page = visit(watched.address).page
+    page.wait_for_selector("#charts .line", timeout=MILLISECONDS)
+    page.wait_for_function("document.querySelectorAll('#charts .line').length >= 5", timeout=MILLISECONDS)
+    page.wait_for_function("document.querySelector('#state').textContent === 'running'", timeout=MILLISECONDS)
+    assert text_of(page, "#run") == "run"
+    actor = start("actor", "--connect", watched.learner, "--name", "fragile")
+    row = "tr:has(td:text-is('fragile'))"
+    page.wait_for_selector(f"{row}[data-state='alive']", timeout=MILLISECONDS)
+    actor.process.send_signal(signal.SIGKILL)
+    page.wait_for_selector(f"{row}[data-state='gone']", timeout=MILLISECONDS)
+    page.wait_for_selector("#log li:has-text('fragile'):has-text('left')", timeout=MILLISECONDS)
+
+
+def test_a_page_that_is_opened_late_shows_the_run_from_its_begin(
+    run: tuple[Run, Callable[..., Running]], visit: Open
+) -> None:
+    page = visit(run[0].address).page
+    page.wait_for_function("document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
+    label = page.locator("#charts svg").first.get_attribute("aria-label")
+    assert "from" in label
+
+
+def test_three_pages_that_play_are_three_actors_that_the_run_learns_from(
+    run: tuple[Run, Callable[..., Running]], visit: Open
+) -> None:
+    pages = [visit(f"{run[0].address}play").page for _ in range(3)]
+    for page in pages:
+        page.locator("#fast").check()
+    names = {page.locator("#name").input_value() for page in pages}
+    assert len(names) == 3
+    transport = connect([run[0].learner])
+    try:
+        until(lambda: names <= {one.actor for status in ask(transport) for one in status.actors if one.env_steps > 0})
+        played = [one for one in ask(transport)[0].actors if one.actor in names]
+        assert not {cause for one in played for cause in one.rollouts_rejected} - {"stale"}
+    finally:
+        transport.close()
+    assert all("Playing as" in text_of(page, "#status") for page in pages)
+
+
+def test_an_episode_is_shown_on_request(run: tuple[Run, Callable[..., Running]], visit: Open) -> None:
+    page = visit(run[0].address).page
+    page.locator("#camera-switch:enabled").click()
+    page.wait_for_selector("#camera-view .bars li:nth-child(2)", timeout=MILLISECONDS)
+    assert page.locator("#camera-view canvas").evaluate("canvas => canvas.width") > 300
+    page.locator("#camera-switch").click()
+    assert page.locator("#camera-view").is_hidden()
+
+
+def test_an_operator_stops_the_run_and_the_page_shows_its_end(
+    run: tuple[Run, Callable[..., Running]], visit: Open
+) -> None:
+    process, visited = run[0].process, visit(run[0].address)
+    page, visited.loses_gateway = visited.page, True
+    token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run" / "operator-token").read_text().strip()
+    page.locator("#operator-token").fill("wrong")
+    page.get_by_role("button", name="Save a checkpoint").click()
+    page.wait_for_function("document.querySelector('#order-result').textContent.startsWith('Not done')")
+    page.locator("#operator-token").fill(token)
+    page.get_by_role("button", name="Stop the run").click()
+    page.get_by_role("dialog").get_by_role("button", name="Keep running").click()
+    assert process.process.poll() is None
+    page.get_by_role("button", name="Stop the run").click()
+    page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
+    assert process.wait() == 1, process.output
+    assert "stopped; continue with: daedalus resume run" in process.output
+    page.wait_for_function("['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
+
+
+# --------------------------------------------------------------------------------------- runs made for the page
+
+
+def test_texts_of_peers_are_shown_as_texts(gateway: RunningGateway, visit: Open) -> None:
+    actor = actor_status(HOSTILE, host=HOSTILE, quarantined=HOSTILE, rollouts_rejected={HOSTILE: 2})
+    event = Event(time="2026-11-22T13:16:45.123Z", kind="joined", actor=HOSTILE, text=HOSTILE, count=2)
+    status = run_status((actor,), run=HOSTILE, environment=HOSTILE, algorithm=HOSTILE, problems=(HOSTILE,))
+    show(gateway, status, [{"env_steps": 1.0, f"user/{HOSTILE}": 2.0}], events=(event,), reason=HOSTILE)
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#actors tbody tr")
+    assert page.locator("img").count() == 0
+    for selector in ("#run", "#actors", "#log", "#notices"):
+        assert HOSTILE in text_of(page, selector)
+    assert page.title().startswith(HOSTILE)
+
+
+def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGateway, visit: Open) -> None:
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#notices:has-text('has not reached its network yet')")
+    gateway.call(lambda: gateway.data.show(gateway.data.seen.__class__(state="waiting")))
+    page.wait_for_selector("#notices:has-text('No learner has answered yet')")
+    show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished")
+    page.wait_for_selector("#notices:has-text('The run has ended: the run is over')")
+    assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
+
+
+def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gateway: RunningGateway, visit: Open) -> None:
+    actors = tuple(
+        actor_status(
+            f"wing-{number}", host=f"host-{number % 7}", env_steps_per_second=float(number), alive=number != 500
+        )
+        for number in range(1000)
+    )
+    show(gateway, run_status(actors))
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#hosts tbody tr:nth-child(7)")
+    assert text_of(page, "#totals").startswith("1,000 actors: 999 alive")
+    assert page.locator("#actors tbody tr").count() == 100
+    header = page.get_by_role("columnheader", name="env_steps/s").last.get_by_role("button")
+    header.focus()
+    page.keyboard.press("Enter")
+    assert page.locator("#actors tbody tr td").first.inner_text() == "wing-999"
+    page.keyboard.press("Enter")
+    assert page.locator("#actors tbody tr td").first.inner_text() == "wing-0"
+    assert page.locator("#actors th[aria-sort='ascending']").inner_text().startswith("env_steps/s")
+    page.locator("#filter").fill("gone host-3")
+    assert text_of(page, "#totals").startswith("1 actor of 1,000 actors: 0 alive")
+    assert page.locator("#actors tbody tr td").first.inner_text() == "wing-500"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_page_is_accessible_and_fits(gateway: RunningGateway, visit: Open, scheme: str, width: int) -> None:
+    quarantined = actor_status("wing-2", quarantined="its rollouts are not finite")
+    actors = (actor_status("wing-1", compact_snapshots=True), quarantined, actor_status("wing-3", alive=False))
+    rows = [{"env_steps": 100.0 * step, "episode_return_mean": 1.0 * step, "entropy": 0.5} for step in range(20)]
+    event = Event(time="2026-11-22T13:16:45.123Z", kind="left", actor="wing-3", text="no longer connected", count=1)
+    show(gateway, run_status(actors, problems=("no update for 61 s",)), rows, events=(event,))
+    for path, selector in (("", "#charts .line"), ("play", "#status")):
+        options = {"color_scheme": scheme, "viewport": {"width": width, "height": 800}}
+        one = visit(f"http://127.0.0.1:{gateway.port}/{path}", **options)
+        one.page.wait_for_selector(selector)
+        overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+        assert one.page.evaluate(overflow) <= 0
+        assert one.violations() == []

@@ -1,0 +1,97 @@
+"""Statuses for tests of the page, and a source that returns what the test says."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+
+from daedalus.gateway.watching.observation import Observation
+from daedalus.protocol.metrics import MetricsPage, MetricsReport
+from daedalus.protocol.orders import Order
+from daedalus.protocol.status import ActorStatus, Event, EventsPage, RunStatus
+from daedalus.transport.interface import TransportError
+
+HOSTILE = '<img src=x onerror="document.title=1">'  # a text of a peer
+
+
+def actor_status(name: str, **fields: object) -> ActorStatus:
+    values: dict[str, object] = {
+        **dict.fromkeys(("host", "software", "address", "quarantined"), ""),
+        **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed", "env_steps"), 1),
+        **dict.fromkeys(("busy_answers", "policy_lag"), 0),
+        **dict.fromkeys(("seconds_since_seen", "env_steps_per_second", "bytes_up_per_hour"), 1.0),
+        "bytes_down_per_hour": 1.0,
+        "epsilon": 0.0,
+        "rollouts_rejected": {},
+        "alive": True,
+        "compact_snapshots": False,
+    }
+    return ActorStatus.model_validate({**values, "actor": name, **fields}, strict=False)
+
+
+def run_status(actors: tuple[ActorStatus, ...] = (), **fields: object) -> RunStatus:
+    values: dict[str, object] = {
+        **dict.fromkeys(("uptime_seconds", "env_steps_per_second", "updates_per_second", "policy_lag_mean"), 2.5),
+        **dict.fromkeys(("updates", "updates_skipped", "queue_bytes", "queue_bytes_limit"), 3),
+        **dict.fromkeys(("rollouts_accepted", "rollouts_missed", "busy_answers"), 4),
+        **dict.fromkeys(("actors_quarantined", "actors_gone"), 0),
+        "run": "r",
+        "learner_epoch": 1,
+        "algorithm": "impala",
+        "environment": "CartPole-v1",
+        "problems": (),
+        "env_steps": 100,
+        "env_steps_budget": 1000,
+        "episode_return_mean": 12.5,
+        "checkpoint_age_seconds": None,
+        "certificate_days_left": None,
+        "rollouts_rejected": {},
+        "actors_alive": len(actors),
+        "refused_joins": (),
+        "actors": actors,
+    }
+    return RunStatus.model_validate({**values, **fields})
+
+
+class FakeSource:
+    """A RunSource."""
+
+    def __init__(self) -> None:
+        self.answer: RunStatus | None = None
+        self.fails = False
+        self.newest_events: tuple[Event, ...] = ()
+        self.rows: list[dict[str, float]] = []
+        self.page_rows = 3  # in one answer
+        self.asked_actors: list[int] = []
+        self.orders: list[Order] = []
+        self.asked = threading.Semaphore(0)
+
+    def status(self, max_actors: int) -> RunStatus | None:
+        self.asked.release()
+        if self.fails:
+            raise TransportError("the router is gone")
+        self.asked_actors.append(max_actors)
+        return self.answer
+
+    def events(self, status: RunStatus) -> EventsPage | None:
+        return EventsPage(run=status.run, learner_epoch=status.learner_epoch, events=self.newest_events)
+
+    def metrics(self, status: RunStatus, first: int) -> MetricsReport | None:
+        numbers = list(range(first, len(self.rows)))[: self.page_rows]
+        columns = tuple(sorted({name for number in numbers for name in self.rows[number]}))
+        values = [[self.rows[number].get(name, np.nan) for name in columns] for number in numbers]
+        return MetricsReport(
+            page=MetricsPage(run=status.run, learner_epoch=status.learner_epoch, columns=columns),
+            numbers=np.array(numbers, np.int64),
+            values=np.array(values, np.float64).reshape(len(numbers), len(columns)),
+        )
+
+    def order(self, status: RunStatus, order: Order) -> str:
+        self.orders.append(order)
+        return ""
+
+
+def observed(status: RunStatus, rows: list[dict[str, float]] | None = None, **fields: object) -> Observation:
+    """Return a running run."""
+    seen = Observation(state="running", status=status, actors=status.actors, rows=tuple(enumerate(rows or [])))
+    return replace(seen, **fields)  # type: ignore[arg-type] - fields of an Observation
