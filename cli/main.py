@@ -14,6 +14,7 @@ Actor-critic reinforcement learning with one learner and any number of actors, o
 on this machine:
   train      start a learner and actors, show their progress, evaluate the result
   resume     continue a run from its newest checkpoint
+  sweep      train runs of several settings and seeds, and compare them
   check      play an environment with random actions, and report its faults, its speed and what train would choose
 
 on several machines, one process at a time:
@@ -82,6 +83,12 @@ def _resume(arguments: list[str]) -> int:
     return resume(arguments)
 
 
+def _sweep(arguments: list[str]) -> int:
+    from daedalus.cli.commands.sweep import sweep
+
+    return sweep(arguments)
+
+
 def _check(arguments: list[str]) -> int:
     from daedalus.cli.commands.check import check
 
@@ -139,6 +146,7 @@ def _completion(arguments: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
+    "sweep": _sweep,
     "check": _check,
     "router": _router,
     "status": _status,

@@ -5,7 +5,7 @@ from typing import Literal
 from daedalus.protocol.specification import Specification
 
 MAX_EVENTS = 100  # that a learner keeps
-PAGE_ACTORS = 100  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
+PAGE_ACTORS = 64  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
 
 
 class ActorStatus(Specification):

@@ -30,7 +30,7 @@ from daedalus.protocol.messages import (
     Welcome,
 )
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -48,8 +48,8 @@ class Policy:
     model: bytes
 
     @classmethod
-    def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
-        network = ActorCritic(spec, spaces)
+    def of(cls, spec: PolicySpec, spaces: Spaces, training: TrainingSpec | None = None) -> "Policy":
+        network = ActorCritic(spec, spaces, training=training)
         return cls(network, export_program(network, spaces))
 
 
@@ -69,6 +69,7 @@ class ScriptedLearner:
         self.reports: queue.Queue[ClientReport] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.epsilons: dict[str, float] = {}  # by actor; 0 of the others
         self.extras: dict[str, np.ndarray] = {}  # in snapshots, besides the weights
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.compact_fetches: list[SnapshotRequest] = []
@@ -84,7 +85,8 @@ class ScriptedLearner:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
-        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, spec=self.spec)
+        epsilon = self.epsilons.get(message.actor, 0.0)
+        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec)
         request.reply(encode(self.refusal or answer))
 
     def _report(self, request: Request) -> None:
