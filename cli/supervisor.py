@@ -134,12 +134,12 @@ def supervised_actor(
     return Supervised(name, begin, ended={0})
 
 
-def stop(processes: list[subprocess.Popen[bytes]]) -> None:
+def stop(processes: list[subprocess.Popen[bytes]], grace_seconds: float = _GRACE_SECONDS) -> None:
     """End processes: send SIGTERM to all, wait, then kill those that are left."""
     for process in processes:
         if process.poll() is None:
             process.terminate()
-    deadline = time.monotonic() + _GRACE_SECONDS
+    deadline = time.monotonic() + grace_seconds
     for process in processes:
         try:
             process.wait(max(deadline - time.monotonic(), 0.0))

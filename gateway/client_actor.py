@@ -63,6 +63,11 @@ class ClientActor:
         mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
         try:
             check_run(spec)
+            if spec.algorithm.synchronous:
+                raise ActorError(
+                    f"a run with {spec.training.algorithm} makes its actors wait for each update, which clients of a "
+                    "gateway do not: use another algorithm"
+                )
             transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
@@ -163,6 +168,7 @@ class ClientActor:
         try:
             self._add_reward(message.reward)
             self.rows.end_episode(values, terminated=message.terminated)
+            self.rows.complete_episode()
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
 

@@ -15,6 +15,7 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
@@ -65,6 +66,7 @@ class ScriptedLearner:
         self.epoch, self.spec, self.policy = epoch, spec, policy
         self.joins: queue.Queue[Join] = queue.Queue()
         self.rollouts: queue.Queue[Request] = queue.Queue()
+        self.reports: queue.Queue[ClientReport] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
         self.epsilons: dict[str, float] = {}  # by actor; 0 of the others
@@ -74,6 +76,7 @@ class ScriptedLearner:
         self._compact = CompactSnapshotCache(epoch)
         self.transport.declare_presence(keys.learner(run))
         self.transport.serve(keys.rollouts(run, "*"), self.rollouts.put)
+        self.transport.serve(keys.reports(run, "*"), self._report)
         self.transport.serve(keys.snapshots(run), self._newest)
         self.transport.serve(keys.program(run, "*"), self._program)
         self.transport.serve(keys.join(run, "*"), self._join)
@@ -85,6 +88,12 @@ class ScriptedLearner:
         epsilon = self.epsilons.get(message.actor, 0.0)
         answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec)
         request.reply(encode(self.refusal or answer))
+
+    def _report(self, request: Request) -> None:
+        message = decode(request.payload, Limits())
+        assert isinstance(message, ClientReport)
+        self.reports.put(message)
+        acknowledge(request, "accepted")
 
     def _newest(self, request: Request) -> None:
         if not request.size:

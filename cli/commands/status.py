@@ -149,8 +149,24 @@ def _table(status: RunStatus) -> list[str]:
         *(f"  {_line(actor)}" for actor in status.actors),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
+        *(f"  {actor.actor} {text}" for actor in status.actors for text in _client_texts(actor)),
         *map(_refused, status.refused_joins),
     ]
+
+
+def _client_texts(actor: ActorStatus) -> list[str]:
+    """Return what a client, whose loop its user owns, reports about itself."""
+    counts = {
+        f"of {actor.deadlines:,} deadlines missed": actor.missed_deadlines,
+        "actions overridden": actor.overridden_actions,
+        "safe actions": actor.safe_actions,
+        "rollouts dropped": actor.rollouts_dropped,
+    }
+    counted = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+    if not counted and actor.deadlines:
+        counted = f"0 of {actor.deadlines:,} deadlines missed"
+    safe = [f"plays the safe action: {actor.safe_reason}"] if actor.safe_reason and actor.alive else []
+    return [*safe, *([f"counts {counted}"] if counted else [])]
 
 
 def _refused(refused: RefusedJoin) -> str:

@@ -11,7 +11,7 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import process_started, stop_on_signals
+from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.run_report import report
 from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
@@ -178,6 +178,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     add_tls(options)
     add_insecure(options)
     add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)  # for `daedalus sweep`
 
 
 def _check_listening(parsed: argparse.Namespace) -> None:
@@ -212,9 +213,12 @@ def _run(
         log_json=parsed.log_json,
     )
     output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
+    stopping = stop_on_signals()
+    if parsed.exit_with_parent:
+        exit_with_parent(stopping)
     try:
         with output:
-            end = run_locally(run, stop_on_signals(), output)
+            end = run_locally(run, stopping, output)
     except RunStoppedError:
         options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
         print(f"stopped; continue with: daedalus resume {directory}{options}")

@@ -8,6 +8,7 @@ from daedalus.learner.serving import fleet_status, former_incarnations, presence
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.status import PAGE_ACTORS
 
 WINDOW = 1024
 MINUTE = 60.0
@@ -337,10 +338,10 @@ def test_number_of_remembered_incarnations_is_bounded(monkeypatch: pytest.Monkey
 
 
 def test_pages_of_the_status_contain_every_actor_once() -> None:
-    fleet = joined_fleet(*(f"a{number}" for number in range(250)))
+    fleet = joined_fleet(*(f"a{number}" for number in range(2 * PAGE_ACTORS + 50)))
     pages, after = [], ""
     while page := fleet_status.page(fleet, after, 0.0):
         pages.append([status.actor for status in page])
         after = page[-1].actor
-    assert [len(each) for each in pages] == [100, 100, 50]
+    assert [len(each) for each in pages] == [PAGE_ACTORS, PAGE_ACTORS, 50]
     assert [name for each in pages for name in each] == sorted(fleet.actors)
