@@ -11,6 +11,7 @@ import pytest
 from browser import Visit, chromium
 from gateways import RunningGateway
 from processes import LIMIT, Running, starting, until
+from scripted_learner import SPEC, ScriptedLearner
 from watched import HOSTILE, actor_status, observed, run_status
 
 from daedalus.cli.status_query import ask
@@ -177,6 +178,20 @@ def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGat
     show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished")
     page.wait_for_selector("#notices:has-text('The run has ended: the run is over')")
     assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
+
+
+def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwork, visit: Open) -> None:
+    other = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "Other-v0"})})
+    learner = ScriptedLearner(network, other)
+    learner.publish(0)
+    running = RunningGateway(network)
+    try:
+        page = visit(f"http://127.0.0.1:{running.port}/play").page
+        page.wait_for_selector("#status:has-text('Not playing: the run plays Other-v0')", timeout=MILLISECONDS)
+        assert text_of(page, "#steps") == "0"
+    finally:
+        running.close()
+        learner.transport.close()
 
 
 def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gateway: RunningGateway, visit: Open) -> None:
