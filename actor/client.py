@@ -9,9 +9,11 @@
                 client.end_episode(terminated=True)
 
 A client sends the same rollouts as any actor, from a thread of its own: no call waits for the network after the first
-policy has come. While the learner is away or too slow, the client keeps the newest rollouts and the last policy.
+policy has come. While the learner is away or too slow, the client keeps the newest rollouts and the last policy, or
+plays a safe action. One client is one agent in one environment: make a client for each.
 """
 
+import itertools
 import os
 import re
 import secrets
@@ -23,13 +25,18 @@ from typing import Any
 
 import gymnasium
 
+from daedalus.actor.clock import Clock
 from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
+from daedalus.protocol.client_report import ClientReport
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import credentials_to_connect
+
+_numbers = itertools.count(1)  # of the clients of this process
 
 
 class Client:
@@ -47,6 +54,9 @@ class Client:
         link: LinkChoice = "auto",
         timeout: float = 60.0,
         action_mask: Any = None,
+        safe_action: Any = None,
+        max_policy_age: float | None = None,
+        untrained: bool = False,
     ) -> None:
         """Join a run, and wait for the first policy.
 
@@ -61,9 +71,17 @@ class Client:
           timeout: seconds to wait for a learner and its first policy.
           action_mask: an example of the masks that `act` gets, if some discrete actions are not always legal: an array
             over all choices, or a map of arrays by action component.
+          safe_action: what to play while the policy is too old or untrained: an action, or a function that returns one
+            for an observation. None: the policy always acts.
+          max_policy_age: with a safe action, the seconds within which the learner must have confirmed that it has no
+            newer policy; default: 30.
+          untrained: with a safe action, whether a policy may act that no update of this run has changed. Such a policy
+            is random, unless the run began with trained weights.
 
-        Raises ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
+        Raises ValueError for a safe action that is not in the action space; ActorError, TransportError,
+        EnvironmentSetupError, AddressError or CredentialsError.
         """
+        guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         config = ActorConfig(
             name=keys.check_name(name or _default_name(credentials), "actor name"),
@@ -71,14 +89,17 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
+            max_policy_age=guard.max_age if guard.enabled else None,
         )
+        self._config = config
         self._stop = threading.Event()
-        self._collector = ClientCollector(observation_space, action_space, action_mask)
+        self._collector = ClientCollector(observation_space, action_space, action_mask, guard)
+        self._clocks: list[Clock] = []
         self._error: Exception | None = None
         transport = connect_with_retry([connect], self._stop, timeout, credentials)
         assert transport is not None  # only a stop makes it None
         self._transport = transport
-        self._service = ActorService(config, transport, self._stop, self._collector)
+        self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
         self._collector.on_rollout = self._service.wake
         self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
         self._thread.start()
@@ -86,26 +107,35 @@ class Client:
             self.close()
             raise self._error or ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
 
-    def act(self, observation: Any, action_mask: Any = None) -> Any:
+    def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
 
         Args:
           observation: of the observation space.
           action_mask: the legal choices, if the client was constructed with a mask: of the same form.
+          override: the action of a person or a safety filter, which is played in place of the policy's: `act` returns
+            it. The policy does not learn from it, but its memory goes on.
 
         Raises ValueError if the observation or the mask does not fit the spaces, ActorError if the learner quarantined
         this actor, and whatever else ended the client's thread.
         """
         if self._error is not None:
             raise self._error
-        return self._collector.act(observation, action_mask)
+        return self._collector.act(observation, action_mask, override)
 
     def reward(self, value: float) -> None:
-        """Add `value` to the reward of the last action; may be called any number of times.
+        """Add `value` to the reward of the last action; any number of times until the next `act`.
 
-        Raises ValueError if `value` is not finite, or before the first action of an episode.
+        A reward after `end_episode` still belongs to the last action of that episode. Raises ValueError if `value` is
+        not finite, or before the first action of an episode.
         """
         self._collector.reward(value)
+
+    def clock(self, rate: float) -> Clock:
+        """Return a clock with `rate` ticks a second, for the loop that calls `act`. The loop ends with the run."""
+        # After an error the loop goes on, so that its next `act` raises it.
+        self._clocks.append(Clock(rate, is_over=lambda: self.is_over and self._error is None))
+        return self._clocks[-1]
 
     def end_episode(self, *, terminated: bool, observation: Any = None) -> None:
         """End the episode; the next `act` begins another one.
@@ -121,8 +151,13 @@ class Client:
 
     @property
     def dropped(self) -> int:
-        """How many rollouts were discarded because the learner accepted none for long."""
+        """How many rollouts, finished or not, were dropped because the learner was away or accepted none for long."""
         return self._collector.dropped
+
+    @property
+    def safe_reason(self) -> str:
+        """Why the last `act` returned the safe action; empty if the policy acted."""
+        return self._collector.guard.reason
 
     @property
     def is_over(self) -> bool:
@@ -134,6 +169,20 @@ class Client:
         self._stop.set()
         self._thread.join(timeout=10.0)
         self._transport.close()
+
+    def _report(self) -> ClientReport:
+        """Return what the status shows of this client. Called on the client's thread."""
+        collector, clocks = self._collector, list(self._clocks)
+        return ClientReport(
+            actor=self._config.name,
+            incarnation=self._config.incarnation,
+            deadlines=sum(clock.deadlines for clock in clocks),
+            missed_deadlines=sum(clock.missed_deadlines for clock in clocks),
+            overridden_actions=collector.overridden_actions,
+            safe_actions=collector.safe_actions,
+            rollouts_dropped=collector.dropped,
+            safe_reason=collector.guard.reason,
+        )
 
     def _serve(self) -> None:
         try:
@@ -154,4 +203,5 @@ class Client:
 
 def _default_name(credentials: Credentials | None) -> str:
     host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
-    return f"{host}.{os.getpid()}"
+    number = next(_numbers)
+    return f"{host}.{os.getpid()}" + (f".{number}" if number > 1 else "")

@@ -32,8 +32,8 @@ class Batch:
     behaviour_log_probs: Tensor  # [T, B]
     rewards: Tensor  # [T, B]
     terminated: Tensor  # [T, B] bool
-    truncated: Tensor  # [T, B] bool
-    valid: Tensor  # [T, B] float32, 1 or 0
+    truncated: Tensor  # [T, B] bool; also where the next row is overridden: the return is bootstrapped there
+    valid: Tensor  # [T, B] float32, 1 for the rows to learn from, 0 for reset rows and overridden rows
 
     def to(self, device: torch.device) -> "Batch":
         """Return the batch on a device. Copies from pinned memory are asynchronous."""
@@ -116,8 +116,11 @@ class BatchAssembler:
         for kind in ("actions", "masks"):
             for name, values in getattr(rollout, kind).items():
                 getattr(batch, kind)[name].numpy()[:, columns] = values
-        for name in ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid"):
+        for name in ("behaviour_log_probs", "rewards", "terminated", "truncated"):
             getattr(batch, name).numpy()[:, columns] = getattr(rollout, name)
+        batch.valid.numpy()[:, columns] = rollout.learned
+        if rollout.overridden is not None:
+            batch.truncated.numpy()[:-1, columns] |= rollout.overridden[1:]
 
 
 def _dtype(space: Any) -> str:

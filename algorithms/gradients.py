@@ -48,7 +48,8 @@ class GradientComputer:
         )
         self._first_pass: FirstPass | None = None  # of the newest batch
         if is_own(spec.algorithm):
-            check_updates(spec, lambda batch: self.compute(batch, spec.entropy_bonus), spaces, network.state_size)
+            updates, state_size = (lambda batch: self.compute(batch, spec.entropy_bonus)), network.state_size
+            check_updates(spec, updates, self._try_after_update, spaces, state_size)
             self._first_pass = None
 
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
@@ -83,6 +84,12 @@ class GradientComputer:
     def after_update(self, policy_version: int) -> None:
         """Let the algorithm do what follows an update, whose gradient the caller has applied."""
         self._algorithm.after_update(policy_version, self.forward)
+
+    def _try_after_update(self) -> None:
+        before = {name: values.clone() for name, values in self.statistics.items()}
+        self.after_update(1)
+        for name, values in self.statistics.items():
+            values.copy_(before[name])
 
     @property
     def statistics(self) -> dict[str, Tensor]:

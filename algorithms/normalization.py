@@ -122,8 +122,8 @@ class RewardNormalizer:
         self.moments.merge(self.moments_of(rollouts))
 
     def moments_of(self, rollouts: Sequence[Rollout]) -> Moments:
-        """Return the moments of the returns of the valid rows of rollouts. Call it once for each rollout, in order."""
-        seen = [self._returns(rollout)[rollout.valid] for rollout in rollouts]
+        """Return the moments of the returns of the rows to learn from. Call it once for each rollout, in order."""
+        seen = [self._returns(rollout)[rollout.learned] for rollout in rollouts]
         return moments_of(torch.from_numpy(np.concatenate(seen)))
 
     def scale(self, batch: Batch) -> None:

@@ -46,13 +46,18 @@ def own_algorithm(spec: TrainingSpec, distribution: ActionDistribution, modules:
 
 
 def check_updates(
-    spec: TrainingSpec, updates: Callable[[Batch], Iterator[object]], spaces: Spaces, state_size: int
+    spec: TrainingSpec,
+    updates: Callable[[Batch], Iterator[object]],
+    after_update: Callable[[], None],
+    spaces: Spaces,
+    state_size: int,
 ) -> None:
     """Make the updates of a small batch of zeros, to find the faults of an algorithm before the run.
 
     Args:
       spec: names the algorithm.
       updates: computes the gradients of a batch; the parameters stay as they are.
+      after_update: does what follows an update, and undoes it.
       spaces: components of the batch.
       state_size: S, the size of the policy's memory; 0 without one.
 
@@ -65,6 +70,7 @@ def check_updates(
     try:
         with torch.random.fork_rng(devices=()):  # the run itself begins with the random state of its seed
             made = sum(1 for _ in updates(batch.to(torch.device(spec.device))))
+            after_update()
     except Exception as error:  # the user's code may raise anything
         raise _fault(spec.algorithm, error) from error
     if made != expected:

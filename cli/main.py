@@ -14,6 +14,7 @@ Actor-critic reinforcement learning with one learner and any number of actors, o
 on this machine:
   train      start a learner and actors, show their progress, evaluate the result
   resume     continue a run from its newest checkpoint
+  sweep      train runs of several settings and seeds, and compare them
   check      play an environment with random actions, and report its faults, its speed and what train would choose
 
 on several machines, one process at a time:
@@ -49,8 +50,13 @@ def _run() -> int:
         return 0 if arguments else 2
     command, rest = arguments[0], arguments[1:]
     if command in _MODULES:
+        line = [sys.executable, "-P", "-m", _MODULES[command], *rest]
+        if sys.platform == "win32" or not hasattr(os, "execv"):  # Windows would return to the shell at once
+            import subprocess
+
+            return subprocess.run(line, check=False).returncode
         # The command replaces this process, so signals reach it and its exit status is returned.
-        os.execv(sys.executable, [sys.executable, "-P", "-m", _MODULES[command], *rest])
+        os.execv(sys.executable, line)
     if command not in _COMMANDS:
         import difflib
 
@@ -75,6 +81,12 @@ def _resume(arguments: list[str]) -> int:
     from daedalus.cli.commands.train import resume
 
     return resume(arguments)
+
+
+def _sweep(arguments: list[str]) -> int:
+    from daedalus.cli.commands.sweep import sweep
+
+    return sweep(arguments)
 
 
 def _check(arguments: list[str]) -> int:
@@ -134,6 +146,7 @@ def _completion(arguments: list[str]) -> int:
 _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
+    "sweep": _sweep,
     "check": _check,
     "router": _router,
     "status": _status,

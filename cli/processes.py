@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import os
-import resource
 import select
 import signal
 import sys
@@ -18,7 +17,7 @@ _logger = logging.getLogger(__name__)
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
-UNREAD = 128 + signal.SIGPIPE  # exit status, as of other programs
+UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
@@ -30,6 +29,10 @@ def raise_descriptor_limit() -> None:
 
     Without this, about a thousand connections would use up the usual limit, and no checkpoint could be written.
     """
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows has no limit
+        return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     for limit in (hard, _MACOS_DESCRIPTORS):
         if soft in (limit, resource.RLIM_INFINITY):
@@ -60,11 +63,13 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
                 stop.set()
 
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)
+    if hasattr(os, "set_blocking"):  # Windows with Python 3.11 has none, and does not require it
+        os.set_blocking(writer, False)
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
-    os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
         threading.Thread(target=_exit_if_stuck, args=(stop, responded), name="stuck-watch", daemon=True).start()
@@ -74,7 +79,11 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
 def _exit_if_stuck(stop: threading.Event, responded: threading.Event) -> None:
     """Wait for `stop`, and end the process unless it ends by itself; `responded` is set by the signal handler."""
     stop.wait()
-    os.kill(os.getpid(), signal.SIGTERM)  # another part of the process may have set `stop`
+    # Another part of the process may have set `stop`.
+    if hasattr(signal, "pthread_kill"):
+        os.kill(os.getpid(), signal.SIGTERM)
+    else:  # Windows, where os.kill would end the process at once
+        signal.raise_signal(signal.SIGTERM)
     if responded.wait(_STUCK_SECONDS):
         time.sleep(_END_SECONDS)
     try:
@@ -127,6 +136,8 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
 
 def _is_unread(stream: TextIO) -> bool:
     """Return whether the other end of a pipe is closed."""
+    if not hasattr(select, "poll"):  # Windows: it cannot be asked, and standard streams are the only pipes there
+        return True
     poll = select.poll()
     poll.register(stream.fileno(), 0)
     return bool(poll.poll(0))  # of errors and closed ends alone
@@ -164,6 +175,6 @@ def process_started() -> float:
         ):
             ticks = int(stat.read().rsplit(")", 1)[1].split()[19])
             age = float(uptime.read().split()[0]) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError):
+    except (OSError, ValueError, IndexError, AttributeError):  # not Linux
         return now
     return now - max(age, 0.0)

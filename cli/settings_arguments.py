@@ -37,7 +37,9 @@ exit status: 0 the target was reached, all steps were done without a target to s
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage"""
 
 
-def add_settings(options: argparse.ArgumentParser) -> None:
+def add_settings(
+    options: argparse.ArgumentParser, seed_help: str = "seed of the network, the environments and the actions"
+) -> None:
     """Add the options that define a run: a preset or an environment, and changes to its settings."""
     options.add_argument(
         "preset",
@@ -60,7 +62,7 @@ def add_settings(options: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of actor processes. `daedalus learner` starts none, but a2c waits for this number",
     )
-    options.add_argument("--seed", type=int, metavar="S", help="seed of the network, the environments and the actions")
+    options.add_argument("--seed", type=int, metavar="S", help=seed_help)
     options.add_argument("--env-steps", type=int, metavar="N", help="budget: environment steps of all actors together")
     options.add_argument(
         "--wrap",

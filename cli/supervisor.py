@@ -154,12 +154,12 @@ def _yield_to_learner(process: subprocess.Popen[bytes]) -> None:
         os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
 
 
-def stop(processes: list[subprocess.Popen[bytes]]) -> None:
+def stop(processes: list[subprocess.Popen[bytes]], grace_seconds: float = _GRACE_SECONDS) -> None:
     """End processes: send SIGTERM to all, wait, then kill those that are left."""
     for process in processes:
         if process.poll() is None:
             process.terminate()
-    deadline = time.monotonic() + _GRACE_SECONDS
+    deadline = time.monotonic() + grace_seconds
     for process in processes:
         try:
             process.wait(max(deadline - time.monotonic(), 0.0))

@@ -74,7 +74,8 @@ def train(
     Args:
       preset: a preset such as "cartpole", or the path of a TOML file such as a run's config.toml.
       env: any gymnasium environment with default settings, instead of a preset; "module:Id" for your own.
-      algorithm: "a2c", "a3c", "impala" or "appo", or "module:Class" for your own.
+      algorithm: "a2c", "a3c", "impala", "appo", "one_step_q", "one_step_sarsa" or "n_step_q", or "module:Class" for
+        your own.
       actors: number of actor processes.
       seed: seed of the network, the environments and the actions.
       env_steps: budget, the environment steps of all actors together.

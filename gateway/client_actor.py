@@ -20,6 +20,7 @@ from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.messages import Act, EndEpisode
 from daedalus.gateway.policy_version import PolicyVersion
+from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Welcome
@@ -62,6 +63,11 @@ class ClientActor:
         mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
         try:
             check_run(spec)
+            if spec.algorithm.synchronous:
+                raise ActorError(
+                    f"a run with {spec.training.algorithm} makes its actors wait for each update, which clients of a "
+                    "gateway do not: use another algorithm"
+                )
             transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
@@ -99,19 +105,25 @@ class ClientActor:
             self.rows.reward(value)
 
     def _begin_rows(self, current: PolicyVersion) -> None:
-        """Continue with the policy of another learner epoch; the unfinished rollout for the previous one is dropped."""
+        """Continue with the policy of another learner epoch; the unfinished rollout for the previous one is dropped.
+
+        Raises ClientError if the client is to explore and the policy cannot.
+        """
         assert self._transforms is not None
         assert self._session is not None
         spec = current.session.spec
-        writer = RolloutWriter(
-            self._transforms.spaces,
-            1,
-            current.runtime,
-            spec.environment,
-            rollout_length=spec.collection.rollout_length,
-            random=np.random.default_rng(),  # not used: the batcher draws the noise
-            epsilon=self._session.epsilon,
-        )
+        try:
+            writer = RolloutWriter(
+                self._transforms.spaces,
+                1,
+                current.runtime,
+                spec.environment,
+                rollout_length=spec.collection.rollout_length,
+                random=np.random.default_rng(),  # not used: the batcher draws the noise
+                epsilon=self._session.epsilon,
+            )
+        except PolicyError as error:
+            raise ClientError("refused", str(error)) from None
         self._rows_epoch, self.version = current.session.learner_epoch, current
         self._rows = ClientRows(
             self._transforms,
@@ -156,6 +168,7 @@ class ClientActor:
         try:
             self._add_reward(message.reward)
             self.rows.end_episode(values, terminated=message.terminated)
+            self.rows.complete_episode()
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
 

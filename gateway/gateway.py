@@ -240,7 +240,7 @@ class Gateway:
         if welcome.learner_epoch != session.learner_epoch:
             self._link.look_again()
             return False
-        seat.actor.joined(session, transforms)
+        seat.actor.joined(welcome, transforms)  # with the client's own epsilon
         return True
 
     async def _ask(self, run: str, join: Join) -> Welcome | None:

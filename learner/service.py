@@ -22,6 +22,7 @@ from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.heartbeat import Heartbeat
+from daedalus.learner.run.rollout_length import check_rollout_length
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, write_json
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
@@ -141,7 +142,8 @@ class LearnerService:
 
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
         learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
-        the policy does not support the spaces, SettingsError if the device is not available.
+        the policy or the algorithm does not support the spaces, SettingsError if the device is not available or
+        rollouts are too short for masked actions.
         """
         try:
             self._server.open()
@@ -153,6 +155,7 @@ class LearnerService:
                 return self._stopped_without_actors()
             spaces = fleet.spaces
             assert spaces is not None
+            check_rollout_length(self._spec, spaces)
             learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
             if self._restored is not None:
                 policy = self._restored.policy

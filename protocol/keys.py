@@ -38,6 +38,11 @@ def rollouts(run: str, actor: str) -> str:
     return f"daedalus/{run}/rollouts/{actor}"
 
 
+def reports(run: str, actor: str) -> str:
+    """Return the key of the reports of one client about itself (`*` for all)."""
+    return f"daedalus/{run}/reports/{actor}"
+
+
 def evaluations(run: str, evaluator: str) -> str:
     """Return the key of one evaluator's requests and reports (`*` for all evaluators)."""
     return f"daedalus/{run}/evaluations/{evaluator}"

@@ -32,6 +32,7 @@ class Limits:
 # Read by the learner; a larger message is malformed.
 JOIN_LIMITS = Limits(max_bytes=0, max_arrays=0)  # names and spaces, no arrays
 STATUS_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)  # a name
+CLIENT_REPORT_LIMITS = Limits(max_bytes=0, max_header_bytes=2 << 10, max_arrays=0)  # names, counts and a reason
 SNAPSHOT_REQUEST_LIMITS = Limits(max_bytes=0, max_header_bytes=1 << 10, max_arrays=0)  # a name and three numbers
 EVALUATION_LIMITS = Limits(max_bytes=1 << 20, max_header_bytes=16 << 10, max_arrays=2)  # returns and lengths
 

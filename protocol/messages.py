@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.keys import check_name
 from daedalus.protocol.metrics import MetricsReport, MetricsRequest
 from daedalus.protocol.orders import OrderRequest
@@ -117,6 +118,10 @@ class Rollout:
     Environments reset by gymnasium's NEXT_STEP rule: the row after the end of an episode only resets the environment.
     Its action was ignored and it is not `valid`; its observation is the final observation of the episode.
 
+    Where somebody else than the policy chose the action that was played, such as a person or a safety filter, a row is
+    `overridden`: it holds the action that the policy would have taken. It is not learned from, and the rows before it
+    are bootstrapped with the value of its observation, but the episode and the memory of the policy go on.
+
     Observations, actions and masks are maps of components, as in Spaces (protocol/spaces.py).
     """
 
@@ -135,6 +140,7 @@ class Rollout:
     episode_lengths: np.ndarray  # [K] int32, their env_steps
     # By name [n] float32, n from 1 to K: scalars of the environment's `info` at the ends of these episodes.
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
+    overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
 
     def __post_init__(self) -> None:
         if self.rewards.ndim != 2:
@@ -153,10 +159,9 @@ class Rollout:
             for name, values in components.items():
                 if values.ndim != 3 or values.shape[:2] != (rows, environments):
                     raise ValueError(f"{kind}/{name} must be [{rows}, {environments}, D], not {values.shape}")
-        for name in ("behaviour_log_probs", "terminated", "truncated", "valid"):
-            shape = getattr(self, name).shape
-            if shape != (rows, environments):
-                raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {shape}")
+        for name, array in {"behaviour_log_probs": self.behaviour_log_probs, **self._flags}.items():
+            if array.shape != (rows, environments):
+                raise ValueError(f"{name} must be [{rows}, {environments}] like rewards, not {array.shape}")
         self._check_dtypes()
         _check_episodes(self)
         if len(self.episode_returns) > rows * environments:
@@ -164,8 +169,7 @@ class Rollout:
 
     def _check_dtypes(self) -> None:
         masks = {f"masks/{name}": mask for name, mask in self.masks.items()}
-        flags = {name: getattr(self, name) for name in ("terminated", "truncated", "valid")}
-        for name, array in (flags | masks).items():
+        for name, array in (self._flags | masks).items():
             if array.dtype != np.bool_:
                 raise ValueError(f"{name} must be bool, not {array.dtype}")
         for name in ("initial_state", "behaviour_log_probs", "rewards"):
@@ -174,6 +178,11 @@ class Rollout:
         for name, actions in self.actions.items():
             if actions.dtype != np.float32 and actions.dtype.kind not in "iu":
                 raise ValueError(f"actions/{name} must be float32 or integers, not {actions.dtype}")
+
+    @property
+    def _flags(self) -> dict[str, np.ndarray]:
+        flags = {"terminated": self.terminated, "truncated": self.truncated, "valid": self.valid}
+        return flags if self.overridden is None else flags | {"overridden": self.overridden}
 
     @property
     def rows(self) -> int:
@@ -186,9 +195,14 @@ class Rollout:
         return self.rewards.shape[1]
 
     @property
+    def learned(self) -> np.ndarray:
+        """Rows to learn from [T, E] bool: valid, and not overridden."""
+        return self.valid if self.overridden is None else self.valid & ~self.overridden
+
+    @property
     def env_steps(self) -> int:
-        """Number of valid rows, over all environments."""
-        return int(np.count_nonzero(self.valid))
+        """Number of rows to learn from, over all environments."""
+        return int(np.count_nonzero(self.learned))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -440,4 +454,5 @@ Message = (
     | MetricsRequest
     | MetricsReport
     | OrderRequest
+    | ClientReport
 )

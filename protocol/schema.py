@@ -19,8 +19,10 @@ def pack(value: Any, path: str, arrays: list[tuple[str, np.ndarray]]) -> dict[st
     packed: dict[str, Any] = {}
     for name, annotation in _fields(type(value)).items():
         item = getattr(value, name)
-        if annotation is np.ndarray:
+        if annotation is np.ndarray or isinstance(item, np.ndarray):
             arrays.append((path + name, item))
+        elif _is_optional_array(annotation):
+            pass  # without it
         elif _is_array_map(annotation):
             arrays.extend((f"{path}{name}/{key}", array) for key, array in item.items())
         elif dataclasses.is_dataclass(annotation):
@@ -44,6 +46,8 @@ def unpack(cls: type, fields: dict[str, Any], path: str, arrays: dict[str, np.nd
             if path + name not in arrays:
                 raise ValueError(f"array {path + name!r} is missing")
             values[name] = arrays.pop(path + name)
+        elif _is_optional_array(annotation):
+            values[name] = arrays.pop(path + name, None)
         elif _is_array_map(annotation):
             prefix = f"{path}{name}/"
             found = [key for key in arrays if key.startswith(prefix)]
@@ -84,6 +88,10 @@ def _value(annotation: Any, item: Any, path: str, arrays: dict[str, np.ndarray])
 def _fields(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _is_optional_array(annotation: Any) -> bool:
+    return annotation == np.ndarray | None
 
 
 def _is_array_map(annotation: Any) -> bool:

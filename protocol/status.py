@@ -5,7 +5,7 @@ from typing import Literal
 from daedalus.protocol.specification import Specification
 
 MAX_EVENTS = 100  # that a learner keeps
-PAGE_ACTORS = 100  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
+PAGE_ACTORS = 64  # in one answer, so that it stays within the reader's limits whatever the size of the fleet
 
 
 class ActorStatus(Specification):
@@ -31,6 +31,13 @@ class ActorStatus(Specification):
     compact_snapshots: bool  # it requests compact snapshots at its own rate, instead of receiving every snapshot
     bytes_up_per_hour: float  # of rollouts, at the rate of the last seconds
     bytes_down_per_hour: float  # of snapshots
+    # What a client reports of its newest process (protocol/client_report.py); 0 and empty for any other actor.
+    deadlines: int = 0
+    missed_deadlines: int = 0
+    overridden_actions: int = 0
+    safe_actions: int = 0
+    rollouts_dropped: int = 0
+    safe_reason: str = ""
 
 
 class RefusedJoin(Specification):

@@ -15,6 +15,7 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import (
@@ -29,7 +30,7 @@ from daedalus.protocol.messages import (
     Welcome,
 )
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -47,8 +48,8 @@ class Policy:
     model: bytes
 
     @classmethod
-    def of(cls, spec: PolicySpec, spaces: Spaces) -> "Policy":
-        network = ActorCritic(spec, spaces)
+    def of(cls, spec: PolicySpec, spaces: Spaces, training: TrainingSpec | None = None) -> "Policy":
+        network = ActorCritic(spec, spaces, training=training)
         return cls(network, export_program(network, spaces))
 
 
@@ -65,14 +66,17 @@ class ScriptedLearner:
         self.epoch, self.spec, self.policy = epoch, spec, policy
         self.joins: queue.Queue[Join] = queue.Queue()
         self.rollouts: queue.Queue[Request] = queue.Queue()
+        self.reports: queue.Queue[ClientReport] = queue.Queue()
         self.snapshot: bytes = encode(Refusal(code="not_ready", reason=""))
         self.refusal: Refusal | None = None
+        self.epsilons: dict[str, float] = {}  # by actor; 0 of the others
         self.extras: dict[str, np.ndarray] = {}  # in snapshots, besides the weights
         self.fetches: list[SnapshotRequest] = []  # requests for whole snapshots
         self.compact_fetches: list[SnapshotRequest] = []
         self._compact = CompactSnapshotCache(epoch)
         self.transport.declare_presence(keys.learner(run))
         self.transport.serve(keys.rollouts(run, "*"), self.rollouts.put)
+        self.transport.serve(keys.reports(run, "*"), self._report)
         self.transport.serve(keys.snapshots(run), self._newest)
         self.transport.serve(keys.program(run, "*"), self._program)
         self.transport.serve(keys.join(run, "*"), self._join)
@@ -81,8 +85,15 @@ class ScriptedLearner:
         message = decode(request.payload, Limits())
         assert isinstance(message, Join)
         self.joins.put(message)
-        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, spec=self.spec)
+        epsilon = self.epsilons.get(message.actor, 0.0)
+        answer: Message = Welcome(run=self.run, learner_epoch=self.epoch, seed=1, epsilon=epsilon, spec=self.spec)
         request.reply(encode(self.refusal or answer))
+
+    def _report(self, request: Request) -> None:
+        message = decode(request.payload, Limits())
+        assert isinstance(message, ClientReport)
+        self.reports.put(message)
+        acknowledge(request, "accepted")
 
     def _newest(self, request: Request) -> None:
         if not request.size:

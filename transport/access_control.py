@@ -95,7 +95,12 @@ def _actors_rules() -> list[dict[str, Any]]:
 
 def _own_keys(name: str) -> list[str]:
     """Return the keys of the queries that only the actor or evaluator `name` may send."""
-    return [keys.join(_RUN, name), keys.rollouts(_RUN, name), keys.evaluations(_RUN, name)]
+    return [
+        keys.join(_RUN, name),
+        keys.rollouts(_RUN, name),
+        keys.reports(_RUN, name),
+        keys.evaluations(_RUN, name),
+    ]
 
 
 def _own_rules(actor: str) -> list[dict[str, Any]]:

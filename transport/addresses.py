@@ -88,6 +88,8 @@ def _check_folder(endpoint: str, folder: str) -> None:
         found = os.stat(folder)
     except OSError as error:
         raise AddressError(f"{endpoint}: {folder}: {error.strerror}") from None
+    if not hasattr(os, "geteuid"):  # Windows
+        raise AddressError(f"{endpoint}: this system has no such sockets: write tcp/HOST:PORT or tls/HOST:PORT")
     if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) & 0o077:
         raise AddressError(f"{endpoint} is open to other users of this machine: its folder must be yours and mode 700")
 

@@ -4,7 +4,6 @@ A session either embeds a full router that listens (the learner, by default) or 
 """
 
 import json
-import resource
 from collections.abc import Callable
 from typing import Literal
 
@@ -52,8 +51,12 @@ def session_opener(
 
 def _descriptors() -> int:
     """Return the number of file descriptors that this process may have open."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return Capacity().descriptors
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return Capacity.descriptors if soft == resource.RLIM_INFINITY else soft
+    return Capacity().descriptors if soft == resource.RLIM_INFINITY else soft
 
 
 def _opening_error(

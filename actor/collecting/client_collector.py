@@ -1,7 +1,9 @@
 """Rollouts from a loop that the caller owns: rows are written as the loop reports observations and rewards."""
 
 import copy
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,10 +13,11 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.collecting.client_rows import ClientRows, check_run
+from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -24,28 +27,46 @@ _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoc
 
 
 class ClientCollector:
-    """A Collector between two threads: the caller's, which acts, and the service's, which sends the rollouts."""
+    """A Collector between two threads: the caller's, which acts, and the service's, which sends the rollouts.
 
-    def __init__(self, observation_space: gymnasium.Space, action_space: gymnasium.Space, example_mask: Any) -> None:
+    Neither waits for the other. A rollout is played with one policy version. In a run whose actors wait for each
+    update, the caller goes on with the last policy meanwhile, and those rows are not written.
+    """
+
+    def __init__(
+        self,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+        example_mask: Any,
+        guard: PolicyGuard | None = None,
+    ) -> None:
         """Construct the collector.
 
         Args:
           observation_space, action_space: those of the caller's loop.
           example_mask: a mask, or a map of masks by action component, if the loop has masks; else None.
+          guard: decides when the safe action is played; None: never.
         """
         self._observation_space, self._action_space = observation_space, action_space
         self._example_mask = example_mask
+        self.guard = guard or PolicyGuard(action_space, None, None, untrained=False)
         self.policy_loaded = threading.Event()  # the caller may act
         self.on_rollout: Callable[[], None] = lambda: None  # called on the caller's thread when a rollout is full
+        # For the service's thread only:
         self._transforms: Transforms | None = None  # of the run that is being joined
-        self._lock = threading.Lock()  # guards the next four
-        self.dropped = 0  # rollouts that were replaced by newer ones before the service took them
-        self._next_policy: tuple[PolicyRuntime, ClientRows] | None = None  # begun, and not acting yet
-        self._snapshot: Snapshot | None = None  # the newest
+        self._program: OnnxRuntime | None = None
+        self._synchronous = False  # actors wait for each update
+        self._lock = threading.Lock()  # guards the next six
+        self.dropped = 0  # rollouts, finished or not, that the service never took
+        self._next_rows: ClientRows | None = None  # of a policy that has begun, and does not act yet
+        self._newest: tuple[Snapshot, OnnxRuntime] | None = None  # the newest weights, loaded
+        self._confirmed_at = -math.inf  # the monotonic time at which the newest snapshot was the learner's newest
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
+        self._may_begin = True  # whether the next row may begin a rollout
         # For the caller's thread only:
-        self._policy: tuple[PolicyRuntime, ClientRows] | None = None
-        self._loaded: Snapshot | None = None  # in the runtime
+        self._rows: ClientRows | None = None
+        self._loaded: Snapshot | None = None  # that acts
+        self.overridden_actions = self.safe_actions = 0
 
     # -------------------------------------------------------------------------------- on the service's thread
 
@@ -59,6 +80,8 @@ class ClientCollector:
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
         """See Collector. Discard the rollouts of the previous policy."""
         assert self._transforms is not None
+        assert isinstance(runtime, OnnxRuntime)  # a client has no other
+        self._program, self._synchronous = runtime, spec.algorithm.synchronous
         writer = RolloutWriter(
             self._transforms.spaces,
             1,
@@ -76,13 +99,23 @@ class ClientCollector:
             on_full=self._keep,
         )
         with self._lock:
-            self._next_policy, self._snapshot = (runtime, rows), None
+            self._next_rows, self._newest = rows, None
+            self._may_begin = not self._synchronous
+            self.dropped += len(self._full)
             self._full.clear()
 
     def load(self, snapshot: Snapshot) -> None:
+        """See Collector. Loading takes long for a large network: it is done here and not in the caller's loop."""
+        assert self._program is not None
+        runtime = self._program.fork()
+        runtime.load(snapshot.weights)
+        with self._lock:
+            self._newest = snapshot, runtime
+
+    def confirm(self, at: float) -> None:
         """See Collector."""
         with self._lock:
-            self._snapshot = snapshot
+            self._confirmed_at = at
         self.policy_loaded.set()
 
     def has_rollout(self) -> bool:
@@ -92,58 +125,92 @@ class ClientCollector:
     def collect(self, identity: RolloutIdentity, on_row: Callable[[], None] = lambda: None) -> Rollout | None:
         """See Collector. Return the oldest full rollout. `on_row` has no effect: the caller's loop makes the rows."""
         with self._lock:
-            return replace(self._full.popleft(), identity=identity) if self._full else None
+            if self._full:
+                return replace(self._full.popleft(), identity=identity)
+            self._may_begin = True
+            return None
 
     def close(self) -> None:
         """See Collector. There is nothing to release."""
 
     # --------------------------------------------------------------------------------- on the caller's thread
 
-    def act(self, observation: Any, action_mask: Any = None) -> Any:
+    def act(self, observation: Any, action_mask: Any = None, override: Any = None) -> Any:
         """Return the action for an observation, which the last action, or the last episode's end, led to."""
         self._switch_policy()
-        assert self._policy is not None  # the service waits for `policy_loaded`
-        runtime, rows = self._policy
+        rows = self._rows
+        assert rows is not None  # the service waits for `policy_loaded`
         rows.observe(observation, action_mask)
         while True:
             if rows.is_between_rollouts:
-                self._load_newest(runtime)
-            if (actions := rows.choose()) is not None:
-                return rows.env_action(actions)
+                self._load_newest()
+            policy_acts = self._policy_may_act()
+            actions = rows.choose(overridden=override is not None, idle=self._is_idle(rows, policy_acts=policy_acts))
+            if actions is not None:
+                break
+        if override is not None:
+            self.overridden_actions += 1
+            return override
+        if not policy_acts:
+            self.safe_actions += 1
+            return self.guard.action(observation)
+        return rows.env_action(actions)
 
     def reward(self, value: float) -> None:
         """Add to the reward of the last action."""
-        if self._policy is None:
+        if self._rows is None:
             raise ValueError("a reward came before any action: call act() first")
-        self._policy[1].reward(value)
+        self._rows.reward(value)
 
     def end_episode(self, observation: Any, *, terminated: bool) -> None:
         """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""
-        if self._policy is None:
+        if self._rows is None:
             raise ValueError("the episode ended without any action: call act() first")
-        self._policy[1].end_episode(observation, terminated=terminated)
+        self._rows.end_episode(observation, terminated=terminated)
 
     def _switch_policy(self) -> None:
         """Continue with a policy that has begun meanwhile; discard the unfinished rollout of the previous one."""
         with self._lock:
-            if self._next_policy is None or self._snapshot is None:
+            if self._next_rows is None or self._newest is None:
                 return
-            self._policy, self._next_policy = self._next_policy, None
+            self.dropped += self._rows is not None and not self._rows.is_between_rollouts
+            self._rows, self._next_rows = self._next_rows, None
         self._loaded = None
 
-    def _load_newest(self, runtime: PolicyRuntime) -> None:
+    def _load_newest(self) -> None:
+        """Let the newest weights act."""
         with self._lock:
-            snapshot = self._snapshot
-        if snapshot is not None and snapshot is not self._loaded:
-            runtime.load(snapshot.weights)
-            self._loaded = snapshot
+            newest, switching = self._newest, self._next_rows is not None
+        if newest is None or switching or newest[0] is self._loaded:
+            return  # weights of a policy that begins are not for the rows of the previous one
+        assert self._rows is not None
+        self._loaded = newest[0]
+        self._rows.use(newest[1])
+
+    def _policy_may_act(self) -> bool:
+        """Return whether the policy may act now, and not the safe action."""
+        assert self._loaded is not None
+        with self._lock:
+            age = time.monotonic() - self._confirmed_at
+        return self.guard.allows(self._loaded.policy_version, age)
+
+    def _is_idle(self, rows: ClientRows, *, policy_acts: bool) -> bool:
+        """Return whether the next row is not written. Count the unfinished rollout that this drops."""
+        with self._lock:
+            if policy_acts:
+                return rows.is_between_rollouts and not self._may_begin
+            self.dropped += not rows.is_between_rollouts
+            return True
 
     def _keep(self, writer: RolloutWriter) -> None:
         """Keep a full rollout for the service."""
         assert self._loaded is not None
         rollout = copy.deepcopy(writer.finish(_NO_IDENTITY, self._loaded.policy_version))
         with self._lock:
-            if self._next_policy is None:  # otherwise the rollout is meant for a previous learner
+            self._may_begin = not self._synchronous
+            if self._next_rows is None:  # otherwise the rollout is meant for a previous learner
                 self.dropped += len(self._full) == _MAX_FULL_ROLLOUTS
                 self._full.append(rollout)
+            else:
+                self.dropped += 1
         self.on_rollout()

@@ -9,7 +9,7 @@ from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.policy.acting.runtime import Choice
+from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 
@@ -44,6 +44,8 @@ class ClientRows:
         self._on_full = on_full
         self._last: Observed | None = None  # the newest observation
         self._acted = False  # the current row has an action and no outcome yet
+        self._idle = False  # the row that has begun is not written
+        self._ending = False  # the episode ends with the current row, which late rewards may still change
         self._episode_ended = False  # the next row is a reset row
         self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
         self._reward, self._terminated, self._truncated = 0.0, False, False  # of the current row
@@ -51,12 +53,16 @@ class ClientRows:
     @property
     def in_episode(self) -> bool:
         """Whether the last action has no outcome yet: the episode has not ended."""
-        return self._acted
+        return self._acted and not self._ending
 
     @property
     def is_between_rollouts(self) -> bool:
         """Whether the next row is the first of a rollout: only then may another policy version choose."""
         return self._writer.is_between_rollouts
+
+    def use(self, runtime: PolicyRuntime) -> None:
+        """Let a runtime with other weights choose the actions. Call only between rollouts."""
+        self._writer.use(runtime)
 
     def observe(self, observation: Any, action_mask: Any = None) -> None:
         """Note an observation to act on, which the last action, or the last episode's end, led to.
@@ -71,6 +77,7 @@ class ClientRows:
                 "would choose illegal actions"
             )
         observed = self._transforms.observe_one(observation, action_mask, needed=True)
+        self.complete_episode()
         if self._last is None:
             self._writer.start(observed)
         elif self._cut == "restarts":
@@ -79,10 +86,23 @@ class ClientRows:
             self._record(observed)
         self._last, self._cut = observed, ""
 
-    def choose(self) -> dict[str, np.ndarray] | None:
-        """Return the policy's actions {name: [1, D]}; None after a reset row, whose action has no effect."""
+    def choose(self, *, overridden: bool = False, idle: bool = False) -> dict[str, np.ndarray] | None:
+        """Return the policy's actions {name: [1, D]}; None after a reset row, whose action has no effect.
+
+        Args:
+          overridden: another action than the policy's is played: the row is not learned from.
+          idle: drop the rows of the unfinished rollout and this one; the memory of the policy still goes on.
+        """
+        if idle:
+            self._writer.discard()
+        # No rollout begins with an overridden row: in each there is a row to learn from.
+        self._idle = idle or (overridden and self.is_between_rollouts)
         actions = self._writer.act()
-        return actions if self._has_acted() else None
+        if not self._has_acted():
+            return None
+        if overridden:
+            self._writer.override()
+        return actions
 
     def begin_row(self) -> RowInputs:
         """Return what the policy chooses from: see RolloutWriter."""
@@ -107,7 +127,10 @@ class ClientRows:
         return self._transforms.env_action(actions)
 
     def reward(self, value: float) -> None:
-        """Add to the reward of the last action. Raises ValueError before an episode's first action."""
+        """Add to the reward of the last action, also after the end of its episode.
+
+        Raises ValueError before an episode's first action.
+        """
         if not self._acted:
             raise ValueError("a reward came before any action of this episode: call act() first")
         if not np.isfinite(value):
@@ -116,7 +139,7 @@ class ClientRows:
 
     def end_episode(self, observation: Any, *, terminated: bool) -> None:
         """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""
-        if not self._acted:
+        if not self.in_episode:
             raise ValueError("the episode ended without any action: call act() first")
         if observation is not None:
             self._last = self._transforms.observe_one(observation, self._example_mask, needed=False)
@@ -127,10 +150,14 @@ class ClientRows:
                 "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
                 "pass the last observation"
             )
-        assert self._last is not None
-        self._terminated, self._truncated = terminated, not terminated
-        self._record(self._last)
-        self._episode_ended = True
+        self._terminated, self._truncated, self._ending = terminated, not terminated, True
+
+    def complete_episode(self) -> None:
+        """Complete the last row of an episode that has ended: no more rewards come for it. Idempotent."""
+        if self._ending:
+            assert self._last is not None
+            self._record(self._last)
+            self._ending, self._episode_ended = False, True
 
     def cut(self) -> None:
         """End the episode as truncated at the newest observation: the loop was interrupted.
@@ -138,6 +165,7 @@ class ClientRows:
         What followed the last action is not known, so its row is not learned from. The next `observe` begins another
         episode.
         """
+        self.complete_episode()
         if self._last is None or self._episode_ended or self._cut:
             return
         if not self._writer.cut():
@@ -154,17 +182,14 @@ class ClientRows:
             observed, np.array([self._reward]), np.array([self._terminated]), np.array([self._truncated])
         )
         self._acted, self._reward, self._terminated, self._truncated = False, 0.0, False, False
-        if full:
+        if self._idle:
+            self._writer.discard()
+        elif full:
             self._on_full(self._writer)
 
 
 def check_run(spec: RunSpec) -> None:
     """Raise ActorError if a loop that somebody else owns cannot take part in a run."""
-    if spec.algorithm.synchronous:
-        raise ActorError(
-            f"a run with {spec.training.algorithm} makes its actors wait for each update, but a client cannot "
-            "wait: use another algorithm"
-        )
     if spec.uploads_gradients:
         raise ActorError(
             "this run takes gradients (collection.upload), and a client sends rollouts: set collection.upload=rollouts"

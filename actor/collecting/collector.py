@@ -30,6 +30,10 @@ class Collector(Protocol):
         """Use these weights from the next rollout on."""
         ...
 
+    def confirm(self, at: float) -> None:
+        """Note that the loaded snapshot was the learner's newest at a monotonic time, in seconds."""
+        ...
+
     def has_rollout(self) -> bool:
         """Return whether `collect` would return a rollout now. Safe from any thread."""
         ...

@@ -67,6 +67,9 @@ class EnvironmentCollector:
         self._runtime.load(snapshot.weights)
         self._policy_version = snapshot.policy_version
 
+    def confirm(self, at: float) -> None:
+        """See Collector. Has no effect: the policy acts whatever its age."""
+
     def has_rollout(self) -> bool:
         """See Collector. `collect` never waits for anybody here."""
         return True

@@ -85,11 +85,16 @@ class RolloutWriter:
         self._terminated = np.zeros((rows, count), np.bool_)
         self._truncated = np.zeros((rows, count), np.bool_)
         self._valid = np.zeros((rows, count), np.bool_)
+        self._overridden = np.zeros((rows, count), np.bool_)
 
     @property
     def is_between_rollouts(self) -> bool:
         """Whether the next row is the first of a rollout: only then may the runtime load other weights."""
         return self._row == 0
+
+    def use(self, runtime: PolicyRuntime) -> None:
+        """Let another runtime of the same program choose the actions. Call only between rollouts."""
+        self._runtime = runtime
 
     def start(self, observed: Observed) -> None:
         """Begin with the first observations of all environments."""
@@ -120,6 +125,11 @@ class RolloutWriter:
             actions[row] = choice.actions[name]
         for name, masks in self._masks.items():
             masks[row] = self._current_masks[name]
+        self._overridden[row] = False
+
+    def override(self) -> None:
+        """Note that other actions than the policy's are played in the row that has begun."""
+        self._overridden[self._row] = True
 
     def record(self, observed: Observed, rewards: np.ndarray, terminated: np.ndarray, truncated: np.ndarray) -> bool:
         """Write what VectorEnvironment.step returned for those actions; return whether the rollout is full."""
@@ -137,6 +147,11 @@ class RolloutWriter:
         self._episodes.step(self._rewards[row], self._terminated[row], self._truncated[row])
         self._row += 1
         return self._row == len(self._rewards)
+
+    def discard(self) -> None:
+        """Drop the rows so far: the next row is the first of a rollout. The episodes and the memory go on."""
+        self._row = 0
+        self._episodes.take_finished()
 
     def cut(self) -> bool:
         """End the episodes as truncated at the newest observations; return False if this rollout has no row of them.
@@ -188,6 +203,7 @@ class RolloutWriter:
             episode_returns=finished.returns,
             episode_lengths=finished.lengths,
             episode_info=episode_info or {},
+            overridden=self._overridden if self._overridden.any() else None,
         )
 
 

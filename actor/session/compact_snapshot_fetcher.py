@@ -47,6 +47,7 @@ class CompactSnapshotFetcher:
         self._fetching = False
         self._fetched: bytes | Message | None = None  # an encoded CompactSnapshot, or another answer of the learner
         self._began = self._next_at = self._seconds = 0.0
+        self.answered_request_at = 0.0  # the monotonic time of the fetch that ended last
 
     @property
     def requested_at(self) -> float:
@@ -161,4 +162,4 @@ class CompactSnapshotFetcher:
 
     def _end(self, fetched: bytes | Message | None, *, rest: float) -> None:
         self._fetching, self._count, self._parts, self._fetched = False, 0, {}, fetched
-        self._next_at = time.monotonic() + rest
+        self._next_at, self.answered_request_at = time.monotonic() + rest, self._began

@@ -12,6 +12,7 @@ from typing import Literal
 
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.session.client_reports import ClientReports
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
 from daedalus.actor.session.origin import own_origin
@@ -25,6 +26,7 @@ from daedalus.actor.session.uploads import RolloutUploads, Uploads, make_uploads
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
@@ -33,6 +35,7 @@ from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
 
+_CONFIRMATIONS = 4  # requests for a newer snapshot within the largest age of the policy
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout: how often newer weights are looked for
 _SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # a link is slow beyond this latency and so many bytes a second
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
@@ -53,6 +56,7 @@ class ActorConfig:
     modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
+    max_policy_age: float | None = None  # seconds within which the learner must confirm the policy; None: no limit
     any_run: bool = False  # whether the actor may change to another run when its learner has gone
 
     def run_to_join(self, followed: str) -> str:
@@ -70,6 +74,7 @@ class ActorService:
         stop: threading.Event,
         collector: Collector | None = None,
         on_join: Callable[[Welcome], object] = lambda _: None,
+        report: Callable[[], ClientReport] | None = None,
     ) -> None:
         """Construct the service.
 
@@ -79,6 +84,7 @@ class ActorService:
           stop: event that ends `run`.
           collector: replaces the environments that the actor would create.
           on_join: called with the answer of each learner that the actor begins to join.
+          report: returns what a client counts about itself; None: this actor is no client.
         """
         self._config, self._transport, self._stop = config, transport, stop
         self._collector = collector or EnvironmentCollector(config.environments, config.modules)
@@ -89,9 +95,12 @@ class ActorService:
         self._presence = LearnerPresence(self._lock)
         self._uploads = UploadSession(transport, config.name, self._presence, self._lock)
         self._end = RunEndWatch(transport, stop, self._lock.announce_change)
-        self._monitor = SessionMonitor(self._uploads, self._presence, self._queries, self._join, self._lock, self._end)
+        self._monitor = SessionMonitor(
+            self._uploads, self._presence, self._queries, self._join, self._lock, self._end, self._on_heartbeat
+        )
         self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
         self._snapshots = SnapshotSource(self._feed, self._monitor, self._uploads)
+        self._reports = None if report is None else ClientReports(transport, report)
         self._contents: Uploads = RolloutUploads()  # what is uploaded of the rollouts
         self._runs: set[str] = set()  # in which this actor's presence is declared
         self._learner_epoch = -1
@@ -135,10 +144,13 @@ class ActorService:
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
         self._end.follow(welcome.run, welcome.learner_epoch)
+        self._loaded_version = -1
         self._on_join(welcome)
         spaces, count = self._collector.prepare(welcome.spec)
         self._feed.begin(welcome)
         self._declare_presence(welcome.run)
+        if self._reports is not None:
+            self._reports.begin()
         join = replace(self._join, spaces=spaces, environments=count)
         confirmed = self._queries.join_learner(welcome.run, join, self._config.timeout, self._end)
         if confirmed.learner_epoch != welcome.learner_epoch:
@@ -211,7 +223,7 @@ class ActorService:
     def _collect_and_upload(self, welcome: Welcome) -> None:
         """Collect and upload until something raises: the session's end, or an error."""
         synchronous, window = welcome.spec.algorithm.synchronous, welcome.spec.collection.window
-        snapshot, self._loaded_version = self._snapshots.await_newer(-1), -1
+        snapshot = self._snapshots.await_newer(-1)
         if not synchronous:
             self._feed.use_fetches()
         while True:
@@ -241,6 +253,18 @@ class ActorService:
             self._collector.load(snapshot)
             self._contents.load(snapshot.weights)
             self._loaded_version = snapshot.policy_version
+        self._collector.confirm(self._feed.confirmed_at)
+
+    def _on_heartbeat(self) -> None:
+        """Report, and keep the policy from growing too old, in every wait: its learner may be busy for long."""
+        if self._reports is not None:
+            self._reports.send_if_due(self._end.run)
+        if self._config.max_policy_age is None or self._loaded_version < 0 or self._feed.newest is None:
+            return
+        self._feed.read()
+        self._load(self._feed.newest)
+        if time.monotonic() > self._feed.confirmed_at + self._config.max_policy_age / _CONFIRMATIONS:
+            self._feed.request_confirmation()
 
     def _collect(self, learner_epoch: int) -> Rollout:
         """Return the next rollout; while a client fills it, load newer weights as they come."""

@@ -25,10 +25,17 @@ class SessionMonitor:
         join: Join,
         lock: StateLock,
         end: RunEndWatch,
+        on_heartbeat: Callable[[], None],
     ) -> None:
-        """`join` is the request that asks whether the learner is there."""
+        """Construct the monitor.
+
+        Args:
+          uploads, presence, queries, lock, end: of the session.
+          join: the request that asks whether the learner is there.
+          on_heartbeat: called in every wait, at least five times a second. It may raise as `check` does.
+        """
         self._uploads, self._presence, self._queries, self._join = uploads, presence, queries, join
-        self._lock, self._end = lock, end
+        self._lock, self._end, self._on_heartbeat = lock, end, on_heartbeat
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
         """Wait until `ready` returns True; return False if `timeout` seconds pass first. Raises as `check` does.
@@ -40,6 +47,7 @@ class SessionMonitor:
         while True:
             self._uploads.send_due()
             self._probe_if_silent()
+            self._on_heartbeat()
             changes = self._lock.changes
             self.check()
             if ready():

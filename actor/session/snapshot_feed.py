@@ -1,14 +1,15 @@
 """The newest snapshot of a learner: pushed to synchronous actors, fetched by all others. No threads."""
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
 from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.actor.session.snapshot_fetcher import SnapshotFetcher
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Message, RunEnded, Snapshot, Welcome
+from daedalus.protocol.messages import Message, Refusal, RunEnded, Snapshot, Welcome
 from daedalus.transport.interface import Inbox, Transport
 
 _SMALL_BYTES = 1 << 20  # of weights whose differences take the learner about a millisecond
@@ -33,13 +34,16 @@ class SnapshotFeed:
         self._inboxes: dict[str, Inbox] = {}  # by run
         self._whole: SnapshotFetcher | None = None  # at most one of these two is set
         self._compact: CompactSnapshotFetcher | None = None
+        self._confirming: SnapshotFetcher | None = None  # while snapshots are pushed
         self._run, self._learner_epoch = "", -1
         self.newest: Snapshot | None = None  # of this learner epoch
+        self.confirmed_at = -math.inf  # the monotonic time at which `newest` was last known to be the learner's newest
 
     def begin(self, welcome: Welcome) -> None:
         """Begin with a learner: no snapshot of it is known, and nothing about its link."""
         self._run, self._learner_epoch, self.newest = welcome.run, welcome.learner_epoch, None
-        self._whole = self._compact = None
+        self.confirmed_at = -math.inf
+        self._whole = self._compact = self._confirming = None
 
     def subscribe(self) -> None:
         """Receive every published snapshot from now on, unless compact snapshots are fetched. Idempotent."""
@@ -71,9 +75,12 @@ class SnapshotFeed:
         if self._compact is None:
             self._unsubscribe()
             assert self.newest is not None
-            self._whole = SnapshotFetcher(
-                self._transport, self._queries, self._run, self._actor, self.newest.policy_version, self._on_news
-            )
+            self._whole = self._fetcher(self.newest)
+
+    def _fetcher(self, held: Snapshot) -> SnapshotFetcher:
+        return SnapshotFetcher(
+            self._transport, self._queries, self._run, self._actor, held.policy_version, self._on_news
+        )
 
     def _unsubscribe(self) -> None:
         for inbox in self._inboxes.values():
@@ -109,16 +116,20 @@ class SnapshotFeed:
 
         Raises RunOverError if the run finished, LearnerLostError if the message is from another learner epoch.
         """
-        if self._compact is not None:
-            message = self._compact.take()
-        elif self._whole is not None:
-            message = self._whole.take()
-        else:
-            inbox = self._inboxes.get(self._run)
-            data = None if inbox is None else inbox.take()
-            message = None if data is None else self._queries.decode(data)
+        for message, at in self._received():
+            self._apply(message, at)
+
+    def _received(self) -> Iterator[tuple[Message, float]]:
+        """Yield the messages that have come, and the monotonic time of their request, or of now for a push."""
+        for fetcher in (self._compact, self._whole, self._confirming):
+            message = None if fetcher is None else fetcher.take()
+            if fetcher is not None and message is not None:
+                yield message, fetcher.answered_request_at
+        inbox = self._inboxes.get(self._run)
+        data = None if inbox is None else inbox.take()
+        message = None if data is None else self._queries.decode(data)
         if message is not None:
-            self._apply(message)
+            yield message, time.monotonic()
 
     def is_current(self) -> bool:
         """Read what has come, and return whether no requested snapshot is awaited. Raises as `read` does."""
@@ -131,25 +142,39 @@ class SnapshotFeed:
         if self._scheduled is not None:
             self._scheduled.request_newest()
 
+    def request_confirmation(self) -> None:
+        """Ask whether `newest` is still the learner's newest, unless an answer is awaited. Does not wait."""
+        if self._compact is None and self._whole is None and self._confirming is None and self.newest is not None:
+            self._confirming = self._fetcher(self.newest)
+        fetcher = self._compact or self._whole or self._confirming
+        if fetcher is not None:
+            fetcher.request_newest()
+
     def request_newest(self) -> None:
         """Request the newest snapshot in case a push was lost. Raises as `read` does."""
         if self._compact is not None:
             self._compact.request_newest()
             return
+        at = time.monotonic()
         for message in self._queries.newest_snapshot(self._run):
-            self._apply(message)
+            self._apply(message, at)
 
     def request_compact_if_behind(self, newest_version: int) -> None:
         """Request the snapshot of a version that acknowledgements mention, on a slow link."""
         if self._slow_link is not None and (self.newest is None or newest_version > self.newest.policy_version):
             self._slow_link.request_newest()
 
-    def _apply(self, message: Message) -> None:
+    def _apply(self, message: Message, at: float) -> None:
+        """Apply a message; `at` is the monotonic time of the request that it answers, or at which it was pushed."""
         if isinstance(message, RunEnded):
             self._end.apply(message)
+        if isinstance(message, Refusal) and self._compact is None:  # the learner has none that is newer
+            self.confirmed_at = at
         if not isinstance(message, Snapshot):
             return
         if message.learner_epoch != self._learner_epoch:
             raise LearnerLostError
         if self.newest is None or message.policy_version > self.newest.policy_version:
             self.newest = message
+        if message.policy_version == self.newest.policy_version:
+            self.confirmed_at = at

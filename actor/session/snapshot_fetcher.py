@@ -33,6 +33,7 @@ class SnapshotFetcher:
         self._fetching = False
         self._answer: bytes | None = None  # not taken yet
         self._seconds = 0.0
+        self.answered_request_at = 0.0  # the monotonic time of the request that was answered last
 
     @property
     def requested_at(self) -> float:
@@ -77,4 +78,5 @@ class SnapshotFetcher:
             if data is None:
                 return
             self._answer, self._seconds = data, time.monotonic() - self._requested_at
+            self.answered_request_at = self._requested_at
         self._on_news()

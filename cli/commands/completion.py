@@ -22,6 +22,7 @@ examples:
 _PARSERS = {
     "train": ("commands.train", "train_parser"),
     "resume": ("commands.train", "resume_parser"),
+    "sweep": ("commands.sweep", "parser"),
     "check": ("commands.check", "parser"),
     "learner": ("settings_arguments", "learner_parser"),
     "actor": ("commands.actor_arguments", "parser"),

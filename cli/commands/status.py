@@ -31,8 +31,8 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
-MB/h up counts rollouts, MB/h down counts snapshots. An s marks an actor that fetches compact snapshots, over a slow
-link.
+epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts rollouts, MB/h down
+counts snapshots. An s marks an actor that fetches compact snapshots, over a slow link.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive or starting, 1 not alive"""
@@ -143,14 +143,30 @@ def _table(status: RunStatus) -> list[str]:
         f"gone; rollouts: {status.rollouts_accepted:,} accepted, {sum(status.rollouts_rejected.values()):,} rejected",
         f"  queue {status.queue_bytes / 2**20:.1f} of {status.queue_bytes_limit / 2**20:.0f} MiB, "
         f"last checkpoint {'not yet' if age is None else f'{age:.0f} s ago'}",
-        f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'env_steps':>13} {'/s':>8}"
+        f"  {'actor':<24} {'state':<11} {'seen':>7} {'lives':>5} {'envs':>5} {'epsilon':>7} {'env_steps':>13} {'/s':>8}"
         f" {'lag':>4} {'busy':>5} {'accepted':>9} {'missed':>6} {'MB/h up':>8} {'down':>8}"
         "  rejected; host, address, software",
         *(f"  {_line(actor)}" for actor in status.actors),
         *_missing_actors(status),
         *(f"  {actor.actor} is quarantined: {actor.quarantined}" for actor in status.actors if actor.quarantined),
+        *(f"  {actor.actor} {text}" for actor in status.actors for text in _client_texts(actor)),
         *map(_refused, status.refused_joins),
     ]
+
+
+def _client_texts(actor: ActorStatus) -> list[str]:
+    """Return what a client, whose loop its user owns, reports about itself."""
+    counts = {
+        f"of {actor.deadlines:,} deadlines missed": actor.missed_deadlines,
+        "actions overridden": actor.overridden_actions,
+        "safe actions": actor.safe_actions,
+        "rollouts dropped": actor.rollouts_dropped,
+    }
+    counted = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+    if not counted and actor.deadlines:
+        counted = f"0 of {actor.deadlines:,} deadlines missed"
+    safe = [f"plays the safe action: {actor.safe_reason}"] if actor.safe_reason and actor.alive else []
+    return [*safe, *([f"counts {counted}"] if counted else [])]
 
 
 def _refused(refused: RefusedJoin) -> str:
@@ -179,9 +195,10 @@ def _line(actor: ActorStatus) -> str:
     answers = actor.rollouts_accepted + sum(actor.rollouts_rejected.values()) + actor.busy_answers
     down = f"{actor.bytes_down_per_hour / 1e6:,.0f}{'s' if actor.compact_snapshots else ''}"
     where = ", ".join(filter(None, (actor.host, actor.address, actor.software)))
+    epsilon = f"{actor.epsilon:g}" if actor.epsilon else "-"
     return (
         f"{actor.actor:<24} {state:<11} {actor.seconds_since_seen:>5.1f} s {actor.lives:>5} {actor.environments:>5}"
-        f" {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
+        f" {epsilon:>7} {actor.env_steps:>13,} {actor.env_steps_per_second:>8,.0f} {actor.policy_lag:>4}"
         f" {actor.busy_answers / max(answers, 1):>5.0%} {actor.rollouts_accepted:>9,} {actor.rollouts_missed:>6,}"
         f" {actor.bytes_up_per_hour / 1e6:>8,.0f} {down:>8}  {rejected or '-'}; {where or '-'}"
     )

@@ -13,7 +13,7 @@ from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import process_started, stop_on_signals
+from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.run_report import report
 from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
@@ -45,6 +45,7 @@ _TRAIN_EXAMPLES = """\
 examples:
   daedalus train cartpole
   daedalus train cartpole --algorithm a2c --actors 4 --seed 7
+  daedalus train cartpole --algorithm n_step_q
   daedalus train --env Acrobot-v1 --env-steps 500000
   daedalus train --env my_module:MyEnv-v0        (my_module.py in this folder registers MyEnv-v0)
   daedalus train cartpole --init-from runs/cartpole-impala-s1-20261121-101500 --set training.learning_rate=0.0001
@@ -189,6 +190,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
     add_tls(options)
     add_insecure(options)
     add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)  # for `daedalus sweep`
 
 
 def _check_watching(parsed: argparse.Namespace) -> None:
@@ -231,9 +233,12 @@ def _run(
         log_json=parsed.log_json,
     )
     output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
+    stopping = stop_on_signals()
+    if parsed.exit_with_parent:
+        exit_with_parent(stopping)
     try:
         with output:
-            end = run_locally(run, stop_on_signals(), output)
+            end = run_locally(run, stopping, output)
     except RunStoppedError:
         options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
         print(f"stopped; continue with: daedalus resume {directory}{options}")

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 
 from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
 
+_FEW = 5  # runs
+
 
 def as_text(comparison: Comparison) -> str:
     """Return the table of a comparison, with what its columns mean."""
@@ -50,6 +52,8 @@ def _notes(comparison: Comparison) -> list[str]:
         )
     if comparison.threshold is None:
         lines.append("env_steps and minutes to a return: name the return with --threshold")
+    if any(1 < result.runs < _FEW for result in comparison.results):
+        lines.append(f"intervals of fewer than {_FEW} runs are too narrow: train more seeds")
     single = [result.group for result in comparison.results if result.runs == 1]
     if single:
         named = " and ".join(single) if len(single) < 3 else f"{len(single)} groups"

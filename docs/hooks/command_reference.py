@@ -19,6 +19,7 @@ from daedalus.cli.commands import (
     plot,
     router,
     status,
+    sweep,
     train,
 )
 from daedalus.cli.commands.actor_arguments import parser as actor_parser
@@ -33,6 +34,7 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
     return {
         "train": train.train_parser(),
         "resume": train.resume_parser(),
+        "sweep": sweep.parser(),
         "check": check.parser(),
         "learner": learner_parser(),
         "actor": actor_parser(),

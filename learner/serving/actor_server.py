@@ -30,6 +30,7 @@ from daedalus.learner.serving.status_responses import StatusResponses
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode, encode
 from daedalus.protocol.limits import (
+    CLIENT_REPORT_LIMITS,
     EVALUATION_LIMITS,
     JOIN_LIMITS,
     SNAPSHOT_REQUEST_LIMITS,
@@ -122,6 +123,7 @@ class ActorServer:
         self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
         self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
         self._serve(keys.orders(run), self._on_order, STATUS_REQUEST_LIMITS)
+        self._serve(keys.reports(run, "*"), self._on_report, CLIENT_REPORT_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.
@@ -226,6 +228,9 @@ class ActorServer:
     def _on_join(self, request: Request) -> None:
         name = keys.last_chunk(request.key)
         request.reply(self._responses.join(name, request.payload, time.monotonic()))
+
+    def _on_report(self, request: Request) -> None:
+        request.reply(self._responses.report(keys.last_chunk(request.key), request.payload))
 
     def _on_drain(self, request: Request) -> None:
         name = keys.last_chunk(request.key)

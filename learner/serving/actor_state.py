@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.sequence_window import SequenceWindow
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import UNKNOWN, Origin
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
@@ -43,6 +44,7 @@ class Actor:
     answered_bytes: int = 0  # requested snapshots
     bytes_up_per_hour: float = 0.0
     bytes_down_per_hour: float = 0.0
+    client: ClientReport | None = None  # of the newest incarnation, if it is a client that reports
 
     @property
     def lives(self) -> int:
@@ -91,3 +93,4 @@ class Actor:
         self.left = False
         self.quarantined, self.drained = "", False
         self.fetches = self.compact_snapshots = False
+        self.client = None

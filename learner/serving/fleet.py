@@ -17,6 +17,7 @@ from daedalus.learner.serving.former_incarnations import Former, FormerIncarnati
 from daedalus.learner.serving.presence import Presence
 from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
 from daedalus.protocol.spaces import Spaces
 
@@ -93,6 +94,14 @@ class Fleet:
             self._replace_incarnation(actor, join.incarnation)
         actor.environments, actor.origin = join.environments, bounded(join.origin)
         self.changed()
+        return None
+
+    def report(self, name: str, report: ClientReport) -> Refusal | None:
+        """Note what a client reports about itself. Return None, or a Refusal if it does not take part."""
+        actor = self.actors.get(name)
+        if actor is None or (report.actor, report.incarnation) != (name, actor.incarnation):
+            return Refusal(code="unknown", reason=f"this process of {name!r} has not joined")
+        actor.client = report
         return None
 
     def drain(self, name: str) -> Refusal | None:

@@ -4,6 +4,7 @@ import heapq
 from typing import TypedDict
 
 from daedalus.learner.serving.fleet import Actor, Fleet
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.status import PAGE_ACTORS, ActorStatus
 
 _MAX_REASON = 300  # characters
@@ -43,6 +44,7 @@ def page(fleet: Fleet, after: str, now: float) -> tuple[ActorStatus, ...]:
 
 
 def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
+    client = actor.client or ClientReport(actor=actor.name, incarnation=actor.incarnation)
     return ActorStatus(
         actor=actor.name,
         host=actor.origin.host,
@@ -64,4 +66,10 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         compact_snapshots=actor.compact_snapshots,
         bytes_up_per_hour=actor.bytes_up_per_hour,
         bytes_down_per_hour=actor.bytes_down_per_hour,
+        deadlines=client.deadlines,
+        missed_deadlines=client.missed_deadlines,
+        overridden_actions=client.overridden_actions,
+        safe_actions=client.safe_actions,
+        rollouts_dropped=client.rollouts_dropped,
+        safe_reason=client.safe_reason[:_MAX_REASON],
     )

@@ -20,9 +20,9 @@ from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
-_ROW_BYTES, _INTEGER_BYTES = 23, 8
+_ROW_BYTES, _INTEGER_BYTES = 24, 8
 _SLACK_BYTES = 64 << 10
-_OTHER_ARRAYS = 16  # besides observations, actions, masks and scalars of info
+_OTHER_ARRAYS = 17  # besides observations, actions, masks and scalars of info
 # Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
 # chooses its number, and zeros compress to nothing: the learner's memory must not depend on the actor.
 _MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS = 64 << 20, 8
@@ -247,6 +247,10 @@ def _episode_violation(rollout: Rollout) -> str:
     ends = rollout.terminated | rollout.truncated  # [T, E]
     if (ends & ~rollout.valid).any():
         return "an episode ends in a row that only resets"
+    if rollout.overridden is not None and (rollout.overridden & ~rollout.valid).any():
+        return "a row that only resets is overridden"
+    if rollout.overridden is not None and not rollout.learned.any():
+        return "every row is overridden: there is none to learn from"
     if (rollout.valid[1:] == ends[:-1]).any():
         return "valid breaks the reset rule: a row must be invalid if, and only if, an episode ended in the row before"
     if len(rollout.episode_returns) != np.count_nonzero(ends):

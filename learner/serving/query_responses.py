@@ -10,9 +10,10 @@ import threading
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.refused_joins import MAX_REASON
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
-from daedalus.protocol.limits import JOIN_LIMITS
-from daedalus.protocol.messages import Join, Origin, Program, Refusal, Welcome
+from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
+from daedalus.protocol.messages import Acknowledgement, Join, Origin, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import EventKind
 
@@ -75,6 +76,18 @@ class QueryResponses:
             self._events.add("joined", text, actor=name)
         welcome = Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, epsilon=epsilon, spec=self._spec)
         return encode(welcome)
+
+    def report(self, name: str, data: bytes) -> bytes:
+        """Return the answer to the encoded ClientReport of an actor. `name` is that in the key of the query."""
+        try:
+            message = decode(data, CLIENT_REPORT_LIMITS)
+        except ProtocolError as error:
+            return encode(Refusal(code="malformed", reason=str(error)))
+        if not isinstance(message, ClientReport):
+            return encode(Refusal(code="malformed", reason="expected a ClientReport message"))
+        with self._lock:
+            refusal = self._fleet.report(name, message)
+        return encode(refusal or Acknowledgement(verdict="accepted"))
 
     def _add_refusal(self, name: str, origin: Origin, refusal: Refusal) -> None:
         kind: EventKind = "failed" if refusal.code == "failed" else "refused"

@@ -123,6 +123,8 @@ def _write_synced(path: Path, data: bytes) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no directories, and NTFS keeps a journal of them
+        return
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,19 +1,20 @@
 """Client: what its own thread reports to the caller's thread."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import gymnasium
 import numpy as np
 import pytest
-from processes import until
-from scripted_learner import ScriptedLearner
+from processes import LIMIT, until
+from scripted_learner import ScriptedLearner, acknowledge
 
 from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.session.learner_queries import ActorError
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement
+from daedalus.protocol.messages import Acknowledgement, Refusal
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 OBSERVATION = np.zeros(4, np.float32)
@@ -65,3 +66,105 @@ def test_act_raises_a_bug_of_the_clients_thread(learner: ScriptedLearner, monkey
         until(lambda: client.is_over)
         with pytest.raises(ZeroDivisionError, match="a bug"):
             client.act(OBSERVATION)
+
+
+def acts_until(client: Client, condition: Callable[[], bool]) -> None:
+    """Run the loop until a condition holds."""
+
+    def acted() -> bool:
+        client.act(OBSERVATION)
+        return condition()
+
+    until(acted)
+
+
+def test_safe_action_while_the_learner_is_gone_and_recovery(network: MemoryNetwork, learner: ScriptedLearner) -> None:
+    learner.publish(3)
+    with Client("tcp/127.0.0.1:1", **SPACES, name="robot", safe_action=1, max_policy_age=0.5) as client:
+        acts_until(client, lambda: bool(learner.fetches))  # it asks for confirmation although no rollout is due
+        learner.transport.close()
+        acts_until(client, lambda: "did not confirm the policy within 0.5 s" in client.safe_reason)
+        assert [client.act(OBSERVATION) for _ in range(20)] == [1] * 20
+        back = ScriptedLearner(network, epoch=2)
+        back.publish(4)
+        acts_until(client, lambda: client.safe_reason == "")
+        acts_until(client, lambda: not back.rollouts.empty())
+        rollout, _ = back.receive()
+        assert (rollout.policy_version, rollout.identity.learner_epoch, rollout.overridden) == (4, 2, None)
+        assert client.dropped > 0
+        back.transport.close()
+
+
+def test_policy_does_not_age_while_the_learner_confirms_it(learner: ScriptedLearner) -> None:
+    """A learner that has no newer policy, such as while all robots play the safe action, is not one that is gone."""
+    learner.publish(3)
+    with Client("tcp/127.0.0.1:1", **SPACES, name="robot", safe_action=1, max_policy_age=2.0) as client:
+        learner.snapshot = encode(Refusal(code="not_ready", reason="the actor holds the newest snapshot"))
+        seen = len(learner.fetches)
+        fill_rollout(client)  # nobody acknowledges it: the window stays full
+        until(lambda: len(learner.fetches) > seen + 8)  # two seconds and more
+        client.act(OBSERVATION)
+        assert client.safe_reason == ""
+
+
+def test_acting_goes_on_while_the_learner_acknowledges_nothing(learner: ScriptedLearner) -> None:
+    with Client("tcp/127.0.0.1:1", **SPACES, name="robot") as client:
+        acts_until(client, lambda: client.dropped > 3)
+        assert learner.rollouts.qsize() <= 2  # the window
+        report = learner.reports.get(timeout=LIMIT)
+        while not report.rollouts_dropped:
+            report = learner.reports.get(timeout=LIMIT)
+
+
+def test_client_reports_what_it_counts(learner: ScriptedLearner) -> None:
+    with Client("tcp/127.0.0.1:1", **SPACES, name="robot", safe_action=1) as client:
+        with client.clock(rate=1000.0) as clock:
+            for _ in range(3):
+                assert clock.wait()
+                client.act(OBSERVATION)  # of version 0
+        client.act(OBSERVATION, override=0)
+        report = learner.reports.get(timeout=LIMIT)
+        while not report.overridden_actions:
+            report = learner.reports.get(timeout=LIMIT)
+        missed = clock.missed_deadlines
+        assert report == ClientReport(
+            actor="robot",
+            incarnation=report.incarnation,
+            deadlines=2 + missed,
+            missed_deadlines=missed,
+            overridden_actions=1,
+            safe_actions=3,
+            safe_reason="no update has changed the policy yet: pass untrained=True to let it act",
+        )
+
+
+def test_clients_of_one_process_have_names_of_their_own(learner: ScriptedLearner) -> None:
+    """Several agents, or several environments, in one loop: a client for each."""
+    with Client("tcp/127.0.0.1:1", **SPACES) as left, Client("tcp/127.0.0.1:1", **SPACES) as right:
+        senders = set()
+        for _ in range(5):
+            left.act(OBSERVATION)
+            right.act(OBSERVATION)
+        for _ in range(2):
+            rollout, request = learner.receive()
+            acknowledge(request, "accepted")
+            senders.add(rollout.identity.actor)
+        assert len(senders) == 2
+
+
+def test_client_takes_part_in_a_synchronous_run(network: MemoryNetwork, learner: ScriptedLearner) -> None:
+    """It acts on while the learner makes an update, and begins its next rollout with the new policy."""
+    learner.spec = learner.spec.model_copy(
+        update={"training": learner.spec.training.model_copy(update={"algorithm": "a2c"})}
+    )
+    with Client("tcp/127.0.0.1:1", **SPACES) as client:
+        for version in range(3):
+            acts_until(client, lambda: not learner.rollouts.empty())
+            rollout, request = learner.receive()
+            assert rollout.policy_version == version
+            for _ in range(20):
+                client.act(OBSERVATION)
+            assert learner.rollouts.empty(), "the next rollout waits for the update"
+            learner.publish(version + 1)
+            acknowledge(request, "accepted", version + 1)
+        assert client.dropped == 0

@@ -1,18 +1,22 @@
 """ClientCollector, compared with an EnvironmentCollector that steps the same environment."""
 
 import copy
+import time
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from allowed_modules import TEST_MODULES
 from collectors import started_collector
 
 from daedalus.actor.collecting.client_collector import _MAX_FULL_ROLLOUTS, ClientCollector
+from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.session.learner_queries import ActorError
+from daedalus.learner.serving.intake import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -158,11 +162,167 @@ def test_invalid_calls_raise_and_change_nothing() -> None:
     assert rollout.episode_returns[0] == 1.0
 
 
-def test_synchronous_run_is_refused() -> None:
-    spec = run_spec().model_copy(update={"training": run_spec().training.model_copy(update={"algorithm": "a2c"})})
-    environment = gymnasium.make(spec.environment.id)
-    with pytest.raises(ActorError, match="a client cannot wait: use another algorithm"):
-        ClientCollector(environment.observation_space, environment.action_space, None).prepare(spec)
+def synchronous(played: Played) -> Played:
+    training = played.spec.training.model_copy(update={"algorithm": "a2c"})
+    played.spec = played.spec.model_copy(update={"training": training})
+    return played
+
+
+def test_rows_between_the_rollouts_of_a_synchronous_run_are_not_written() -> None:
+    """The next rollout begins with the newest weights once the service asks for it; the memory goes on meanwhile."""
+    played = synchronous(Played(run_spec()))
+    client, robot = begun(played)
+    drive(client, robot, 4)  # the service has not asked for a rollout yet
+    assert not client.has_rollout()
+    assert client.collect(IDENTITY) is None
+    drive(client, robot, 4 * ROWS)
+    first = take(client)
+    assert not client.has_rollout()
+    client.load(played.snapshot(1))
+    drive(client, robot, ROWS)
+    assert not client.has_rollout()
+    assert client.collect(IDENTITY) is None
+    drive(client, robot, 2 * ROWS)
+    second = take(client)
+    assert (first.policy_version, second.policy_version) == (0, 1)
+    assert first.initial_state.any(), "the memory began before the rollout"
+    assert client.dropped == 0
+    for rollout in (first, second):
+        assert _episode_violation(rollout) == ""
+
+
+def observations(count: int) -> np.ndarray:
+    return (
+        np.random.default_rng(5)
+        .standard_normal((count, *gymnasium.make(run_spec().environment.id).observation_space.shape))
+        .astype(np.float32)
+    )  # type: ignore[misc] - it has a shape
+
+
+def played_with(overrides: dict[int, int], steps: int) -> tuple[list[Rollout], list[int]]:
+    """Return the rollouts of a loop without ends whose actions are overridden at some steps, and the actions."""
+    torch.manual_seed(1)
+    client, _ = begun(Played(run_spec()))
+    rollouts: list[Rollout] = []
+    actions = []
+    for step, observation in enumerate(observations(steps)):
+        actions.append(int(client.act(observation, override=overrides.get(step))))
+        client.reward(step)
+        rollouts += [] if not client.has_rollout() else [take(client)]
+    assert client.overridden_actions == len(overrides)
+    return rollouts, actions
+
+
+def test_overridden_action_is_played_and_the_policy_goes_on_as_without_it() -> None:
+    plain, plain_actions = played_with({}, 3 * ROWS + 1)
+    rollouts, actions = played_with({step: (plain_actions[step] + 1) % 4 for step in (2, 7)}, 3 * ROWS + 1)
+    assert [step for step in range(len(actions)) if actions[step] != plain_actions[step]] == [2, 7]
+    assert len(rollouts) == len(plain) == 3
+    for rollout, other in zip(rollouts, plain, strict=True):
+        for name in Rollout.__dataclass_fields__:
+            if name != "overridden":
+                np.testing.assert_equal(getattr(rollout, name), getattr(other, name), name)
+    found = [None if rollout.overridden is None else rollout.overridden[:, 0].tolist() for rollout in rollouts]
+    assert found == [[False, False, True, False, False], [False, False, True, False, False], None]
+
+
+def test_no_rollout_begins_with_an_overridden_row() -> None:
+    """A person who drives for long fills one rollout, and no further ones that hold nothing to learn from."""
+    rollouts, _ = played_with(dict.fromkeys(range(3, 40), 0), 40 + ROWS + 1)
+    first, second = rollouts
+    assert first.learned[:, 0].tolist() == [True] * 3 + [False] * 2
+    assert second.learned.all()
+    assert second.rewards[0, 0] == 40.0
+    assert second.initial_state.any()
+
+
+def guarded(played: Played, **settings: Any) -> tuple[ClientCollector, Robot]:
+    environment = gymnasium.make(played.spec.environment.id).unwrapped
+    space = environment.action_space
+    guard = PolicyGuard(space, 1, settings.get("max_policy_age"), untrained=settings.get("untrained", False))
+    client = ClientCollector(environment.observation_space, space, None, guard)
+    client.prepare(played.spec)
+    client.begin(played.runtime(), played.spec, 3)
+    client.load(played.snapshot(settings.get("version", 1)))
+    client.confirm(time.monotonic())
+    return client, Robot(environment, environment.reset(seed=1)[0])
+
+
+def test_old_policy_does_not_act_and_nothing_is_learned_from_its_rows() -> None:
+    client, robot = guarded(Played(run_spec()))
+    drive(client, robot, 3)
+    assert client.safe_actions == 0
+    client.confirm(time.monotonic() - 31.0)
+    assert [client.act(robot.observation) for _ in range(4 * ROWS)] == [1] * 4 * ROWS
+    assert (client.safe_actions, client.dropped) == (4 * ROWS, 1)
+    assert client.guard.reason == "the learner did not confirm the policy within 30 s"
+    assert not client.has_rollout()
+    client.confirm(time.monotonic())
+    drive(client, robot, ROWS + 1)
+    assert client.guard.reason == ""
+    assert client.safe_actions == 4 * ROWS
+    assert take(client).overridden is None
+
+
+def test_untrained_policy_acts_only_if_asked_for() -> None:
+    client, robot = guarded(Played(run_spec()), version=0)
+    assert [client.act(robot.observation) for _ in range(20)] == [1] * 20
+    assert "no update has changed the policy yet" in client.guard.reason
+    client, robot = guarded(Played(run_spec()), version=0, untrained=True)
+    drive(client, robot, 20)
+    assert client.safe_actions == 0
+
+
+def test_another_learner_with_an_untrained_policy_does_not_drive() -> None:
+    played = Played(run_spec())
+    client, robot = guarded(played, version=500)
+    drive(client, robot, 3)
+    client.begin(played.runtime(), played.spec, 4)
+    client.load(played.snapshot(0))
+    assert [client.act(robot.observation) for _ in range(20)] == [1] * 20
+    client.load(played.snapshot(1))
+    drive(client, robot, 1)
+    assert client.safe_actions == 20
+
+
+def test_override_has_precedence_over_the_safe_action() -> None:
+    client, robot = guarded(Played(run_spec()), version=0)
+    assert client.act(robot.observation, override=0) == 0
+    assert (client.overridden_actions, client.safe_actions) == (1, 0)
+
+
+def test_safe_action_may_depend_on_the_observation() -> None:
+    guard = PolicyGuard(gymnasium.spaces.Discrete(9), lambda observation: observation + 1, None, untrained=False)
+    assert guard.action(4) == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ((None, 30.0), "pass a safe_action"),
+        ((7, None), "safe_action 7 is not in the action space"),
+        ((1, 0.0), "must be above 0 seconds"),
+        ((1, float("nan")), "must be above 0 seconds"),
+    ],
+)
+def test_settings_of_the_safe_action_are_checked(arguments: tuple[Any, float | None], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        PolicyGuard(gymnasium.spaces.Discrete(2), *arguments, untrained=False)
+
+
+def test_reward_may_come_after_the_end_of_its_episode() -> None:
+    client, robot = begun(Played(run_spec()))
+    client.act(robot.observation)
+    client.end_episode(None, terminated=True)
+    client.reward(2.0)
+    client.reward(3.0)
+    with pytest.raises(ValueError, match="without any action"):
+        client.end_episode(None, terminated=True)
+    drive(client, robot, ROWS)
+    rollout = take(client)
+    assert rollout.rewards[:2, 0].tolist() == [5.0, 0.0]
+    assert rollout.terminated[0, 0]
+    assert rollout.episode_returns[0] == 5.0
 
 
 def test_terminated_episode_needs_its_last_observation_where_terminations_are_bootstrapped() -> None:

@@ -14,6 +14,8 @@ from torch.testing import assert_close
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.rollout_gradients import RolloutGradients
+from daedalus.learner.run.rollout_length import check_rollout_length
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -303,3 +305,12 @@ def test_sarsa_with_rollouts_of_one_row_is_refused() -> None:
     RunSpec.model_validate(content | {"training": {"algorithm": "one_step_q"}})
     with pytest.raises(ValueError, match="one_step_sarsa learns from an action and the next one: make it at least 2"):
         RunSpec.model_validate(content | {"training": {"algorithm": "one_step_sarsa"}})
+
+
+def test_masked_actions_with_rollouts_of_one_row_are_refused() -> None:
+    content = {"environment": {"id": "A"}, "collection": {"rollout_length": 1}}
+    spec = RunSpec.model_validate(content | {"training": {"algorithm": "n_step_q"}})
+    check_rollout_length(spec, SPACES)
+    with pytest.raises(SettingsError, match="n_step_q needs the mask of the next row"):
+        check_rollout_length(spec, MASKED)
+    check_rollout_length(RunSpec.model_validate(content), MASKED)

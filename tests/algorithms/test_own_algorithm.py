@@ -56,6 +56,21 @@ class Random(A3c):
         torch.rand(self.draws)
         yield from super().losses(batch, forward)
 
+class Counting(A3c):
+    record = AlgorithmRecord(target_network=True)
+
+    def __init__(self, spec, distribution):
+        super().__init__(spec, distribution)
+        self.statistics = {"updates": torch.zeros(())}
+
+    def after_update(self, policy_version, forward):
+        self.statistics["updates"] += 1
+        assert self.statistics["updates"] == policy_version
+
+class FaultyAfter(A3c):
+    def after_update(self, policy_version, forward):
+        forward.update_target()
+
 number = 3
 """
 
@@ -120,6 +135,7 @@ def test_arguments_reach_the_constructor(modules: UserModules) -> None:
         (f"{MODULE}:Unfinished", "NotImplementedError"),
         (f"{MODULE}:Twice", "its losses make 2 updates of a batch, and its record says 1"),
         (f"{MODULE}:WrongShape", "ValueError: the shapes of values, targets and shares differ"),
+        (f"{MODULE}:FaultyAfter", "there is no target network: set target_network in the record of the algorithm"),
         (f"{MODULE}:NoRecord", "its record is not an AlgorithmRecord"),
         (f"{MODULE}:number", "it is not a class of daedalus.algorithms.algorithm.Algorithm"),
         (f"{MODULE}:absent", "has no 'absent'"),
@@ -132,6 +148,18 @@ def test_a_fault_is_reported_in_one_line_before_the_run(modules: UserModules, na
         Learner(TrainingSpec(algorithm=name), POLICY, SPACES, modules)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_follows_an_update_is_saved_and_restored(modules: UserModules) -> None:
+    spec = resolved(modules, "Counting")
+    first, second = (Learner(spec.training, POLICY, SPACES, modules) for _ in range(2))
+    for step in range(3):
+        first.step(make_rollouts(step), 0.0)
+    state = {name: values.clone() for name, values in first.state().items()}
+    assert float(state["algorithm/updates"]) == 3.0
+    second.restore(3, {name: values.copy() for name, values in first.weights().items()}, state)
+    second.step(make_rollouts(9), 0.0)
+    assert float(second.state()["algorithm/updates"]) == 4.0
 
 
 def test_the_run_directory_holds_the_settings_and_not_the_record(modules: UserModules, tmp_path: Path) -> None:

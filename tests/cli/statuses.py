@@ -17,6 +17,7 @@ def actor_status(name: str, **changes: Any) -> ActorStatus:
         "lives": 1,
         "seconds_since_seen": 0.5,
         "environments": 4,
+        "epsilon": 0.0,
         "env_steps": 50,
         "env_steps_per_second": 10.0,
         "rollouts_accepted": 5,

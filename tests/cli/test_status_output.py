@@ -46,6 +46,13 @@ def test_actors_are_shown_with_host_address_and_software(printed: Print) -> None
     assert line.endswith("; gpu-box, tcp/10.0.0.7:43092, daedalus-rl 1.0")
 
 
+def test_the_epsilon_of_an_actor_that_explores_is_shown(printed: Print) -> None:
+    shown = printed(run_status(actors=(actor_status("arm-1", epsilon=0.5), actor_status("arm-2"))))
+    cells = {line.split()[0]: line.split() for line in shown.splitlines() if "arm-" in line}
+    column = next(line.split() for line in shown.splitlines() if "epsilon" in line).index("epsilon")
+    assert (cells["arm-1"][column + 1], cells["arm-2"][column + 1]) == ("0.5", "-")  # `0.5 s` of `seen` is two words
+
+
 def test_refused_joins_are_shown_with_host_version_and_reason(printed: Print) -> None:
     status = run_status(refused_joins=(refused_join(), refused_join(host="", software="")))
     assert printed(status).splitlines()[-2:] == [

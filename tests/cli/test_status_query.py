@@ -81,7 +81,11 @@ def test_status_contains_every_actor_of_a_large_fleet(server: ActorServer, opera
 
 
 def test_number_of_fetched_actors_can_be_limited(server: ActorServer, operator: MemoryTransport) -> None:
-    assert [len(ask(operator, max_actors=most)[0].actors) for most in (0, 100, 101)] == [100, 100, 200]
+    assert [len(ask(operator, max_actors=most)[0].actors) for most in (0, PAGE_ACTORS, PAGE_ACTORS + 1)] == [
+        PAGE_ACTORS,
+        PAGE_ACTORS,
+        2 * PAGE_ACTORS,
+    ]
 
 
 def test_actor_that_leaves_between_two_pages_costs_no_other(server: ActorServer, operator: MemoryTransport) -> None:
@@ -163,6 +167,12 @@ def test_page_of_the_longest_values_fits_the_limits_of_its_reader() -> None:
         rollouts_missed=largest,
         busy_answers=largest,
         policy_lag=largest,
+        deadlines=largest,
+        missed_deadlines=largest,
+        overridden_actions=largest,
+        safe_actions=largest,
+        rollouts_dropped=largest,
+        safe_reason="\N{EM DASH}" * 300,
     )
     data = encode(ActorsReport(page=ActorsPage(learner_epoch=largest, actors=(actor,) * PAGE_ACTORS)))
     assert isinstance(decode(data, STATUS_LIMITS), ActorsReport)
@@ -183,7 +193,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 200)
+    monkeypatch.setattr("daedalus.cli.commands.exporter._MAX_ACTORS", 2 * PAGE_ACTORS)
     collector = StatusCollector()
     collector.transport = operator
     samples = []
@@ -192,10 +202,10 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     counts = {sample.labels["state"]: sample.value for sample in samples if sample.name == "daedalus_actors"}
     assert counts == {"alive": 452, "quarantined": 1, "gone": 452}
     series = {sample.labels["actor"] for sample in samples if "actor" in sample.labels}
-    present = [name for name in sorted(server.fleet.actors)[:200] if int(name[4:]) % 2 == 0]
+    present = [name for name in sorted(server.fleet.actors)[: 2 * PAGE_ACTORS] if int(name[4:]) % 2 == 0]
     assert series == set(present)
     (warning,) = caplog.messages
-    assert "has 905 actors: 200 of them have metrics of their own" in warning
+    assert f"has 905 actors: {2 * PAGE_ACTORS} of them have metrics of their own" in warning
 
 
 # -------------------------------------------------------------------------------------------- --alive

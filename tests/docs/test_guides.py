@@ -83,6 +83,22 @@ def test_the_algorithm_learns(folder: Path) -> None:
     assert not np.array_equal(learner.weights()["policy_head.weight"], before["policy_head.weight"])
 
 
+def test_the_algorithm_of_action_values_learns(folder: Path) -> None:
+    (folder / "my_values.py").write_text(example("algorithm.md", number=1))
+    modules = UserModules(frozenset({"my_values"}))
+    spec = run_spec({"environment": {"id": "Any-v0"}, "training": {"algorithm": "my_values:DoubleQ"}})
+    spec = with_record(spec, modules)
+    assert spec.training.epsilons == (0.1, 0.01)
+    learner = Learner(spec.training, PolicySpec(hidden=(8,)), SPACES, modules)
+    weights, target = learner.weights()["policy_head.weight"], learner.state()["target_network"].clone()
+    before = weights.copy()
+    assert learner.step(make_rollouts(1), 0.0) == []
+    assert not np.array_equal(weights, before)
+    followed = (learner.state()["target_network"] - target).abs().max()
+    assert 0.0 < followed < 0.02 * np.abs(weights - before).max()
+    assert OnnxRuntime(learner.program()).explores
+
+
 def test_the_metrics_writer_writes(folder: Path) -> None:
     (folder / "json_lines.py").write_text(example("metrics_writer.md"))
     sys.path.append(str(folder))

@@ -15,7 +15,7 @@ from daedalus.protocol.status import ActorStatus, Event, EventKind, RunStatus
 
 WIRE = (DOCS / "wire.md").read_text("utf-8")
 TABLES = ["Join", "Welcome", "Refusal", "Program", "Snapshot", "Rollout", "Gradient", "Acknowledgement"]
-TABLES += ["RunEnded", "SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport"]
+TABLES += ["RunEnded", "SnapshotRequest", "SnapshotPart", "CompactSnapshot", "EvaluationReport", "ClientReport"]
 
 
 def first_column(table: str) -> set[str]:

@@ -32,6 +32,7 @@ class RecordingLearner:
 
     def __init__(self, transport: MemoryTransport, spec: RunSpec = SPEC) -> None:
         self.spec, self.epoch, self.version = spec, 2**62 + 5, 0
+        self.epsilon = 0.0  # of every actor
         self.joins: list[Join] = []
         self.rollouts: queue.SimpleQueue[Rollout] = queue.SimpleQueue()
         self.verdicts: queue.SimpleQueue[Acknowledgement] = (
@@ -86,11 +87,11 @@ class RecordingLearner:
         if join.spaces is not None:  # an actor declares its presence before it joins
             assert self.present[join.actor, join.incarnation]
         if join.spaces is not None and not self.weights:
-            self.network = ActorCritic(self.spec.policy, join.spaces)
+            self.network = ActorCritic(self.spec.policy, join.spaces, training=self.spec.training)
             self.model = export_program(self.network, join.spaces)
             self.weights = {name: p.detach().numpy().copy() for name, p in self.network.named_parameters()}
             self.weights = {name: self.weights[name] for name in OnnxRuntime(self.model).weight_names}
-        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=11, spec=self.spec)))
+        request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=11, epsilon=self.epsilon, spec=self.spec)))
 
     def _on_rollout(self, request: Request) -> None:
         rollout = decode(request.payload, Limits())

@@ -64,9 +64,11 @@ def play(
     """Function that starts a recording learner and an actor."""
     inside, address = network
 
-    def begin_both(spec: RunSpec = SPEC) -> tuple[RecordingLearner, Running]:
+    def begin_both(spec: RunSpec = SPEC, epsilon: float = 0.0) -> tuple[RecordingLearner, Running]:
         torch.manual_seed(0)
-        return RecordingLearner(MemoryTransport(inside), spec), begin(address)
+        learner = RecordingLearner(MemoryTransport(inside), spec)
+        learner.epsilon = epsilon
+        return learner, begin(address)
 
     return begin_both
 
@@ -132,6 +134,16 @@ def log_prob_and_state(
         parameters, after = network.step({NAME: torch.from_numpy(observations.copy())}, torch.from_numpy(state.copy()))
         chosen = {ACTION: torch.from_numpy(actions.astype(np.int64))}
         return network.distribution.log_prob(parameters, chosen, {}).numpy(), after.numpy()
+
+
+def test_the_actor_explores_with_the_epsilon_of_its_welcome(
+    play: Callable[..., tuple[RecordingLearner, Running]],
+) -> None:
+    learner, _ = play(SPEC.model_copy(update={"training": TrainingSpec(algorithm="n_step_q")}), epsilon=0.5)
+    log_probs = learner.next().behaviour_log_probs
+    is_random = np.isclose(log_probs, np.log(0.25), atol=1e-5)
+    assert (is_random | np.isclose(log_probs, np.log(0.75), atol=1e-5)).all()
+    assert 0.1 < is_random.mean() < 0.4
 
 
 def test_the_actor_obeys_each_verdict(play: Callable[..., tuple[RecordingLearner, Running]]) -> None:

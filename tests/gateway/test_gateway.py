@@ -282,7 +282,7 @@ def test_synchronous_run_refuses_clients(network: MemoryNetwork, connect: Connec
     training = SPEC.training.model_copy(update={"algorithm": "a2c"})
     learner = ScriptedLearner(network, SPEC.model_copy(update={"training": training}))
     try:
-        assert "a client cannot wait: use another algorithm" in connect().hello("arm-1")["reason"]
+        assert "clients of a gateway do not: use another algorithm" in connect().hello("arm-1")["reason"]
     finally:
         learner.transport.close()
 

@@ -276,3 +276,11 @@ def test_evaluations_of_one_owner_do_not_displace_the_others(tmp_path: Path) -> 
     for number in range(100):
         evaluations.begin(f"greedy.{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / "honest", *(tmp_path / str(n) for n in range(85, 100))}
+
+
+def test_target_is_reached_by_the_best_evaluation(run: Run) -> None:
+    assert not run.evaluations.reached(5.0)
+    for version, mean in ((1, 4.0), (2, 6.0), (3, 2.0)):
+        run.play(version, mean, mean)
+        assert run.evaluations.reached(5.0) == (version >= 2)
+    assert not run.evaluations.reached(None)

@@ -8,6 +8,7 @@ from daedalus.learner.serving import fleet_status, former_incarnations, presence
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.protocol.messages import Join, Refusal
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.status import PAGE_ACTORS
 
 WINDOW = 1024
 MINUTE = 60.0
@@ -225,6 +226,22 @@ def test_seeds_depend_on_actor_incarnation_start_version_and_run_seed() -> None:
     assert len({*seeds(1).values(), *seeds(2).values()}) == 16
 
 
+def test_epsilon_is_drawn_by_seed_and_name_and_is_the_same_after_a_restart() -> None:
+    epsilons = (0.1,) * 4 + (0.01,) * 3 + (0.5,) * 3
+
+    def drawn(seed: int) -> list[float]:
+        return [Fleet(seed, None, epsilons).epsilon_for(f"actor-{number}") for number in range(1000)]
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    shares = {epsilon: drawn(1).count(epsilon) / 1000 for epsilon in epsilons}
+    assert shares == pytest.approx({0.1: 0.4, 0.01: 0.3, 0.5: 0.3}, abs=0.06)
+    fleet = Fleet(1, None, epsilons)
+    for incarnation in (1, 2):
+        assert attempt(fleet, "actor-0", incarnation) is None
+        assert fleet.actors["actor-0"].epsilon == drawn(1)[0]
+        assert fleet_status.page(fleet, "", 0.0)[0].epsilon == drawn(1)[0]
+
+
 def test_statuses_are_sorted_by_actor_name() -> None:
     fleet = joined_fleet("b", "a")
     fleet.actors["b"].rejected["stale"] += 2
@@ -321,10 +338,10 @@ def test_number_of_remembered_incarnations_is_bounded(monkeypatch: pytest.Monkey
 
 
 def test_pages_of_the_status_contain_every_actor_once() -> None:
-    fleet = joined_fleet(*(f"a{number}" for number in range(250)))
+    fleet = joined_fleet(*(f"a{number}" for number in range(2 * PAGE_ACTORS + 50)))
     pages, after = [], ""
     while page := fleet_status.page(fleet, after, 0.0):
         pages.append([status.actor for status in page])
         after = page[-1].actor
-    assert [len(each) for each in pages] == [100, 100, 50]
+    assert [len(each) for each in pages] == [PAGE_ACTORS, PAGE_ACTORS, 50]
     assert [name for each in pages for name in each] == sorted(fleet.actors)

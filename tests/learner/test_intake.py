@@ -116,20 +116,20 @@ def test_bytes_that_are_no_message_are_rejected_as_malformed(harness: Harness, d
 
 
 def test_message_with_many_arrays_is_rejected_as_malformed(harness: Harness) -> None:
-    weights = {str(number): np.zeros(1, np.float32) for number in range(36)}
+    weights = {str(number): np.zeros(1, np.float32) for number in range(37)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
-    assert_rejected(harness, data, "malformed", "36 arrays, the limit is 35")
+    assert_rejected(harness, data, "malformed", "37 arrays, the limit is 36")
 
 
 def test_each_component_adds_its_arrays_to_the_limit() -> None:
     """A component of the observation has one array, a component of the action two, with its masks."""
     observation, action = ArraySpace(shape=(3,), dtype="float32"), DiscreteSpace(counts=(4,))
     spaces = Spaces(observations={"a": observation, "b": observation}, actions=dict.fromkeys("cde", action))
-    weights = {str(number): np.zeros(1, np.float32) for number in range(41)}
+    weights = {str(number): np.zeros(1, np.float32) for number in range(42)}
     data = encode(Snapshot(learner_epoch=EPOCH, policy_version=0, program="", weights=weights))
     verdict = stacked_harness(spaces).receive(data)
     assert isinstance(verdict, Rejected)
-    assert verdict.reason == "41 arrays, the limit is 40"
+    assert verdict.reason == "42 arrays, the limit is 41"
 
 
 def test_message_of_another_type_is_rejected_as_malformed(harness: Harness) -> None:
@@ -317,8 +317,8 @@ def test_size_limit_accepts_the_largest_valid_rollout_and_rejects_twice_its_fram
 
 
 def test_rollout_of_exactly_64_mib_is_not_refused() -> None:
-    """4,096 x (6 x 31 + (6 + 3) x 1,798) bytes, and 64 KiB."""
-    spaces = plain_spaces(ArraySpace(shape=(1798,), dtype="uint8", frames=3), 4)
+    """4,096 x (6 x 32 + (6 + 2) x 2,022) bytes, and 64 KiB."""
+    spaces = plain_spaces(ArraySpace(shape=(2022,), dtype="uint8", frames=2), 4)
     intake = Intake(run_spec(), EPOCH, joined_fleet("a", environments=4096, spaces=spaces))
     verdict = intake.read("a", b"no message")
     assert isinstance(verdict, Rejected)
@@ -355,9 +355,9 @@ def test_large_message_of_a_sender_that_has_not_joined_is_fenced(spaces: Spaces 
     ],
 )
 def test_size_limit_is_the_documented_one(action: DiscreteSpace | ContinuousSpace, action_bytes: int) -> None:
-    """E (T (23 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
+    """E (T (24 + action bytes) + (T + k) frame bytes + 4 S) + 64 KiB, and the header: docs/wire.md."""
     harness = stacked_harness(Spaces(observations={NAME: STACKED}, actions={ACTION: action}), state_size=7)
-    limit = ENVIRONMENTS * (ROWS * (23 + action_bytes) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
+    limit = ENVIRONMENTS * (ROWS * (24 + action_bytes) + (ROWS + 4) * 60 * 80 * 3 + 4 * 7) + (64 << 10)
     message = Limits(max_bytes=limit).message_bytes
     assert harness.intake.refuse_size("a", message) is None
     refused = harness.intake.refuse_size("a", message + 1)

@@ -176,7 +176,31 @@ def test_evaluator_is_not_counted_as_an_actor(tmp_path: Path) -> None:
     assert summary["policy_lag_max"] <= training_run.spec.training.policy_lag_bound
 
 
-@pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala", "appo"])
+@pytest.mark.parametrize(
+    ("algorithm", "exploration"), [("n_step_q", None), ("impala", (0.1,))], ids=["action values", "actor-critic"]
+)
+def test_a_run_whose_actors_explore_is_solved_by_an_evaluation(
+    tmp_path: Path, algorithm: str, exploration: tuple[float, ...] | None
+) -> None:
+    """Its training episodes are too few to solve it."""
+    training = {"env_steps": 10**9, "target_return": 1.0, "target_episodes": 10**6, "algorithm": algorithm}
+    evaluation = {"seconds": 0.01, "episodes": 2}
+    solved = TrainingRun(tmp_path, training={**training, "exploration": exploration}, evaluation=evaluation)
+    solved.finish()
+    assert json.loads((solved.directory / "summary.json").read_text())["solved"]
+
+
+def test_a_run_without_exploration_is_not_solved_by_an_evaluation(tmp_path: Path) -> None:
+    training = {"env_steps": 10**9, "target_return": 1.0, "target_episodes": 10**6, "algorithm": "impala"}
+    training_run = TrainingRun(tmp_path, training=training, evaluation={"seconds": 0.01, "episodes": 2})
+    try:
+        until(lambda: sum("evaluation at" in line for line in LINES) >= 2)
+    finally:
+        training_run.end()
+    assert not json.loads((training_run.directory / "summary.json").read_text())["solved"]
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "a3c", "impala", "appo", "one_step_q", "one_step_sarsa", "n_step_q"])
 def test_every_algorithm_trains_with_frame_stacks_and_recurrent_policy(tmp_path: Path, algorithm: str) -> None:
     training = {"env_steps": 10**9, "stop_when_solved": False, "algorithm": algorithm, **FEW_UPDATES}
     training_run = TrainingRun(tmp_path, training=training)

@@ -155,7 +155,9 @@ def test_value_that_is_not_finite_is_refused(assignment: str) -> None:
 
 def test_value_of_wrong_type_is_refused() -> None:
     assert error_message("training.learning_rate=fast").startswith("setting training.learning_rate should be")
-    assert "one of a2c, a3c, impala, appo (did you mean appo?), not 'ppo'" in error_message("training.algorithm=ppo")
+    assert "appo, one_step_q, one_step_sarsa, n_step_q (did you mean appo?), not 'ppo'" in error_message(
+        "training.algorithm=ppo"
+    )
     assert error_message("policy.hidden=64") == (
         "setting policy.hidden is 64, which is not a list: write policy.hidden=[64]"
     )

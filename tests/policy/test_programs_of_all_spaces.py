@@ -14,7 +14,7 @@ from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import PolicySpec
+from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 ROWS = 5
 
@@ -74,9 +74,11 @@ def masks_of(spaces: Spaces, random: np.random.Generator) -> dict[str, np.ndarra
     return masks
 
 
-def built(spec: PolicySpec, spaces: Spaces) -> tuple[ActorCritic, dict[str, np.ndarray]]:
+def built(
+    spec: PolicySpec, spaces: Spaces, training: TrainingSpec | None = None
+) -> tuple[ActorCritic, dict[str, np.ndarray]]:
     """Return a network and its weights, also the biases and the statistics of its normaliser random."""
-    network = ActorCritic(spec, spaces)
+    network = ActorCritic(spec, spaces, training=training)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             if "normalizer" in name:
@@ -87,13 +89,17 @@ def built(spec: PolicySpec, spaces: Spaces) -> tuple[ActorCritic, dict[str, np.n
 
 
 @settings(max_examples=12, phases=(Phase.generate,))  # shrinking would export a program for each step
-@given(spaces=all_spaces, spec=policies, seed=st.integers(0, 2**20), greedy=st.booleans())
-def test_program_acts_as_torch_does(spaces: Spaces, spec: PolicySpec, seed: int, greedy: bool) -> None:
+@given(spaces=all_spaces, spec=policies, seed=st.integers(0, 2**20), greedy=st.booleans(), explores=st.booleans())
+def test_program_acts_as_torch_does(spaces: Spaces, spec: PolicySpec, seed: int, greedy: bool, explores: bool) -> None:
     torch.manual_seed(seed)
     random = np.random.default_rng(seed)
-    network, weights = built(spec, spaces)
+    bounded = all(isinstance(space, DiscreteSpace) or space.bounded for space in spaces.actions.values())
+    training = TrainingSpec(exploration=(0.5,)) if explores and bounded else TrainingSpec()
+    network, weights = built(spec, spaces, training)
     runtime = OnnxRuntime(export_program(network, spaces))
-    plain = TorchRuntime(spec, spaces)
+    plain = TorchRuntime(spec, spaces, training)
+    assert runtime.explores == plain.explores == training.explores
+    epsilon = np.full((ROWS, 1), 0.5, np.float32)
     assert runtime.state_size == plain.state_size
     seen, masks = observe(spaces, random), masks_of(spaces, random)
     state = random.normal(0, 0.5, (ROWS, runtime.state_size)).astype(np.float32)
@@ -102,9 +108,11 @@ def test_program_acts_as_torch_does(spaces: Spaces, spec: PolicySpec, seed: int,
     choices = []
     for one in (runtime, plain):
         one.load(weights)
-        choices.append(one.act(seen, state, noise, masks))
+        choices.append(one.act(seen, state, noise, masks, epsilon))
     assert_same(spaces, *choices)
     assert_legal(spaces, masks, choices[0])
+    if training.explores:
+        return
     np.testing.assert_allclose(choices[0].log_probs, learned(network, seen, state, masks, choices[0]), atol=2e-3)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.compact import bfloat16, planes
 from daedalus.protocol.messages import (
@@ -45,7 +46,7 @@ _T, _E, _K = 3, 2, 4
 _PIXELS = np.arange((_K + _T) * _E * 6 * 5, dtype=np.uint8).reshape(_E, _K + _T, 6, 5).swapaxes(0, 1)
 
 
-def _rollout(frames: np.ndarray) -> Rollout:
+def _rollout(frames: np.ndarray, overridden: np.ndarray | None = None) -> Rollout:
     cells, cells4 = np.arange(_T * _E).reshape(_T, _E), np.arange((_T + 1) * _E).reshape(_T + 1, _E)
     return Rollout(
         identity=RolloutIdentity(actor="wing-1", incarnation=2**61 + 1, sequence=7, learner_epoch=2**60 + 3),
@@ -65,6 +66,7 @@ def _rollout(frames: np.ndarray) -> Rollout:
         episode_returns=np.array([1.5, -2.0], np.float32),
         episode_lengths=np.array([12, 9], np.int32),
         episode_info={"distance": np.array([3.5], np.float32), "goals": np.array([0.0, 2.0], np.float32)},
+        overridden=overridden,
     )
 
 
@@ -105,6 +107,12 @@ _ACTOR = ActorStatus(
     compact_snapshots=True,
     bytes_up_per_hour=7200.5,
     bytes_down_per_hour=1.5,
+    deadlines=600,
+    missed_deadlines=2,
+    overridden_actions=5,
+    safe_actions=40,
+    rollouts_dropped=1,
+    safe_reason="the learner did not confirm the policy within 30 s",
 )
 
 MESSAGES: dict[str, Message] = {
@@ -136,7 +144,7 @@ MESSAGES: dict[str, Message] = {
     "refusal": Refusal(code="mismatch", reason="other spaces"),
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),
     "rollout_numbers": _rollout(np.linspace(-1, 1, (_T + 1) * _E * 4, dtype=np.float32).reshape(_T + 1, _E, 4)),
-    "rollout_pixels": _rollout(_PIXELS),
+    "rollout_pixels": _rollout(_PIXELS, np.arange(_T * _E).reshape(_T, _E) == 5),
     "gradient_float32": _gradient({"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.ones(3, np.float32)}),
     "gradient_compact": _gradient(planes(bfloat16({"body.weight": 1.01 * np.eye(3, dtype=np.float32)}), None)),
     "acknowledgement": Acknowledgement(verdict="rejected", reason="policy lag 40", policy_version=81),
@@ -161,6 +169,16 @@ MESSAGES: dict[str, Message] = {
             bfloat16({"body.weight": 1.01 * np.eye(3, dtype=np.float32), "body.bias": np.zeros(3, np.float32)}),
             bfloat16({"body.weight": np.eye(3, dtype=np.float32), "body.bias": np.ones(3, np.float32)}),
         ),
+    ),
+    "client_report": ClientReport(
+        actor="wing-1",
+        incarnation=5,
+        deadlines=600,
+        missed_deadlines=2,
+        overridden_actions=5,
+        safe_actions=40,
+        rollouts_dropped=1,
+        safe_reason="the learner did not confirm the policy within 30 s",
     ),
     "evaluation_request": EvaluationRequest(evaluator="judge"),
     "evaluation_report": EvaluationReport(

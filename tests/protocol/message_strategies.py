@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 from wire_format import DTYPES, bits
 
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import (
     Acknowledgement,
     ActorsReport,
@@ -115,7 +116,9 @@ actor_statuses = st.builds(
     ActorStatus,
     epsilon=floats,
     rollouts_rejected=st.dictionaries(text, counters, max_size=3),
-    **dict.fromkeys(("actor", "host", "software", "address", "quarantined"), text),
+    **dict.fromkeys(("actor", "host", "software", "address", "quarantined", "safe_reason"), text),
+    **dict.fromkeys(("deadlines", "missed_deadlines", "overridden_actions"), counters),
+    **dict.fromkeys(("safe_actions", "rollouts_dropped"), counters),
     **dict.fromkeys(("seconds_since_seen", "env_steps_per_second"), floats),
     **dict.fromkeys(("bytes_up_per_hour", "bytes_down_per_hour"), floats),
     **dict.fromkeys(("lives", "environments", "rollouts_accepted", "rollouts_missed"), counters),
@@ -185,6 +188,7 @@ def rollouts(draw: st.DrawFn) -> Rollout:
                 draw(st.lists(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"), max_size=3)) if episodes else ()
             )
         },
+        overridden=bits(random, "|b1", shape) if draw(st.booleans()) else None,
     )
 
 
@@ -304,6 +308,13 @@ KINDS: dict[type, st.SearchStrategy[Any]] = {
     CompactSnapshot: compact_snapshots(),
     EvaluationRequest: st.builds(EvaluationRequest, evaluator=text),
     EvaluationReport: evaluation_reports(),
+    ClientReport: st.builds(
+        ClientReport,
+        actor=text,
+        safe_reason=text,
+        **dict.fromkeys(("incarnation", "deadlines", "missed_deadlines", "overridden_actions"), counters),
+        **dict.fromkeys(("safe_actions", "rollouts_dropped"), counters),
+    ),
     RunEnded: st.builds(
         RunEnded, learner_epoch=counters, outcome=st.sampled_from(["finished", "stopped"]), reason=text
     ),

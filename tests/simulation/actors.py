@@ -66,6 +66,9 @@ class ScriptedCollector:
         self._actor.ledger.require(not older, "an older policy version is loaded after a newer one")
         self._snapshot = snapshot
 
+    def confirm(self, at: float) -> None:
+        pass
+
     def has_rollout(self) -> bool:
         return True
 

@@ -1,0 +1,1 @@
+"""A sweep: runs of many settings and seeds on this machine."""
