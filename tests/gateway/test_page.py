@@ -59,6 +59,11 @@ def show(gateway: RunningGateway, *arguments: Any, **fields: Any) -> None:
     gateway.call(lambda: gateway.data.show(observed(*arguments, **fields)))
 
 
+def wait_for(page: Any, expression: str) -> None:
+    """Wait until an expression of JavaScript is true. The page forbids what Playwright's own wait does."""
+    until(lambda: page.evaluate(expression))
+
+
 def text_of(page: Any, selector: str) -> str:
     return page.locator(selector).inner_text()
 
@@ -87,8 +92,8 @@ def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable
     watched, start = run
     page = visit(watched.address).page
     page.wait_for_selector("#charts .line", timeout=MILLISECONDS)
-    page.wait_for_function("document.querySelectorAll('#charts .line').length >= 5", timeout=MILLISECONDS)
-    page.wait_for_function("document.querySelector('#state').textContent === 'running'", timeout=MILLISECONDS)
+    wait_for(page, "document.querySelectorAll('#charts .line').length >= 5")
+    wait_for(page, "document.querySelector('#state').textContent === 'running'")
     assert text_of(page, "#run") == "run"
     actor = start("actor", "--connect", watched.learner, "--name", "fragile")
     row = "tr:has(td:text-is('fragile'))"
@@ -102,7 +107,7 @@ def test_a_page_that_is_opened_late_shows_the_run_from_its_begin(
     run: tuple[Run, Callable[..., Running]], visit: Open
 ) -> None:
     page = visit(run[0].address).page
-    page.wait_for_function("document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
+    wait_for(page, "document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
     label = page.locator("#charts svg").first.get_attribute("aria-label")
     assert "from" in label
 
@@ -142,7 +147,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run" / "operator-token").read_text().strip()
     page.locator("#operator-token").fill("wrong")
     page.get_by_role("button", name="Save a checkpoint").click()
-    page.wait_for_function("document.querySelector('#order-result').textContent.startsWith('Not done')")
+    wait_for(page, "document.querySelector('#order-result').textContent.startsWith('Not done')")
     page.locator("#operator-token").fill(token)
     page.get_by_role("button", name="Stop the run").click()
     page.get_by_role("dialog").get_by_role("button", name="Keep running").click()
@@ -151,7 +156,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
     assert process.wait() == 1, process.output
     assert "stopped; continue with: daedalus resume run" in process.output
-    page.wait_for_function("['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
+    wait_for(page, "['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
@@ -213,8 +218,12 @@ def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gatewa
     page.keyboard.press("Enter")
     assert page.locator("#actors tbody tr td").first.inner_text() == "wing-0"
     assert page.locator("#actors th[aria-sort='ascending']").inner_text().startswith("env_steps/s")
+    show(gateway, run_status((actor_status("arm", epsilon=0.1, missed_deadlines=3, safe_reason="too old"), *actors)))
+    page.wait_for_selector("#actors th:has-text('Safe reason')")
+    titles = page.locator("#actors th").all_inner_texts()
+    assert titles[-3:] == ["Exploration", "Missed deadlines", "Safe reason"]
     page.locator("#filter").fill("gone host-3")
-    assert text_of(page, "#totals").startswith("1 actor of 1,000 actors: 0 alive")
+    assert text_of(page, "#totals").startswith("1 actor of 1,001 actors: 0 alive")
     assert page.locator("#actors tbody tr td").first.inner_text() == "wing-500"
 
 
