@@ -93,8 +93,7 @@ class GatewayService:
         tasks = [asyncio.create_task(self._await_stop()), asyncio.create_task(self._reach_network())]
 
         async def close() -> None:
-            await raw.close()
-            await self._close()
+            await asyncio.gather(raw.close(), self._close())
 
         try:
             await Server(application(self._gateway, raw, rules, self._data), tls).run_until(
@@ -176,10 +175,15 @@ class GatewayService:
         self._monitor.open()
 
     async def _close(self) -> None:
+        """Close all parts side by side: each may wait for some seconds."""
+        closing = [self._close_gateway()]
         if self._camera is not None:
-            await self._camera.close()
+            closing.append(self._camera.close())
         if self._monitor is not None:
-            await asyncio.to_thread(self._monitor.close)
+            closing.append(asyncio.to_thread(self._monitor.close))
+        await asyncio.gather(*closing)
+
+    async def _close_gateway(self) -> None:
         if self._gateway.done():
             await self._gateway.result().close()
         else:

@@ -59,6 +59,7 @@ def hostile_clients() -> Verdict:
         here.start("learner", "cartpole", "--listen", here.address, "--run-dir", "run", *ENDLESS)
         gateway = here.start("gateway", "--connect", here.address, "--listen", "127.0.0.1:0", "--log-level", "info")
         port = int(gateway.expect(r"ws://127\.0\.0\.1:(\d+)/actor").group(1))
+        gateway.expect("follows run")
         until = time.monotonic() + 5.0 + _SECONDS
         steps: list[float] = []
         honest = threading.Thread(target=_play, args=(port, until, steps))

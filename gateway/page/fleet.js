@@ -61,7 +61,7 @@ export class Fleet {
       return { ...actor, state: stateOf(actor) };
     });
     const further = columns.filter((name) => !KNOWN.has(name) && this.#actors.some((actor) => isSet(actor[name])));
-    this.#extra = further.map(extraColumn);
+    this.#extra = further.map((name) => extraColumn(name, typeof this.#actors[0][name] === "number"));
     this.#draw();
   }
 
@@ -114,9 +114,9 @@ function isSet(value) {
   return value !== null && value !== undefined && value !== "" && value !== 0 && value !== false;
 }
 
-function extraColumn(name) {
+function extraColumn(name, isNumber) {
   const title = TITLES[name] ?? name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
   const text = (row) => (typeof row[name] === "number" ? number(row[name]) : isSet(row[name]) ? String(row[name]) : "-");
   const value = (row) => (typeof row[name] === "number" ? row[name] : 0);
-  return { name: `extra ${name}`, title, number: true, text, value };
+  return { name: `extra ${name}`, title, text, ...(isNumber ? { number: true, value } : { wraps: true }) };
 }

@@ -27,6 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     learner = Running([*COMMAND, "learner", "cartpole", "--listen", address, "--run-dir", "run", *ENDLESS], folder)
     gateway = Running([*COMMAND, "gateway", "--connect", address, "--listen", "127.0.0.1:0"], folder)
     try:
+        gateway.expect("follows run")  # the learner answers
         yield address, gateway.expect(r"ws://127\.0\.0\.1:(\d+)/actor").group(1)
         for process in (gateway, learner):
             process.process.terminate()

@@ -11,6 +11,7 @@ import pytest
 from browser import Visit, chromium
 from gateways import RunningGateway
 from processes import LIMIT, Running, starting, until
+from scripted_learner import SPEC, ScriptedLearner
 from watched import HOSTILE, actor_status, observed, run_status
 
 from daedalus.cli.status_query import ask
@@ -58,6 +59,11 @@ def show(gateway: RunningGateway, *arguments: Any, **fields: Any) -> None:
     gateway.call(lambda: gateway.data.show(observed(*arguments, **fields)))
 
 
+def wait_for(page: Any, expression: str) -> None:
+    """Wait until an expression of JavaScript is true. The page forbids what Playwright's own wait does."""
+    until(lambda: page.evaluate(expression))
+
+
 def text_of(page: Any, selector: str) -> str:
     return page.locator(selector).inner_text()
 
@@ -86,8 +92,8 @@ def test_curves_appear_and_a_killed_actor_shows_as_gone(run: tuple[Run, Callable
     watched, start = run
     page = visit(watched.address).page
     page.wait_for_selector("#charts .line", timeout=MILLISECONDS)
-    page.wait_for_function("document.querySelectorAll('#charts .line').length >= 5", timeout=MILLISECONDS)
-    page.wait_for_function("document.querySelector('#state').textContent === 'running'", timeout=MILLISECONDS)
+    wait_for(page, "document.querySelectorAll('#charts .line').length >= 5")
+    wait_for(page, "document.querySelector('#state').textContent === 'running'")
     assert text_of(page, "#run") == "run"
     actor = start("actor", "--connect", watched.learner, "--name", "fragile")
     row = "tr:has(td:text-is('fragile'))"
@@ -101,7 +107,7 @@ def test_a_page_that_is_opened_late_shows_the_run_from_its_begin(
     run: tuple[Run, Callable[..., Running]], visit: Open
 ) -> None:
     page = visit(run[0].address).page
-    page.wait_for_function("document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
+    wait_for(page, "document.querySelector('#charts .line')?.getAttribute('d').includes('L')")
     label = page.locator("#charts svg").first.get_attribute("aria-label")
     assert "from" in label
 
@@ -141,7 +147,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     token = (Path(os.readlink(f"/proc/{process.process.pid}/cwd")) / "run" / "operator-token").read_text().strip()
     page.locator("#operator-token").fill("wrong")
     page.get_by_role("button", name="Save a checkpoint").click()
-    page.wait_for_function("document.querySelector('#order-result').textContent.startsWith('Not done')")
+    wait_for(page, "document.querySelector('#order-result').textContent.startsWith('Not done')")
     page.locator("#operator-token").fill(token)
     page.get_by_role("button", name="Stop the run").click()
     page.get_by_role("dialog").get_by_role("button", name="Keep running").click()
@@ -150,7 +156,7 @@ def test_an_operator_stops_the_run_and_the_page_shows_its_end(
     page.get_by_role("dialog").get_by_role("button", name="Stop the run").click()
     assert process.wait() == 1, process.output
     assert "stopped; continue with: daedalus resume run" in process.output
-    page.wait_for_function("['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
+    wait_for(page, "['lost', 'closed', 'ended'].includes(document.querySelector('#state').dataset.state)")
 
 
 # --------------------------------------------------------------------------------------- runs made for the page
@@ -179,6 +185,20 @@ def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGat
     assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
 
 
+def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwork, visit: Open) -> None:
+    other = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "Other-v0"})})
+    learner = ScriptedLearner(network, other)
+    learner.publish(0)
+    running = RunningGateway(network)
+    try:
+        page = visit(f"http://127.0.0.1:{running.port}/play").page
+        page.wait_for_selector("#status:has-text('Not playing: the run plays Other-v0')", timeout=MILLISECONDS)
+        assert text_of(page, "#steps") == "0"
+    finally:
+        running.close()
+        learner.transport.close()
+
+
 def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gateway: RunningGateway, visit: Open) -> None:
     actors = tuple(
         actor_status(
@@ -198,8 +218,12 @@ def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gatewa
     page.keyboard.press("Enter")
     assert page.locator("#actors tbody tr td").first.inner_text() == "wing-0"
     assert page.locator("#actors th[aria-sort='ascending']").inner_text().startswith("env_steps/s")
+    show(gateway, run_status((actor_status("arm", epsilon=0.1, missed_deadlines=3, safe_reason="too old"), *actors)))
+    page.wait_for_selector("#actors th:has-text('Safe reason')")
+    titles = page.locator("#actors th").all_inner_texts()
+    assert titles[-3:] == ["Exploration", "Missed deadlines", "Safe reason"]
     page.locator("#filter").fill("gone host-3")
-    assert text_of(page, "#totals").startswith("1 actor of 1,000 actors: 0 alive")
+    assert text_of(page, "#totals").startswith("1 actor of 1,001 actors: 0 alive")
     assert page.locator("#actors tbody tr td").first.inner_text() == "wing-500"
 
 
