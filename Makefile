@@ -70,7 +70,7 @@ docs: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,browser,docs,dev]"
+	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,browser,docs,dev]"
 	touch $@
 
 clean:

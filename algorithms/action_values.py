@@ -19,7 +19,8 @@ class ActionValues(Algorithm):
     The target network is copied from the network every `training.target_period` updates.
 
     A rollout has neither the action nor the mask of the observation after its last row. Where the targets need one of
-    them, the last row bootstraps the rows before it and is itself learned from only if it ended in a termination.
+    them, the last row bootstraps the rows before it and is itself learned from only if it ended in a termination. After
+    a truncation, the mask of the final observation is the environment's; all actions are legal if it gives none.
     """
 
     def next_values(self, values: Tensor, batch: Batch) -> Tensor:

@@ -12,6 +12,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -131,8 +132,16 @@ def _loss(
     return policy_loss + 0.5 * advantages.square().mean() - ENTROPY_BONUS * distribution.entropy().mean()
 
 
-def hogwild(seed: int, workers: int) -> tuple[float | None, int, float]:
-    """Train with shared weights; return seconds to solved or None, env_steps, and env_steps per second."""
+class Run(NamedTuple):
+    """Result of one training."""
+
+    seconds: float | None  # to solved; None if it was not
+    env_steps: int
+    env_steps_per_second: float
+
+
+def hogwild(seed: int, workers: int) -> Run:
+    """Train with shared weights."""
     began, shared = time.monotonic(), Shared(seed)
     context = multiprocessing.get_context("spawn")
     processes = [
@@ -143,13 +152,13 @@ def hogwild(seed: int, workers: int) -> tuple[float | None, int, float]:
     for process in processes:
         process.join()
     seconds, env_steps = time.monotonic() - began, int(shared.counts[1])
-    return seconds if bool(shared.solved) else None, env_steps, env_steps / seconds
+    return Run(seconds if bool(shared.solved) else None, env_steps, env_steps / seconds)
 
 
-def daedalus(seed: int, workers: int, *options: str) -> tuple[float | None, int, float]:
-    """Train with `daedalus train cartpole`; return as `hogwild`."""
+def daedalus(seed: int, workers: int, *options: str) -> Run:
+    """Train with `daedalus train cartpole`."""
     summary = train("cartpole", "--seed", seed, "--actors", workers, *options)
-    return summary["seconds_to_target"], summary["env_steps"], summary["env_steps_per_second"]
+    return Run(summary["seconds_to_target"], summary["env_steps"], summary["env_steps_per_second"])
 
 
 def main() -> None:
@@ -169,9 +178,10 @@ def main() -> None:
     rows = []
     for name, variant in variants.items():
         runs = [variant(seed, parsed.workers) for seed in parsed.seeds]
-        seconds = sorted(run[0] or float("inf") for run in runs)
-        solved = sum(run[0] is not None for run in runs)
-        env_steps, rate = (statistics.median(run[index] for run in runs) for index in (1, 2))
+        seconds = sorted(run.seconds or float("inf") for run in runs)
+        solved = sum(run.seconds is not None for run in runs)
+        env_steps = statistics.median(run.env_steps for run in runs)
+        rate = statistics.median(run.env_steps_per_second for run in runs)
         median, worst = f"{statistics.median(seconds):.1f}", f"{seconds[-1]:.1f}"
         rows.append((name, f"{solved} of {len(runs)}", median, worst, f"{env_steps:,.0f}", f"{rate:,.0f}"))
         print(rows[-1], flush=True)

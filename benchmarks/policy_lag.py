@@ -10,43 +10,13 @@ of the budget.
 
 import argparse
 import statistics
-from collections import deque
 
 from running import machine, table
+from study.exact_lag import train
 
-from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.settings import choose_algorithm, read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
-from daedalus.learner.training.learner import Learner
-from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.protocol.messages import RolloutIdentity, Snapshot
 from daedalus.protocol.spec import RunSpec
-
-_IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
-
-
-def train(spec: RunSpec, lag: int) -> RunCounters:
-    """Train until the target or the end of the budget, with one rollout for each batch, and return the counters."""
-    training = spec.training
-    collector = EnvironmentCollector()
-    spaces, _ = collector.prepare(spec)
-    learner = Learner(training, spec.policy, spaces)
-    collector.begin(OnnxRuntime(learner.program()), spec, training.seed)
-    counters, annealing = RunCounters(training.target_episodes), Annealing(budget=training.env_steps)
-    snapshots: deque[Snapshot] = deque(maxlen=lag + 1)
-    while counters.env_steps < training.env_steps and not counters.reached(training.target_return):
-        weights = {name: array.copy() for name, array in learner.weights().items()}
-        version = learner.policy_version
-        snapshots.append(Snapshot(learner_epoch=1, policy_version=version, program="", weights=weights))
-        collector.load(snapshots[0])
-        rollouts = [collector.collect(_IDENTITY)]
-        progress = annealing.at(counters.env_steps)
-        learner.step(rollouts, progress)
-        counters.trained(rollouts, version, learner.policy_version - version)
-    collector.close()
-    return counters
 
 
 def specification(parsed: argparse.Namespace, seed: int) -> RunSpec:
@@ -71,7 +41,7 @@ def main() -> None:
     specs = [specification(parsed, seed) for seed in parsed.seeds]
     target = specs[0].training.target_return
     for lag in parsed.lags:
-        runs = [train(spec, lag) for spec in specs]
+        runs = [train(spec, lag).counters for spec in specs]
         solved = [run.env_steps for run in runs if run.reached(target)]
         ends = ", ".join(
             f"{run.env_steps:,}" if run.reached(target) else f"{run.episode_return_mean:.1f}" for run in runs

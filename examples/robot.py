@@ -11,6 +11,7 @@ the program prints how many of its deadlines it missed.
 
 import argparse
 import asyncio
+import contextlib
 import logging
 import math
 import multiprocessing
@@ -121,7 +122,8 @@ class DelayingProxy:
         except OSError:  # there is no learner yet: the client tries again
             writer.close()
             return
-        await asyncio.gather(self._forward(reader, far_writer), self._forward(far_reader, writer))
+        with contextlib.suppress(asyncio.CancelledError, ConnectionError):  # the end of the program or of a connection
+            await asyncio.gather(self._forward(reader, far_writer), self._forward(far_reader, writer))
 
     async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pieces: asyncio.Queue[tuple[float, float, bytes]] = asyncio.Queue()

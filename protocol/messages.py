@@ -451,8 +451,8 @@ Message = (
     | ActorsReport
     | EventsRequest
     | EventsReport
+    | ClientReport
     | MetricsRequest
     | MetricsReport
     | OrderRequest
-    | ClientReport
 )

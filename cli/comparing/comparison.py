@@ -10,6 +10,7 @@ import numpy as np
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import ENVIRONMENT
 from daedalus.cli.comparing.statistics import (
+    Strata,
     improvement_interval,
     interquartile_interval,
     interquartile_mean,
@@ -71,11 +72,11 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
             GroupResult(
                 group=group.name,
                 runs=len(group.runs),
-                final_return=_estimate(returns[index]),
+                final_return=estimate([returns[index]]),
                 reached=None if env_steps is None else int(np.isfinite(env_steps).sum()),
-                env_steps=None if env_steps is None else _estimate(env_steps),
-                minutes=None if minutes is None else _estimate(minutes),
-                improvement=_improvement(returns[index], returns[0]) if index else None,
+                env_steps=None if env_steps is None else estimate([env_steps]),
+                minutes=None if minutes is None else estimate([minutes]),
+                improvement=improvement([returns[index]], [returns[0]]) if index else None,
             )
         )
     environment = next((run.settings[ENVIRONMENT] for run in runs if run.settings), "")
@@ -88,11 +89,14 @@ def final_returns(group: Group, *, evaluated: bool) -> np.ndarray:
     return np.array([math.nan if value is None else value for value in values])
 
 
-def _estimate(scores: np.ndarray) -> Estimate:
-    interval = interquartile_interval([scores])
-    return Estimate(float(interquartile_mean(scores)), float(interval.low), float(interval.high))
+def estimate(strata: Strata) -> Estimate:
+    """Return the interquartile mean of the runs of all tasks, with its interval."""
+    interval = interquartile_interval(strata)
+    mean = interquartile_mean(np.concatenate(strata))
+    return Estimate(float(mean), float(interval.low), float(interval.high))
 
 
-def _improvement(scores: np.ndarray, first: np.ndarray) -> Estimate:
-    interval = improvement_interval([scores], [first])
-    return Estimate(probability_of_improvement([scores], [first]), float(interval.low), float(interval.high))
+def improvement(strata: Strata, first: Strata) -> Estimate:
+    """Return the probability that a run has a higher score than one of `first`, with its interval."""
+    interval = improvement_interval(strata, first)
+    return Estimate(probability_of_improvement(strata, first), float(interval.low), float(interval.high))

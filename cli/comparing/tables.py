@@ -29,13 +29,13 @@ def as_text(comparison: Comparison) -> str:
 
 
 def _cells(result: GroupResult, comparison: Comparison) -> list[str]:
-    cells = [result.group, str(result.runs), _estimate(result.final_return, _number)]
+    cells = [result.group, str(result.runs), written(result.final_return, _number)]
     if result.env_steps is not None and result.minutes is not None:
         cells.append(f"{result.reached} of {result.runs}")
-        cells += [_estimate(result.env_steps, lambda value: f"{value:,.0f}"), _estimate(result.minutes, _number)]
+        cells += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, _number)]
     if len(comparison.results) > 1:
         improvement = result.improvement
-        cells.append("" if improvement is None else _estimate(improvement, lambda value: f"{value:.2f}"))
+        cells.append("" if improvement is None else written(improvement, lambda value: f"{value:.2f}"))
     return cells
 
 
@@ -65,7 +65,9 @@ def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
 
 
-def _estimate(estimate: Estimate, form: Callable[[float], str]) -> str:
+def written(estimate: Estimate, form: Callable[[float], str]) -> str:
+    """Return an estimate as `1.5 [1.2, 1.9]`, or without an interval if it is unknown."""
+
     def shown(value: float) -> str:
         return "-" if math.isnan(value) else "never" if math.isinf(value) else form(value)
 

@@ -122,8 +122,8 @@ class ActorServer:
         self._serve(keys.program(run, "*"), lambda query: query.reply(responses.program(keys.last_chunk(query.key))))
         self._serve(keys.status(run), self._on_status, STATUS_REQUEST_LIMITS)
         self._serve(keys.drain(run, "*"), self._on_drain, STATUS_REQUEST_LIMITS)
-        self._serve(keys.orders(run), self._on_order, STATUS_REQUEST_LIMITS)
         self._serve(keys.reports(run, "*"), self._on_report, CLIENT_REPORT_LIMITS)
+        self._serve(keys.orders(run), self._on_order, STATUS_REQUEST_LIMITS)
         self._serve(keys.evaluations(run, "*"), self.evaluations.offer, EVALUATION_LIMITS)
         transport.declare_presence(keys.learner(run))
         # Last, because an actor that has joined uses all other keys.

@@ -192,11 +192,9 @@ def test_rows_between_the_rollouts_of_a_synchronous_run_are_not_written() -> Non
 
 
 def observations(count: int) -> np.ndarray:
-    return (
-        np.random.default_rng(5)
-        .standard_normal((count, *gymnasium.make(run_spec().environment.id).observation_space.shape))
-        .astype(np.float32)
-    )  # type: ignore[misc] - it has a shape
+    shape = gymnasium.make(run_spec().environment.id).observation_space.shape
+    assert shape is not None
+    return np.random.default_rng(5).standard_normal((count, *shape)).astype(np.float32)
 
 
 def played_with(overrides: dict[int, int], steps: int) -> tuple[list[Rollout], list[int]]:

@@ -157,6 +157,7 @@ def test_statistics_are_of_the_rows_to_learn_from() -> None:
     statistics = ObservationStatistics(ActorCritic(policy, SPACES).normalizer)
     assert statistics.moments_of(join([rollout]))["observation"].number == rollout.env_steps
     assert RewardNormalizer(GAMMA).moments_of([rollout]).number == rollout.env_steps
+    assert rollout.overridden is not None
     assert rollout.env_steps == np.count_nonzero(rollout.valid & ~rollout.overridden)
 
 

@@ -36,10 +36,12 @@ def test_a_learner_trains_from_a_loop_that_the_caller_owns(
     loop.expect("the run is over")
 
 
-def test_a_client_in_a_synchronous_run_fails_at_once(
+def test_a_client_takes_part_in_a_synchronous_run(
     start: Callable[..., Running], address: str, example: Callable[..., Running]
 ) -> None:
-    start("learner", "cartpole", "--algorithm", "a2c", "--listen", address, "--run-dir", "run")
-    loop = example()
-    assert loop.wait() == 1
-    loop.expect("ActorError: a run with a2c makes its actors wait for each update, but a client cannot wait")
+    words = ("learner", "cartpole", "--algorithm", "a2c", "--env-steps", 1000, "--actors", 1, "--run-dir", "run")
+    learner = start(*words, "--listen", address, "--set", "collection.rollout_length=32")
+    loop = example("--name", "robot")
+    assert learner.wait() == 3, learner.output  # the budget ended without the target
+    assert loop.wait() == 0, loop.output
+    loop.expect("the run is over")

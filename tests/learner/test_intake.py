@@ -575,6 +575,29 @@ def test_rows_that_break_the_reset_rule_are_rejected_as_unfit(
 
 
 @pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ("reset", "a row that only resets is overridden"),
+        ("all", "every row is overridden: there is none to learn from"),
+    ],
+)
+def test_overridden_rows_that_no_client_sends_are_rejected_as_unfit(harness: Harness, rows: str, reason: str) -> None:
+    plain = good()
+    assert not plain.valid.all()
+    overridden = ~plain.valid if rows == "reset" else plain.valid
+    assert_rejected(harness, encode(good(overridden=overridden)), "unfit", reason)
+
+
+def test_overridden_rows_are_accepted_and_not_counted() -> None:
+    overridden = good().valid.copy()
+    overridden[:-1] = False
+    assert overridden.any()
+    verdict = Harness().receive(encode(good(overridden=overridden)))
+    assert isinstance(verdict, Rollout)
+    assert verdict.env_steps == good().env_steps - np.count_nonzero(overridden)
+
+
+@pytest.mark.parametrize(
     ("name", "largest", "reason"),
     [
         ("rewards", 1e9, "rewards has a value beyond +-1e+09: set environment.reward_scale"),

@@ -9,13 +9,16 @@ from plain import vector_spaces
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.fleet_status import page
 from daedalus.learner.serving.query_responses import QueryResponses
+from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Join, Message, Origin, Program, Refusal, RunEnded, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Message, Origin, Program, Refusal, RunEnded, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
+SPACES = vector_spaces(4, 2)
 SPEC = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
 
 
@@ -132,3 +135,30 @@ def test_join_with_observations_too_large_for_memory_is_refused_and_fixes_no_spa
     assert isinstance(answer, Refusal)
     assert "use at most" in answer.reason
     assert fleet.spaces is None
+
+
+def test_report_of_a_client_is_in_its_status_until_it_is_restarted() -> None:
+    responses, fleet = make_responses()
+    joining = Join(actor="a", incarnation=1, spaces=SPACES, environments=1)
+    responses.join("a", encode(joining), 0.0)
+    report = ClientReport(actor="a", incarnation=1, deadlines=9, missed_deadlines=2, safe_reason="x" * 1000)
+    assert read(responses.report("a", encode(report))) == Acknowledgement(verdict="accepted")
+    (status,) = page(fleet, "", 0.0)
+    assert (status.deadlines, status.missed_deadlines, len(status.safe_reason)) == (9, 2, 300)
+    responses.join("a", encode(replace(joining, incarnation=2)), 0.0)
+    (status,) = page(fleet, "", 0.0)
+    assert (status.deadlines, status.safe_reason) == (0, "")
+
+
+def test_report_that_is_not_of_the_actor_of_its_key_is_refused() -> None:
+    responses, fleet = make_responses()
+    responses.join("a", encode(Join(actor="a", incarnation=1, spaces=SPACES, environments=1)), 0.0)
+    for report in (ClientReport(actor="b", incarnation=1), ClientReport(actor="a", incarnation=2)):
+        answer = read(responses.report("a", encode(report)))
+        assert isinstance(answer, Refusal)
+        assert answer.code == "unknown"
+    for data in (b"", b"DAED", encode(Join(actor="a", incarnation=1))):
+        answer = read(responses.report("a", data))
+        assert isinstance(answer, Refusal)
+        assert answer.code == "malformed"
+    assert fleet.actors["a"].client is None

@@ -281,6 +281,7 @@ def test_values_near_100_that_differ_by_a_tenth_stay_distinct(mixed: bool) -> No
     """A head that ran in bfloat16 would keep 8 bits: steps of 0.5 between 64 and 128."""
     spaces = vector_spaces(1, 2)
     network = ActorCritic(PolicySpec(hidden=()), spaces)
+    assert network.value_head is not None
     with torch.no_grad():
         for head in (network.policy_head, network.value_head):
             head.weight.fill_(1.0)

@@ -49,6 +49,7 @@ def address(certificates: Path) -> Iterator[str]:
         for key in (
             keys.join("r", "*"),
             keys.rollouts("r", "*"),
+            keys.reports("r", "*"),
             keys.evaluations("r", "*"),
             keys.program("r", "*"),
             keys.snapshots("r"),
@@ -126,11 +127,13 @@ def others(scene: Scene) -> list[str]:
 
 
 def uploads_as_itself(scene: Scene) -> bool:
-    return scene.answered(keys.rollouts("r", scene.name)) and scene.answered(keys.evaluations("r", scene.name))
+    return all(scene.answered(key_of("r", scene.name)) for key_of in (keys.rollouts, keys.reports, keys.evaluations))
 
 
 def uploads_as_another(scene: Scene) -> bool:
-    queried = [key_of("r", name) for key_of in (keys.rollouts, keys.evaluations) for name in others(scene)]
+    queried = [
+        key_of("r", name) for key_of in (keys.rollouts, keys.reports, keys.evaluations) for name in others(scene)
+    ]
     return any(scene.answered(key) for key in queried)
 
 

@@ -107,18 +107,19 @@ class TestSampler:
         assert search.take() is None
 
     def test_an_interrupted_sweep_goes_on_with_the_same_points(self, tmp_path: Path) -> None:
-        before = make_runs(self.search(tmp_path), lambda run: 1.0, most=3)  # ends in the middle of the second point
-        search = self.search(tmp_path)
+        # Stop in the middle of the second of three random points: the third must not be the first again.
+        before = make_runs(self.search(tmp_path, trials=9), lambda run: 1.0, most=3)
+        search = self.search(tmp_path, trials=9)
         after = []
         while (run := search.take()) is not None:
             if not (run.directory / "summary.json").exists():
                 finish(run)
             search.ended(run, failed=False)
             after.append(run)
-        assert len(after) == 12
+        assert len(after) == 18
         assert [run.spec for run in after[:3]] == [run.spec for run in before]
-        assert len({run.spec.training.learning_rate for run in after}) == 6
-        assert len([trial for trial in search._study.trials if trial.value is not None]) == 6
+        assert len({run.spec.training.learning_rate for run in after}) == 9
+        assert len([trial for trial in search._study.trials if trial.value is not None]) == 9
 
     def test_points_of_another_sweep_are_refused(self, tmp_path: Path) -> None:
         for content in ({"trials": [{"training.learning_rate": "0.1"}]}, {"trials": 3}, {}):

@@ -1,0 +1,1 @@
+"""Studies of the algorithms: one command for each, with raw results as CSV."""

@@ -1,0 +1,209 @@
+"""Study what policy lag costs: final return and env_steps to a threshold, when snapshots reach the actors late.
+
+    python -m benchmarks.study.lag --folder build/study
+    python -m benchmarks.study.lag --folder build/study --tasks catch --lags 0 16 --seeds 5 --jobs 4
+
+Every rollout is played with weights of exactly so many updates ago, in one process, so that a run is determined by its
+seed. Each run adds a line to lag.csv in the folder; the same command again makes only the runs that are missing. At the
+end, and with --table alone, the table is printed from the file: interquartile means and 95 % bootstrap intervals.
+"""
+
+import argparse
+import csv
+import itertools
+import math
+import multiprocessing
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.running import machine, table
+from benchmarks.study.tasks import TASKS, VARIANTS, specification
+from daedalus.cli.comparing.comparison import estimate, improvement
+from daedalus.cli.comparing.tables import written
+
+_COLUMNS: tuple[str, ...] = (
+    "task",
+    "variant",
+    "lag",
+    "seed",
+    "budget",
+    "env_steps",
+    "final_return",
+    "env_steps_to_threshold",
+    "lag_mean",
+    "seconds",
+)
+_FILE = "lag.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A run of the study."""
+
+    task: str
+    variant: str
+    lag: int
+    seed: int
+    budget: int  # env_steps
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Make a run; return its line of the file."""
+    from benchmarks.study.exact_lag import train
+    from daedalus.learner.training.allocator import keep_freed_memory
+
+    keep_freed_memory()
+    began = time.monotonic()
+    outcome = train(specification(cell.task, cell.variant, cell.seed, cell.budget), cell.lag)
+    counters = outcome.counters
+    return {
+        **asdict(cell),
+        "env_steps": counters.env_steps,
+        "final_return": "" if counters.episode_return_mean is None else f"{counters.episode_return_mean:.6g}",
+        "env_steps_to_threshold": outcome.env_steps_to_target or "",
+        "lag_mean": f"{counters.policy_lag_mean:.4g}",
+        "seconds": f"{time.monotonic() - began:.1f}",
+    }
+
+
+def read(path: Path) -> dict[Cell, dict[str, str]]:
+    """Return the lines of the file by run; empty without a file."""
+    if not path.exists():
+        return {}
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {
+        Cell(row["task"], row["variant"], int(row["lag"]), int(row["seed"]), int(row["budget"])): row for row in rows
+    }
+
+
+def remove_cut_line(path: Path) -> None:
+    """Remove what an interrupted study had written of a line."""
+    if path.exists():
+        content = path.read_bytes()
+        path.write_bytes(content[: content.rfind(b"\n") + 1])
+
+
+def make(cells: Sequence[Cell], path: Path, jobs: int) -> None:
+    """Make runs, and add the line of each to the file when it has ended."""
+    new = not path.exists()
+    with open(path, "a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _COLUMNS)
+        if new:
+            writer.writeheader()
+        for number, row in enumerate(_results(cells, jobs), start=1):
+            writer.writerow(row)
+            file.flush()
+            shown = ", ".join(f"{name} {row[name]}" for name in _COLUMNS[:4])
+            print(f"{number} of {len(cells)}: {shown}: return {row['final_return']}, {row['seconds']} s", flush=True)
+
+
+def _results(cells: Sequence[Cell], jobs: int) -> Iterable[dict[str, Any]]:
+    if jobs == 1:
+        yield from map(run, cells)
+        return
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(run, cell) for cell in cells]):
+            yield future.result()
+
+
+def tables(rows: dict[Cell, dict[str, str]]) -> str:
+    """Return the tables of the study: one for each task, and one of all tasks together."""
+    texts = []
+    for task in dict.fromkeys(cell.task for cell in rows):
+        lines = []
+        for variant, lag in _settings(rows, task):
+            returns = _values(rows, task, variant, lag, "final_return")
+            steps = np.nan_to_num(_values(rows, task, variant, lag, "env_steps_to_threshold"), nan=math.inf)
+            mean_lag = np.mean(_values(rows, task, variant, lag, "lag_mean"))
+            reached = f"{np.isfinite(steps).sum()} of {len(steps)}"
+            final = written(estimate([returns]), "{:.4g}".format)
+            lines.append(
+                (variant, lag, f"{mean_lag:.1f}", final, reached, written(estimate([steps]), "{:,.0f}".format))
+            )
+        header = (
+            "variant",
+            "lag, updates",
+            "measured",
+            "final return",
+            "reached",
+            f"env_steps to {TASKS[task].threshold:g}",
+        )
+        texts.append(f"{task}\n\n{table(header, lines)}")
+    return "\n\n".join([*texts, _together(rows)])
+
+
+def _settings(rows: Iterable[Cell], task: str | None = None) -> list[tuple[str, int]]:
+    """Return the variants and lags that have runs, in the order of VARIANTS."""
+    found = {(cell.variant, cell.lag) for cell in rows if task in (None, cell.task)}
+    return sorted(found, key=lambda setting: (list(VARIANTS).index(setting[0]), setting[1]))
+
+
+def _values(rows: dict[Cell, dict[str, str]], task: str, variant: str, lag: int, column: str) -> np.ndarray:
+    """Return a column of the runs of a setting, [runs], ordered by seed; NaN: blank."""
+    chosen = sorted(
+        (cell.seed, row) for cell, row in rows.items() if (cell.task, cell.variant, cell.lag) == (task, variant, lag)
+    )
+    return np.array([float(row[column] or "nan") for _, row in chosen])
+
+
+def _together(rows: dict[Cell, dict[str, str]]) -> str:
+    """Return the table over all tasks, with returns normalised: 0 a random policy, 1 the threshold of the task."""
+    tasks = list(dict.fromkeys(cell.task for cell in rows))
+    lines = []
+    for variant, lag in _settings(rows):
+        strata, without = (_normalised(rows, tasks, variant, each) for each in (lag, 0))
+        if not all(map(len, strata)):  # a task lacks this setting so far
+            continue
+        better = ""
+        if lag and all(map(len, without)):
+            better = written(improvement(strata, without), "{:.2f}".format)
+        lines.append((variant, lag, written(estimate(strata), "{:.3f}".format), better))
+    header = ("variant", "lag, updates", "normalised final return", "P(> lag 0)")
+    return f"{', '.join(tasks)} together (0: random policy, 1: threshold)\n\n{table(header, lines)}"
+
+
+def _normalised(rows: dict[Cell, dict[str, str]], tasks: Sequence[str], variant: str, lag: int) -> list[np.ndarray]:
+    return [
+        (_values(rows, name, variant, lag, "final_return") - TASKS[name].random_return)
+        / (TASKS[name].threshold - TASKS[name].random_return)
+        for name in tasks
+    ]
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--folder", type=Path, required=True, help="folder of lag.csv")
+    options.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    options.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    options.add_argument("--lags", nargs="+", type=int, default=[0, 1, 4, 16, 64])
+    options.add_argument("--seeds", type=int, default=10, help="number of seeds")
+    options.add_argument("--jobs", type=int, default=1, help="runs side by side")
+    options.add_argument("--env-steps", type=int, help="budget of each run (default: that of the task)")
+    options.add_argument("--table", action="store_true", help="only print the tables of the runs so far")
+    parsed = options.parse_args()
+    path = parsed.folder / _FILE
+    budgets = {name: parsed.env_steps or task.env_steps for name, task in TASKS.items()}
+    # All settings with the first seed, then with the next: the tables make sense at any time.
+    cells = [
+        Cell(task, variant, lag, seed, budgets[task])
+        for seed in range(1, parsed.seeds + 1)
+        for task, variant, lag in itertools.product(parsed.tasks, parsed.variants, parsed.lags)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not parsed.table:
+        remove_cut_line(path)
+        done = read(path)
+        make([cell for cell in cells if cell not in done], path, parsed.jobs)
+    print(machine())
+    print(tables({cell: row for cell, row in read(path).items() if cell.budget == budgets[cell.task]}))
+
+
+if __name__ == "__main__":
+    main()
