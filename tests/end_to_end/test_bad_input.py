@@ -30,7 +30,7 @@ Start = Callable[..., Running]
         (["train", "nothing.toml"], 2, r"nothing.toml: No such file"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
         (["evaluate", "nowhere"], 1, r"nowhere has no checkpoints"),
-        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere is not a run directory: it has neither"),
+        (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere does not exist: name a run directory"),
         (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
         (
             ["actor", "--connect", "tcp/127.0.0.1:1", "--timeout", "0.3"],
