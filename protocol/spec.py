@@ -6,6 +6,7 @@ reference of all settings. This file does not know where a specification comes f
 line) or how it is used.
 """
 
+import math
 import re
 from typing import Annotated, Literal
 
@@ -171,7 +172,7 @@ class TrainingSpec(Specification):
     """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
     max_policy_lag: NaturalInt | None = None
     """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches for `impala` and
-    `appo`, of 8 for the others."""
+    `appo`, of 8 for the others; of more if `collection.actors` can have more than half as many in flight."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""
@@ -271,13 +272,6 @@ class TrainingSpec(Specification):
         A part is an environment where the policy has memory, else a valid row.
         """
         return self.passes * min(self.minibatches, parts) if self.record.passes_over_batch else 1
-
-    @property
-    def policy_lag_bound(self) -> int:
-        """Largest policy lag that is learned from, in updates."""
-        if self.max_policy_lag is not None:
-            return self.max_policy_lag
-        return self.record.max_lag_batches * self.updates_per_batch
 
 
 class EvaluationSpec(Specification):
@@ -421,3 +415,16 @@ class RunSpec(Specification):
     def batch_rollouts(self) -> int:
         """How many rollouts make a batch where no barrier decides it."""
         return self.training.batch_rollouts or self.algorithm.batch_rollouts or self.collection.actors
+
+    @property
+    def policy_lag_bound(self) -> int:
+        """Largest policy lag that is learned from, in updates.
+
+        Where the learner is slower than its actors, all rollouts in flight wait for it. Unless it is set, the bound
+        leaves room for twice as many: otherwise every rollout of an actor slower than the others would be too old.
+        """
+        training = self.training
+        if training.max_policy_lag is not None:
+            return training.max_policy_lag
+        in_flight = math.ceil(self.collection.actors * self.collection.window / self.batch_rollouts)  # batches
+        return max(self.algorithm.max_lag_batches, 2 * in_flight) * training.updates_per_batch

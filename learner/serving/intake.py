@@ -60,7 +60,7 @@ class Intake:
         self._fleet = fleet
         self._envs_per_actor = spec.collection.envs_per_actor
         # A synchronous algorithm accepts only rollouts of the newest version.
-        self._max_lag = 0 if spec.algorithm.synchronous else spec.training.policy_lag_bound
+        self._max_lag = 0 if spec.algorithm.synchronous else spec.policy_lag_bound
         # Set before any actor has the program:
         self.state_size = 0  # size of the recurrent state
         self.gradient_shapes: Shapes = {}  # of the parameters that have gradients

@@ -310,11 +310,11 @@ def _queue(spec: RunSpec) -> RequestQueue:
 
     Further rollouts are answered busy: in the queue they would become stale, and their senders would time out.
     """
-    batches = spec.training.policy_lag_bound // spec.training.updates_per_batch + 1
+    batches = spec.policy_lag_bound // spec.training.updates_per_batch + 1
     return RequestQueue(spec.service.queue_bytes, max(batches * spec.batch_rollouts, 2 * spec.collection.actors))
 
 
 def _buffer(spec: RunSpec) -> RolloutBuffer:
     if spec.algorithm.synchronous:
         return BarrierBuffer(spec.collection.actors)
-    return StreamBuffer(spec.batch_rollouts, spec.training.policy_lag_bound)
+    return StreamBuffer(spec.batch_rollouts, spec.policy_lag_bound)

@@ -231,8 +231,21 @@ def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
     ],
 )
 def test_default_lag_bound_counts_batches(fields: dict[str, Any], updates: int, bound: int) -> None:
-    spec = TrainingSpec.model_validate(fields)
-    assert (spec.updates_per_batch, spec.policy_lag_bound) == (updates, bound)
+    spec = RunSpec.model_validate({"environment": {"id": "e"}, "training": fields})
+    assert (spec.training.updates_per_batch, spec.policy_lag_bound) == (updates, bound)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "actors", "window", "bound"),
+    [("a3c", 2, 2, 8), ("a3c", 5, 3, 30), ("impala", 5, 3, 32), ("impala", 5, 20, 40), ("appo", 1, 1, 32 * 9)],
+)
+def test_default_lag_bound_has_room_for_all_rollouts_in_flight(
+    algorithm: str, actors: int, window: int, bound: int
+) -> None:
+    collection = {"actors": actors, "window": window}
+    training = {"algorithm": algorithm, "passes": 3, "minibatches": 3}
+    spec = RunSpec.model_validate({"environment": {"id": "e"}, "collection": collection, "training": training})
+    assert spec.policy_lag_bound == bound
 
 
 def test_every_algorithm_has_its_mathematics() -> None:

@@ -130,7 +130,7 @@ class Ledger:
         if not taken.rollouts:
             return
         synchronous = self._spec.algorithm.synchronous
-        bound = 0 if synchronous else self._spec.training.policy_lag_bound
+        bound = 0 if synchronous else self._spec.policy_lag_bound
         for rollout in taken.rollouts:
             identity, lag = rollout.identity, version - rollout.policy_version
             self.require(identity not in life.trained, "trained twice:", identity)

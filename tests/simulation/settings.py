@@ -95,8 +95,9 @@ def _spec(random: Random, message_bytes: int) -> RunSpec:
     training: dict[str, object] = {"algorithm": algorithm, "passes": 1, "minibatches": 2, "env_steps": 10**9}
     if algorithm in ("impala", "appo"):
         training["batch_rollouts"] = random.choice((None, 1, 2, 3))
-    if algorithm != "a2c" and random.random() < 0.5:
-        # Large enough for every actor: where the learner is the bottleneck, all rollouts in flight wait in a queue.
+    if algorithm != "a2c" and (random.random() < 0.5 or algorithm == "a3c"):
+        # Large enough for every actor: where the learner is the bottleneck, all rollouts in flight wait in a queue. The
+        # default of a3c does not count the actors that join later.
         training["max_policy_lag"] = random.choice((2, 4)) * most * window
     return RunSpec.model_validate(
         {
