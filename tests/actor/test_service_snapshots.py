@@ -1,6 +1,7 @@
 """ActorService against a scripted learner, over the memory transport: which snapshots it collects with."""
 
 import threading
+import time
 from collections.abc import Callable
 
 import pytest
@@ -62,6 +63,7 @@ def test_rollout_after_a_wait_is_of_the_newest_policy(network: MemoryNetwork, ac
     learner.publish(3)
     first, second = learner.receive(), learner.receive()
     learner.publish(4)  # while the window is full
+    time.sleep(1.0)  # the actor awaits the snapshot for as long as it has waited for room
     acknowledge(first[1], "accepted")
     assert [second[0].policy_version, learner.receive()[0].policy_version] == [3, 4]
 
