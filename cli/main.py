@@ -23,7 +23,7 @@ on several machines, one process at a time:
   router     connect learner and actors at a fixed address
   status     show the state of a learner and its actors
   drain      ask actors to leave after their current rollout
-  gateway    connect actors in any language
+  gateway    show a run on a web page, and connect actors in any language
   exporter   export the status as Prometheus metrics
   certs      create certificates for encrypted connections
 
