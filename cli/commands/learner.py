@@ -49,6 +49,7 @@ from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
+from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
@@ -138,15 +139,7 @@ def _serve(
     restored = _newest_checkpoint(run.directory) if resumed else None
     spaces = arguments.spaces
     if restored is None and arguments.prepared is None:
-        if arguments.env is None or run.exists:
-            spaces = expected_spaces(run.spec, run.modules, stop)
-        else:
-            spaces, defaults = expected_defaults(run.spec, run.modules, stop)
-            chosen, directory = resolve(arguments, defaults)
-            chosen = with_record(chosen, run.modules)
-            if spaces is not None and chosen.environment != run.spec.environment:
-                spaces = expected_spaces(chosen, run.modules, stop)
-            run = replace(run, spec=chosen, directory=directory)
+        run, spaces = _with_spaces(run, arguments, stop)
     initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
     transport = _open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
@@ -182,6 +175,20 @@ def _serve(
             run_directory.remove_failed(run.directory)
         raise
     return _status(outcome, run.spec, stopped)
+
+
+def _with_spaces(
+    run: ChosenRun, arguments: argparse.Namespace, stop: threading.Event
+) -> tuple[ChosenRun, Spaces | None]:
+    """Return the run with the default settings of its spaces, and the spaces; None if they are not known here."""
+    if arguments.env is None or run.exists:
+        return run, expected_spaces(run.spec, run.modules, stop)
+    spaces, defaults = expected_defaults(run.spec, run.modules, stop)
+    chosen, directory = resolve(arguments, defaults)
+    chosen = with_record(chosen, run.modules)
+    if spaces is not None and chosen.environment != run.spec.environment:
+        spaces = expected_spaces(chosen, run.modules, stop)
+    return replace(run, spec=chosen, directory=directory), spaces
 
 
 def _credentials(arguments: argparse.Namespace) -> Credentials | None:

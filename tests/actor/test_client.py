@@ -139,7 +139,7 @@ def test_client_reports_what_it_counts(learner: ScriptedLearner) -> None:
 
 
 def test_clients_of_one_process_have_names_of_their_own(learner: ScriptedLearner) -> None:
-    """Several agents, or several environments, in one loop: a client for each."""
+    """A loop with several agents or environments has a client for each of them."""
     with Client("tcp/127.0.0.1:1", **SPACES) as left, Client("tcp/127.0.0.1:1", **SPACES) as right:
         senders = set()
         for _ in range(5):
