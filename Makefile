@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-compose examples screenshots attack fuzz mutants docs check format clean
+.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs check format clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -11,6 +11,11 @@ train: .venv/ready-train
 # Two processes share the tests; those of one file run in one process, because they share what they start.
 test: check
 	$(BIN)/pytest --numprocesses 2 --dist loadfile
+
+# Trackio needs an older pillow than constraints.txt: for its test it is installed into a folder of its own.
+test-trackio: .venv/ready-test
+	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade --target build/trackio trackio
+	PYTHONPATH=build/trackio $(BIN)/pytest tests/cli/test_tracker_processes.py -k trackio
 
 # Test with real containers, if docker is installed. debootstrap makes the base image if none can be pulled.
 test-compose: .venv/ready-test
@@ -70,7 +75,7 @@ docs: .venv/ready-test
 	touch $@
 
 .venv/ready-test: .venv/ready-train
-	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,gateway,browser,docs,dev]"
+	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,wandb,mlflow,hub,gateway,browser,docs,dev]"
 	touch $@
 
 clean:

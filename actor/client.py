@@ -10,7 +10,7 @@
 
 A client sends the same rollouts as any actor, from a thread of its own: no call waits for the network after the first
 policy has come. While the learner is away or too slow, the client keeps the newest rollouts and the last policy, or
-plays a safe action. One client is one agent in one environment: make a client for each.
+plays a safe action. A loop with several agents passes their number and uses `client.agents`.
 """
 
 import itertools
@@ -32,6 +32,7 @@ from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
+from daedalus.protocol.messages import MAX_ENVIRONMENTS
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import credentials_to_connect
@@ -40,7 +41,12 @@ _numbers = itertools.count(1)  # of the clients of this process
 
 
 class Client:
-    """One actor in a loop that the caller owns. Not for several threads at once."""
+    """One actor in a loop that the caller owns. Not for several threads at once.
+
+    Attributes:
+      agents: one ClientAgent for each agent of the loop, with `act`, `reward` and `end_episode` of its own. The methods
+        of the same names here are those of the first.
+    """
 
     def __init__(
         self,
@@ -57,6 +63,7 @@ class Client:
         safe_action: Any = None,
         max_policy_age: float | None = None,
         untrained: bool = False,
+        agents: int = 1,
     ) -> None:
         """Join a run, and wait for the first policy.
 
@@ -77,10 +84,13 @@ class Client:
             newer policy; default: 30.
           untrained: with a safe action, whether a policy may act that no update of this run has changed. Such a policy
             is random, unless the run began with trained weights.
+          agents: number of agents in the loop, each with these spaces: robots, players, or copies of a simulator.
 
-        Raises ValueError for a safe action that is not in the action space; ActorError, TransportError,
-        EnvironmentSetupError, AddressError or CredentialsError.
+        Raises ValueError for a safe action that is not in the action space, or a number of agents that is not from 1
+        to 4096; ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
         """
+        if not 1 <= agents <= MAX_ENVIRONMENTS:
+            raise ValueError(f"agents is {agents}: it must be from 1 to {MAX_ENVIRONMENTS}")
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         config = ActorConfig(
@@ -93,7 +103,10 @@ class Client:
         )
         self._config = config
         self._stop = threading.Event()
-        self._collector = ClientCollector(observation_space, action_space, action_mask, guard)
+        self._collector = ClientCollector(
+            observation_space, action_space, action_mask, guard, agents=agents, check=self._check
+        )
+        self.agents = self._collector.agents
         self._clocks: list[Clock] = []
         self._error: Exception | None = None
         transport = connect_with_retry([connect], self._stop, timeout, credentials)
@@ -108,28 +121,12 @@ class Client:
             raise self._error or ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
 
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
-        """Return the action to take now. After the end of the run it is the last policy's, and nobody learns from it.
-
-        Args:
-          observation: of the observation space.
-          action_mask: the legal choices, if the client was constructed with a mask: of the same form.
-          override: the action of a person or a safety filter, which is played in place of the policy's: `act` returns
-            it. The policy does not learn from it, but its memory goes on.
-
-        Raises ValueError if the observation or the mask does not fit the spaces, ActorError if the learner quarantined
-        this actor, and whatever else ended the client's thread.
-        """
-        if self._error is not None:
-            raise self._error
-        return self._collector.act(observation, action_mask, override)
+        """See ClientAgent.act: this is the first agent."""
+        return self.agents[0].act(observation, action_mask, override=override)
 
     def reward(self, value: float) -> None:
-        """Add `value` to the reward of the last action; any number of times until the next `act`.
-
-        A reward after `end_episode` still belongs to the last action of that episode. Raises ValueError if `value` is
-        not finite, or before the first action of an episode.
-        """
-        self._collector.reward(value)
+        """See ClientAgent.reward: this is the first agent."""
+        self.agents[0].reward(value)
 
     def clock(self, rate: float) -> Clock:
         """Return a clock with `rate` ticks a second, for the loop that calls `act`. The loop ends with the run."""
@@ -138,16 +135,8 @@ class Client:
         return self._clocks[-1]
 
     def end_episode(self, *, terminated: bool, observation: Any = None) -> None:
-        """End the episode; the next `act` begins another one.
-
-        Args:
-          terminated: True if the environment ended the episode; False if a limit truncated it.
-          observation: the last one. Required for the bootstrap value: after a truncation, and after a termination in
-            a run with environment.bootstrap_terminations.
-
-        Raises ValueError if the episode has no action yet, or the observation is missing or does not fit the space.
-        """
-        self._collector.end_episode(observation, terminated=terminated)
+        """See ClientAgent.end_episode: this is the first agent."""
+        self.agents[0].end_episode(terminated=terminated, observation=observation)
 
     @property
     def dropped(self) -> int:
@@ -178,11 +167,16 @@ class Client:
             incarnation=self._config.incarnation,
             deadlines=sum(clock.deadlines for clock in clocks),
             missed_deadlines=sum(clock.missed_deadlines for clock in clocks),
-            overridden_actions=collector.overridden_actions,
-            safe_actions=collector.safe_actions,
+            overridden_actions=sum(agent.overridden_actions for agent in self.agents),
+            safe_actions=sum(agent.safe_actions for agent in self.agents),
             rollouts_dropped=collector.dropped,
             safe_reason=collector.guard.reason,
         )
+
+    def _check(self) -> None:
+        """Raise what has ended the client's thread."""
+        if self._error is not None:
+            raise self._error
 
     def _serve(self) -> None:
         try:

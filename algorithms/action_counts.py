@@ -24,8 +24,8 @@ class ActionCounts:
     def add(self, batch: Batch) -> None:
         """Count the actions of the valid rows of a batch."""
         for name, counts in self._counts.items():
-            choices = batch.actions[name] + self._first_choices[name]  # [T, B, D]
-            weights = batch.valid.unsqueeze(-1).expand(choices.shape)
+            choices = batch.actions[name].to(counts.device) + self._first_choices[name]  # [T, B, D]
+            weights = batch.valid.to(counts.device).unsqueeze(-1).expand(choices.shape)
             counts += torch.bincount(choices.flatten(), weights.flatten(), len(counts)).to(torch.int64)
 
     def merge(self, counts: dict[str, torch.Tensor]) -> None:

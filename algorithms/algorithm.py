@@ -3,7 +3,7 @@
 docs/guides/algorithm.md shows how to add one.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -12,11 +12,12 @@ from torch import Tensor
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.forward import Forward
+from daedalus.algorithms.minibatches import Minibatch
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spec import TrainingSpec
 
-__all__ = ["Algorithm", "Forward", "Losses"]
+__all__ = ["Algorithm", "Forward", "Losses", "MinibatchLosses"]
 
 
 class Losses(NamedTuple):
@@ -33,6 +34,19 @@ class Losses(NamedTuple):
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
     clipped_fraction: Tensor | None = None  # scalar, share of rows whose probability ratio was clipped; None: no clip
     first_pass: FirstPass | None = None  # of the whole batch, for its diagnostics; the same object in all updates
+
+
+class MinibatchLosses(NamedTuple):
+    """The losses of one update as a function of a minibatch, for the caller to compute.
+
+    The function must do the same operations for all minibatches of the same shapes, because the caller may record them
+    (algorithms/recording.py), which makes the updates of a small network more than twice as fast. It must be the same
+    object in all updates, or a method of one.
+    """
+
+    function: Callable[[Minibatch, Forward], Losses]  # whose `first_pass` is None
+    minibatch: Minibatch
+    first_pass: FirstPass | None = None  # as that of Losses
 
 
 class Algorithm:
@@ -57,7 +71,7 @@ class Algorithm:
         """
         self.spec, self.distribution = spec, distribution
 
-    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses | MinibatchLosses]:
         """Yield the losses of each update of a batch, in order. The observations of the batch are normalised.
 
         The caller changes the parameters between two updates, so losses are computed only when the caller asks for

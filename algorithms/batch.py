@@ -1,16 +1,17 @@
 """Rollouts joined on the environment axis, as tensors in reused memory."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from daedalus.algorithms.ranks import ONE_RANK, Ranks, Share
 from daedalus.protocol.frames import stack_rows
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout
 
 Components = dict[str, Tensor]
 
@@ -34,6 +35,12 @@ class Batch:
     terminated: Tensor  # [T, B] bool
     truncated: Tensor  # [T, B] bool; also where the next row is overridden: the return is bootstrapped there
     valid: Tensor  # [T, B] float32, 1 for the rows to learn from, 0 for reset rows and overridden rows
+    share: Share | None = None  # part of a whole batch that this batch is; None: it is whole
+
+    @property
+    def ranks(self) -> Ranks:
+        """The processes that have the other parts of the whole batch."""
+        return ONE_RANK if self.share is None else self.share.ranks
 
     def to(self, device: torch.device) -> "Batch":
         """Return the batch on a device. Copies from pinned memory are asynchronous."""
@@ -43,11 +50,30 @@ class Batch:
         def moved(values: Tensor) -> Tensor:
             return values.to(device, non_blocking=True)
 
-        moved_parts: dict[str, Any] = {}
+        share = self.share and replace(self.share, valid=moved(self.share.valid))
+        return replace(self.map(moved), share=share)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
+        """Return the batch with `function` applied to each tensor; not to those of `share`."""
+        mapped: dict[str, Any] = {}
         for part in fields(self):
             values = getattr(self, part.name)
-            moved_parts[part.name] = each(values, moved) if isinstance(values, dict) else moved(values)
-        return Batch(**moved_parts)
+            if isinstance(values, dict):
+                mapped[part.name] = each(values, function)
+            elif isinstance(values, Tensor):
+                mapped[part.name] = function(values)
+        return replace(self, **mapped)
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors of the batch, in the order of the fields; not those of `share`."""
+        found: list[Tensor] = []
+        for part in fields(self):
+            values = getattr(self, part.name)
+            if isinstance(values, dict):
+                found += values.values()
+            elif isinstance(values, Tensor):
+                found.append(values)
+        return found
 
 
 class BatchAssembler:

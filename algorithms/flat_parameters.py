@@ -24,10 +24,10 @@ class FlatParameters:
             parameter.data = self.values[start:end].view_as(parameter)
             start = end
 
-    def differentiate(self, loss: Tensor) -> None:
-        """Write the gradients of a loss to `gradients`; 0 for a parameter that it does not depend on."""
+    def differentiated(self, loss: Tensor) -> Tensor:
+        """Return the gradients of a loss [P]; 0 for a parameter that it does not depend on."""
         gradients = torch.autograd.grad(loss, self._parameters, materialize_grads=True)
-        torch.cat([gradient.flatten() for gradient in gradients], out=self.gradients)
+        return torch.cat([gradient.flatten() for gradient in gradients])
 
     def clip_gradients(self, max_norm: float) -> float:
         """Scale the gradients so that their norm is at most `max_norm`; return their norm before scaling.

@@ -1,11 +1,13 @@
 """Gradients of the updates of a batch, at the current parameters of the network. The caller applies them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from daedalus.algorithms.algorithm import Losses, MinibatchLosses
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.flat_parameters import FlatParameters
@@ -13,12 +15,16 @@ from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.losses import mean, value_loss
 from daedalus.algorithms.own_algorithm import check_updates
 from daedalus.algorithms.precision import is_mixed
+from daedalus.algorithms.ranks import Share
+from daedalus.algorithms.recording import OperationRecorder
 from daedalus.algorithms.registry import build_algorithm
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import TrainingSpec
+
+_MOST_ROWS = 32  # of a recorded sequence: recording takes a tenth of a second for each row of a memory
 
 
 class Terms(NamedTuple):
@@ -46,6 +52,10 @@ class GradientComputer:
             has_target=self._algorithm.record.target_network,
             is_mixed=is_mixed(spec.precision, self.parameters.values.device, network.convolutional),
         )
+        # A recording saves what Python costs: much with small layers, little with convolutions.
+        on_cpu = self.parameters.values.device.type == "cpu"
+        self._records = on_cpu and not network.convolutional and not network.has_user_modules
+        self._recorder = OperationRecorder()
         self._first_pass: FirstPass | None = None  # of the newest batch
         if is_own(spec.algorithm):
             updates, state_size = (lambda batch: self.compute(batch, spec.entropy_bonus)), network.state_size
@@ -55,29 +65,72 @@ class GradientComputer:
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next update.
+        The caller applies the gradient before it asks for the next update. Of a share of a batch, both are those of the
+        whole batch.
         """
         # The statistics of observations do not change within a batch: normalise once for all passes.
         batch = replace(batch, observations=self._network.normalizer(batch.observations))
+        bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
+        updates = 0
         for losses in self._algorithm.losses(batch, self.forward):
-            if not losses.values.shape == losses.targets.shape == losses.shares.shape:
-                shapes = [tuple(each.shape) for each in (losses.values, losses.targets, losses.shares)]
-                raise ValueError(f"the shapes of values, targets and shares differ: {shapes}")
-            value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
-            entropy = mean(losses.entropies, losses.shares)
-            loss = losses.policy_loss + self._spec.value_coefficient * value_term - entropy_bonus * entropy
+            updates += 1
             self._first_pass = losses.first_pass
-            self.parameters.differentiate(loss)
-            clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
-            yield Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
+            if isinstance(losses, MinibatchLosses):
+                gradient, *each = self._of_minibatch(losses, bonus, record=batch.share is None)
+                shares = losses.minibatch.shares
+            else:
+                gradient, *each = self._differentiated(losses, bonus)
+                shares = losses.shares
+            self.parameters.gradients.copy_(gradient)
+            terms = Terms(*each)
+            yield terms if batch.share is None else self._over_ranks(batch.share, terms, shares)
+        if batch.share is not None:
+            for _ in range(updates, batch.share.updates):  # an algorithm of the user makes fewer here than elsewhere
+                self.parameters.gradients.zero_()
+                none = batch.valid.new_zeros(1)
+                yield self._over_ranks(batch.share, Terms(none[0], none[0], none[0], none[0]), none)
 
-    @property
-    def first_pass(self) -> FirstPass | None:
-        """The first pass of the newest batch, valid until the memory of the batch is used for the next one."""
-        return self._first_pass
+    def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor, *, record: bool) -> tuple[Tensor, ...]:
+        """Return the gradient [P] and the terms of the losses of a minibatch, by a recording if it is worth one."""
+        function, minibatch, _ = losses
+        if not (record and self._records and len(minibatch.shares) <= _MOST_ROWS):
+            return self._differentiated(function(minibatch, self.forward), bonus)
+
+        def gradient(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+            *parts, bonus = tensors
+            return self._differentiated(function(minibatch.with_tensors(parts), self.forward), bonus)
+
+        return self._recorder.call((function, *minibatch.names), gradient, [*minibatch.tensors(), bonus])
+
+    def _differentiated(self, losses: Losses, bonus: Tensor) -> tuple[Tensor, ...]:
+        """Return the gradient [P] of the weighted sum of losses, and their Terms."""
+        if not losses.values.shape == losses.targets.shape == losses.shares.shape:
+            shapes = [tuple(each.shape) for each in (losses.values, losses.targets, losses.shares)]
+            raise ValueError(f"the shapes of values, targets and shares differ: {shapes}")
+        value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
+        entropy = mean(losses.entropies, losses.shares)
+        loss = losses.policy_loss + self._spec.value_coefficient * value_term - bonus * entropy
+        clipped = entropy.new_zeros(()) if losses.clipped_fraction is None else losses.clipped_fraction
+        terms = Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
+        return self.parameters.differentiated(loss), *terms
+
+    def _over_ranks(self, share: Share, terms: Terms, shares: Tensor) -> Terms:
+        """Replace the gradient of this rank by the mean over all ranks, and return the means of the terms.
+
+        A rank counts by its rows to learn from, so that the result is that of the whole batch.
+        """
+        number = (shares > 0.0).sum().to(torch.float32)
+        *sums, total = share.ranks.sum(torch.stack([*terms, torch.ones_like(number)]) * number)
+        total = total.clamp(min=1.0)
+        self.parameters.gradients.mul_(number / total)
+        self.parameters.gradients.copy_(share.ranks.sum(self.parameters.gradients))
+        return Terms(*(each / total for each in sums))
 
     def take_first_pass(self) -> FirstPass | None:
-        """Return `first_pass`, once; None without a batch since the last call."""
+        """Return the first pass of the newest batch, once; None without a batch since the last call.
+
+        It is valid until the memory of the batch is used for the next one.
+        """
         first_pass, self._first_pass = self._first_pass, None
         return first_pass
 

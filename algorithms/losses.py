@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss, mse_loss
 
+from daedalus.algorithms.ranks import ONE_RANK, Ranks
 from daedalus.algorithms.returns import Targets
 
 _MAX_LOG_RATIO = 20.0  # a ratio of 5e8: beyond it the exponential overflows, and the gradient is not a number
@@ -25,19 +26,24 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
     return values.flatten().dot(shares.flatten())
 
 
-def normalized(advantages: Tensor, valid: Tensor) -> Tensor:
-    """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows; `valid` [T, B], 1 or 0."""
-    number = valid.sum().clamp(min=1.0)  # not by shares, whose rounding would make equal advantages differ from 0
-    centred = advantages - (advantages * valid).sum() / number
-    return centred / (((centred.square() * valid).sum() / number).sqrt() + 1e-8)
+def normalized(advantages: Tensor, valid: Tensor, ranks: Ranks = ONE_RANK) -> Tensor:
+    """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows of all ranks.
+
+    `valid` [T, B] is 1 or 0.
+    """
+    # Not by shares, whose rounding would make equal advantages differ from 0.
+    number = ranks.sum(valid.sum()).clamp(min=1.0)
+    centred = advantages - ranks.sum((advantages * valid).sum()) / number
+    return centred / ((ranks.sum((centred.square() * valid).sum()) / number).sqrt() + 1e-8)
 
 
-def policy_factors(targets: Targets, valid: Tensor, normalize: bool) -> Tensor:
+def policy_factors(targets: Targets, valid: Tensor, normalize: bool, ranks: Ranks = ONE_RANK) -> Tensor:
     """Return w_t A_t [T, B], the factor of row t in the policy loss, with A_t normalised over the valid rows if asked.
 
     A_t is normalised before it is weighted: normalised after, a row with weight 0 would get -mean / std.
+    `ranks` is that of the batch.
     """
-    return targets.weights * (normalized(targets.advantages, valid) if normalize else targets.advantages)
+    return targets.weights * (normalized(targets.advantages, valid, ranks) if normalize else targets.advantages)
 
 
 def policy_gradient_loss(log_probs: Tensor, factors: Tensor, shares: Tensor) -> Tensor:
@@ -56,11 +62,10 @@ def clipped_policy_loss(
     A_t is a constant, and c the clip range. The minimum removes the gain from moving r_t out of the range: such rows
     have no gradient. Where the share is near 0 the passes change the policy little, where it is near 1 too much.
 
-    Schulman et al. (2017), equation 7. The denominator of r_t is the policy before the first update of the batch, not
-    the behaviour policy: V-trace's rho in A_t corrects for the behaviour policy (Hilton et al. 2022, section 3).
+    Schulman et al. (2017), equation 7.
 
     Args:
-      log_ratios: [T, B], log r_t: log pi(a_t|s_t) minus its value before the first update of the batch.
+      log_ratios: [T, B], log r_t: log pi(a_t|s_t) minus that of the proximal policy.
       factors: [T, B], A_t.
       shares: [T, B].
       clip_range: c.

@@ -1,8 +1,9 @@
 """Minibatches of a batch, with targets that are computed once for all passes. Pure functions."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -25,10 +26,30 @@ class Minibatch:
     starts: Tensor  # [R, B] bool
     actions: Components  # each [R, B, D]
     masks: Components  # of the masked actions [R, B, choices] bool
-    log_probs: Tensor  # [R, B], log pi(a_t | s_t) before the first update of the batch
+    log_probs: Tensor  # [R, B], log-probabilities of the proximal policy
     targets: Tensor  # [R, B], value targets
     factors: Tensor  # [R, B], of the rows in the policy loss
     shares: Tensor  # [R, B] float32, of the rows in a mean: 1/N for each of N valid rows, else 0
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """The names of the components of each map, in the order of the fields."""
+        return tuple(tuple(getattr(self, name)) for name in _MAPS)
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors of the minibatch, in the order of the fields."""
+        maps = (getattr(self, name).values() for name in _MAPS)
+        return [*chain.from_iterable(maps), *(getattr(self, name) for name in _ARRAYS)]
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> "Minibatch":
+        """Return a minibatch with other tensors, in the order of `tensors`."""
+        remaining = iter(tensors)
+        maps = {name: {key: next(remaining) for key in getattr(self, name)} for name in _MAPS}
+        return replace(self, **maps, **dict(zip(_ARRAYS, remaining, strict=True)))
+
+
+_MAPS = ("observations", "actions", "masks")
+_ARRAYS = ("initial_state", "starts", "log_probs", "targets", "factors", "shares")
 
 
 def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
@@ -36,10 +57,12 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
     is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
-    minibatches as it has parts, so that none is empty.
+    minibatches as it has parts, so that none is empty. All have one size, that of a batch without reset rows: rows that
+    are missing are filled up by a copy of another row whose share is 0. Of a share of a batch, each minibatch has those
+    of its parts that are in the share; one without any has a part whose shares are 0.
 
     Args:
-      log_probs: [T, B], log pi(a_t | s_t) before the first update of the batch.
+      log_probs: [T, B], log-probabilities of the actions under the proximal policy.
       targets: [T, B], value targets.
       factors: [T, B], of the rows in the policy loss.
       count: largest number of minibatches.
@@ -51,8 +74,11 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 def _by_environment(
     batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int
 ) -> Iterator[Minibatch]:
-    order = torch.randperm(batch.rewards.shape[1]).to(batch.rewards.device)
-    for part in order.tensor_split(min(count, len(order))):
+    whole = batch.valid if batch.share is None else batch.share.valid
+    order = batch.ranks.permutation(whole.shape[1]).to(whole.device)
+    for part in map(partial(_own_environments, batch), order.tensor_split(min(count, len(order)))):
+        valid = batch.valid[:, part] if len(part) else torch.zeros_like(batch.valid[:, :1])
+        part = part if len(part) else part.new_zeros(1)
         yield Minibatch(
             observations=each(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
             initial_state=batch.initial_state[part],
@@ -62,16 +88,23 @@ def _by_environment(
             log_probs=log_probs[:, part],
             targets=targets[:, part],
             factors=factors[:, part],
-            shares=shares_of(batch.valid[:, part]),
+            shares=shares_of(valid),
         )
 
 
 def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
-    rows = batch.valid.flatten().nonzero().squeeze(1)  # [N]
-    order = rows[torch.randperm(len(rows)).to(rows.device)]
+    whole = batch.valid if batch.share is None else batch.share.valid
+    rows = whole.flatten().nonzero().squeeze(1)  # [N]
+    order = rows[batch.ranks.permutation(len(rows)).to(rows.device)]
     number = min(count, len(order))
     if not number:
         return
+    own = [_own_rows(batch, part) for part in order.tensor_split(number)]
+    counted = [len(part) for part in own]
+    size = 1 if batch.share is not None else -(-whole.numel() // number)
+    own = [_filled_up(part, size) for part in own]
+    order, sizes = torch.cat(own), [len(part) for part in own]
+    shares = {(rows, size): _equal_shares(batch.valid, rows, size) for rows, size in zip(counted, sizes, strict=True)}
 
     def parts_of(values: Tensor) -> tuple[Tensor, ...]:
         """Gather values of rows [T, B, ...] in the order of the pass, and split them: [1, n, ...] each.
@@ -79,7 +112,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
         One gather for each array and pass, and views of it: gathering each minibatch would take as many operations as
         there are minibatches, and small ones cost as much as large ones.
         """
-        return values.flatten(0, 1)[order].unsqueeze(0).tensor_split(number, dim=1)
+        return values.flatten(0, 1)[order].unsqueeze(0).split(sizes, dim=1)
 
     # Of images a second copy of the whole batch would be too much.
     large = {name: values for name, values in batch.observations.items() if values[0, 0].nbytes > _LARGE_BYTES}
@@ -87,7 +120,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
     actions = {name: parts_of(values) for name, values in batch.actions.items()}
     masks = {name: parts_of(values) for name, values in batch.masks.items()}
     arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
-    for index, part in enumerate(order.tensor_split(number)):
+    for index, part in enumerate(own):
         starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
         gathered = each(large, partial(_rows, rows=part))
         yield Minibatch(
@@ -99,8 +132,41 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
             log_probs=own_log_probs,
             targets=own_targets,
             factors=own_factors,
-            shares=batch.valid.new_full((1, len(part)), 1.0 / len(part)),
+            shares=shares[counted[index], sizes[index]],
         )
+
+
+def _own_environments(batch: Batch, environments: Tensor) -> Tensor:
+    """Return those of some environments of the whole batch that are in the batch, by their number in the batch."""
+    if batch.share is None:
+        return environments
+    own = environments[(environments >= batch.share.first) & (environments < batch.share.end)]
+    return own - batch.share.first
+
+
+def _own_rows(batch: Batch, rows: Tensor) -> Tensor:
+    """Return those of some rows of the whole batch that are in the batch. Rows are counted as T x B."""
+    if batch.share is None:
+        return rows
+    share, width = batch.share, batch.share.valid.shape[1]
+    environments = rows % width
+    own = (environments >= share.first) & (environments < share.end)
+    return rows[own] // width * (share.end - share.first) + environments[own] - share.first
+
+
+def _filled_up(rows: Tensor, size: int) -> Tensor:
+    """Return the numbers of rows, and copies of the first so that there are at least `size`; row 0 if there is none."""
+    missing = size - len(rows)
+    if missing <= 0:
+        return rows
+    return torch.cat([rows, (rows[:1] if len(rows) else rows.new_zeros(1)).expand(missing)])
+
+
+def _equal_shares(like: Tensor, rows: int, size: int) -> Tensor:
+    """Return the shares [1, size] of a minibatch whose first rows count, each as much, and the others nothing."""
+    shares = like.new_zeros((1, size))
+    shares[:, :rows] = 1.0 / max(rows, 1)
+    return shares
 
 
 def _columns(values: Tensor, part: Tensor, rows: int | None = None) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
 from daedalus.policy.network.normalization import ObservationNormalizer
-from daedalus.protocol.messages import Rollout, RolloutIdentity
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly

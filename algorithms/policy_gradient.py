@@ -10,23 +10,15 @@ from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.algorithms.losses import policy_factors, policy_gradient_loss, shares_of
 from daedalus.algorithms.returns import Targets
-from daedalus.algorithms.targets import uncorrected_targets
+from daedalus.algorithms.targets import lambda_targets
 
 
 class PolicyGradient(Algorithm):
     """Actor-critic algorithm with a single pass over each batch."""
 
     def targets(self, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
-        """Return value targets and advantages; arguments as for uncorrected_targets.
-
-        Where actors explore, rows are weighted by min(rho_clip, pi / mu): random actions of an actor are then no more
-        frequent in the gradient than those of the policy (off-policy actor-critic: Degris et al. 2012).
-        """
-        targets = uncorrected_targets(self.spec, batch, log_probs, values)
-        if not self.spec.explores:
-            return targets
-        ratios = (log_probs - batch.behaviour_log_probs).exp()
-        return targets._replace(weights=ratios.clamp(max=self.spec.rho_clip))
+        """Return value targets and advantages; arguments as for lambda_targets."""
+        return lambda_targets(self.spec, batch, log_probs, values)
 
     def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
         """Yield the losses of the only update. See Algorithm."""
@@ -35,7 +27,7 @@ class PolicyGradient(Algorithm):
         with torch.no_grad():
             targets = self.targets(batch, log_probs, values)
             shares = shares_of(batch.valid)
-            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages)
+            factors = policy_factors(targets, batch.valid, self.spec.normalize_advantages, batch.ranks)
         yield Losses(
             policy_loss=policy_gradient_loss(log_probs, factors, shares),
             entropies=entropies,

@@ -1,5 +1,6 @@
 """Gradients of an actor's own rollouts, at the weights that played them. State; no I/O, no threads."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,11 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.compact import bfloat16, float32, planes
-from daedalus.protocol.messages import LARGEST_GRADIENT_NORM, Gradient, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import LARGEST_GRADIENT_NORM, Gradient, Rollout
+
+_CONSTRUCTION = threading.Lock()
 
 
 class RolloutGradients:
@@ -33,7 +36,9 @@ class RolloutGradients:
         """Raise NetworkError or AlgorithmError if the network or the algorithm cannot be constructed here."""
         torch.set_num_threads(1)
         training = spec.training.model_copy(update={"device": "cpu"})
-        with torch.random.fork_rng(devices=()):  # a learner in the same process draws its own numbers
+        # A learner in the same process draws numbers of its own: leave them as they were. The lock is for several
+        # actors, of which one would otherwise restore what another has drawn.
+        with _CONSTRUCTION, torch.random.fork_rng(devices=()):
             self._network = ActorCritic(spec.policy, spaces, modules, training)
         self._computer = GradientComputer(training, self._network, spaces, modules)
         self._assembler = BatchAssembler(spaces, torch.device("cpu"))

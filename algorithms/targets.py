@@ -7,15 +7,22 @@ from daedalus.algorithms.returns import Targets, actor_critic_targets, vtrace_ta
 from daedalus.protocol.spec import TrainingSpec
 
 
-def uncorrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
+def lambda_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:
     """Return lambda-returns and their advantages, as if the behaviour policy were the target policy.
 
+    Where actors explore, rows are weighted by min(rho_clip, pi / mu): random actions of an actor are then no more
+    frequent in the gradient than those of the policy (off-policy actor-critic: Degris et al. 2012).
+
     Args:
-      log_probs: [T, B], log pi(a_t | s_t) of the target policy; not used.
+      log_probs: [T, B], log pi(a_t | s_t) of the target policy.
       values: [T+1, B] under the weights being learned.
     """
     discounts = spec.discount_factor * (~batch.terminated)
-    return actor_critic_targets(batch.rewards, discounts, values[:-1], values[1:], batch.truncated, spec.trace_lambda)
+    ends = values[:-1], values[1:], batch.truncated
+    targets = actor_critic_targets(batch.rewards, discounts, *ends, spec.trace_lambda)
+    if not spec.explores:
+        return targets
+    return targets._replace(weights=(log_probs - batch.behaviour_log_probs).exp().clamp(max=spec.rho_clip))
 
 
 def vtrace_corrected_targets(spec: TrainingSpec, batch: Batch, log_probs: Tensor, values: Tensor) -> Targets:

@@ -1,13 +1,13 @@
 """Measure learning of the presets: every algorithm on CartPole, and the other presets, over several seeds.
 
-python benchmarks/algorithms.py                          (the whole table)
-python benchmarks/algorithms.py --only acrobot           (one preset)
+python -m benchmarks.algorithms                          (the whole table)
+python -m benchmarks.algorithms --only acrobot           (one preset)
 """
 
 import argparse
 import statistics
 
-from running import machine, table, train
+from benchmarks.running import machine, table, train
 
 RUNS = (
     ("cartpole", "a2c", (1, 2, 3, 4, 5)),
@@ -17,7 +17,7 @@ RUNS = (
     ("cartpole", "one_step_q", (1, 2, 3, 4, 5)),
     ("cartpole", "one_step_sarsa", (1, 2, 3, 4, 5)),
     ("acrobot", "impala", (1, 2, 3)),
-    ("lunar_lander", "impala", (1, 2, 3)),
+    ("lunar_lander", "appo", (1, 2, 3)),
     ("cartpole_notes", "a2c", (1, 2, 3)),
 )
 

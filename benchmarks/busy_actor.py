@@ -12,7 +12,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
+from daedalus.protocol.uploads import RolloutIdentity
 
 
 def main() -> None:

@@ -1,15 +1,15 @@
 """Measure env_steps per CPU second of CarRacing and Pong, with transforms and random actions.
 
-python benchmarks/environment_speed.py
+python -m benchmarks.environment_speed
 """
 
 import argparse
 import time
 
 import numpy as np
-from random_actions import random_actions
-from running import machine, table
 
+from benchmarks.random_actions import random_actions
+from benchmarks.running import machine, table
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.run.settings import read_preset, run_spec
 

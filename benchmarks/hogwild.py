@@ -1,7 +1,7 @@
 """Compare a plain A3C whose workers write into shared weights (Hogwild) with ours, on CartPole.
 
-    python benchmarks/hogwild.py
-    python benchmarks/hogwild.py --seeds 1 2 3 4 5 --workers 2 --no-daedalus
+    python -m benchmarks.hogwild
+    python -m benchmarks.hogwild --seeds 1 2 3 4 5 --workers 2 --no-daedalus
 
 The plain A3C is that of Mnih et al. (2016), algorithm S3, as most implementations of it are: processes on one machine,
 one environment each, parameters and RMSProp's statistics in shared memory, no lock. Solved means that the mean of the
@@ -18,8 +18,9 @@ import gymnasium
 import numpy as np
 import torch
 import torch.multiprocessing as multiprocessing
-from running import machine, table, train
 from torch import nn
+
+from benchmarks.running import machine, table, train
 
 TARGET, EPISODES, BUDGET = 475.0, 100, 3_000_000  # mean return; episodes in the mean; env_steps of all workers
 ROLLOUT_LENGTH, DISCOUNT_FACTOR, REWARD_SCALE = 20, 0.99, 0.05

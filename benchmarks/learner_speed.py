@@ -1,8 +1,8 @@
 """Measure updates of the learner's networks, in samples per second: forward, backward, gradient norm, Adam.
 
-    python benchmarks/learner_speed.py
-    python benchmarks/learner_speed.py --networks nature article --threads 1 --seconds 10 --profile
-    python benchmarks/learner_speed.py --networks nature --actors 2
+    python -m benchmarks.learner_speed
+    python -m benchmarks.learner_speed --networks nature article --threads 1 --seconds 10 --profile
+    python -m benchmarks.learner_speed --networks nature --actors 2
 
 There are no actors and no transport. The result is the fastest of several updates, because other load on the machine
 can only slow an update down. With --actors N, the mean update is also measured while N processes play Pong at the same
@@ -21,8 +21,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from running import machine, table
 
+from benchmarks.running import machine, table
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.optimizers import Adam
@@ -63,7 +63,7 @@ def updater(policy: PolicySpec, space: ArraySpace, rows: int, environments: int,
         with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
             logits, values = network({"observation": observations}, state, starts)
         loss = values.square().mean() - logits.log_softmax(-1).gather(-1, actions).mean()
-        flat.differentiate(loss)
+        flat.gradients.copy_(flat.differentiated(loss))
         flat.clip_gradients(0.5)
         optimizer.step(flat.values, flat.gradients, 1e-4)
 

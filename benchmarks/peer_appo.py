@@ -7,7 +7,7 @@ the games and works with the gymnasium version of Sample Factory:
 
     python -m venv PLACE
     PLACE/bin/pip install torch sample-factory==2.1.1 ale-py==0.10.2
-    PLACE/bin/python benchmarks/peer_appo.py --env-steps 10000
+    PLACE/bin/python -m benchmarks.peer_appo --env-steps 10000
 """
 
 import argparse

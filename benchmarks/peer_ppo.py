@@ -1,9 +1,10 @@
 """Train PPO of stable-baselines3 with all its defaults and 8 environments in one process, and print the result as JSON.
 
     pip install -e ".[benchmark]"
-    python benchmarks/peer_ppo.py --env LunarLander-v3 --env-steps 500000 --seed 11
+    python -m benchmarks.peer_ppo --env LunarLander-v3 --env-steps 500000 --seed 11
 
-It has MultiInputPolicy for Dict observations, CnnPolicy for images, else MlpPolicy. The score is the mean return of the
+It has MultiInputPolicy for Dict observations, CnnPolicy for images, else MlpPolicy. It refuses texts in observations
+and images as small as those of MiniGrid: there it gets the numbers as one array. The score is the mean return of the
 last 100 training episodes.
 """
 
@@ -42,6 +43,17 @@ def policy_for(space: gymnasium.Space) -> str:
     return "CnnPolicy" if len(shape) == 3 and min(shape[:2]) >= _SMALLEST_IMAGE else "MlpPolicy"
 
 
+def accepted(environment: gymnasium.Env) -> gymnasium.Env:
+    """Return the environment with observations that the peer accepts: a Dict with texts becomes one flat array."""
+    space = environment.observation_space
+    if not isinstance(space, gymnasium.spaces.Dict):
+        return environment
+    kept = [name for name, component in space.items() if component.shape is not None]
+    if len(kept) == len(space):
+        return environment
+    return gymnasium.wrappers.FlattenObservation(gymnasium.wrappers.FilterObservation(environment, kept))
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--env", required=True)
@@ -52,13 +64,16 @@ def main() -> None:
     module, _, name = parsed.env.rpartition(":")
     if module:
         importlib.import_module(module)
-    environments = make_vec_env(name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs)
+    environments = make_vec_env(
+        name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
+    )
     model = PPO(policy_for(environments.observation_space), environments, seed=parsed.seed, device="cpu")
     returns = Returns()
     began = time.monotonic()
     model.learn(parsed.env_steps, callback=returns)
     seconds = time.monotonic() - began
-    print(json.dumps({"score": statistics.fmean(returns.returns[-_EPISODES:]), "seconds": seconds}))
+    score = statistics.fmean(returns.returns[-_EPISODES:]) if returns.returns else None
+    print(json.dumps({"score": score, "seconds": seconds, "env_steps": model.num_timesteps}))
 
 
 if __name__ == "__main__":

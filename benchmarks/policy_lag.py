@@ -1,7 +1,7 @@
 """Measure which policy lag an algorithm bears: every rollout is played with weights of exactly so many updates ago.
 
-    python benchmarks/policy_lag.py
-    python benchmarks/policy_lag.py --preset acrobot --algorithm a3c --lags 0 8 32 --seeds 1 2 3 --env-steps 400000
+    python -m benchmarks.policy_lag
+    python -m benchmarks.policy_lag --preset acrobot --algorithm a3c --lags 0 8 32 --seeds 1 2 3 --env-steps 400000
 
 One process collects and learns in turn, without a network, so that the lag is exact and a run is determined by its
 seed. The result of a run is the env_steps until the target return, or the mean of the last training episodes at the end
@@ -11,9 +11,8 @@ of the budget.
 import argparse
 import statistics
 
-from running import machine, table
-from study.exact_lag import train
-
+from benchmarks.running import machine, table
+from benchmarks.study.exact_lag import train
 from daedalus.learner.run.settings import choose_algorithm, read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.protocol.spec import RunSpec

@@ -1,7 +1,7 @@
 """Measure env_steps/s on Pong with learning: Daedalus, its peers, and the limit of the pure computations.
 
-    python benchmarks/pong_throughput.py --rounds 3
-    python benchmarks/pong_throughput.py --sample-factory PLACE/bin/python       (peer_appo.py describes PLACE)
+    python -m benchmarks.pong_throughput --rounds 3
+    python -m benchmarks.pong_throughput --sample-factory PLACE/bin/python       (peer_appo.py describes PLACE)
 
 Peers are A2C of stable-baselines3 and, with --sample-factory, APPO of Sample Factory. The ratio is to the faster peer.
 All use 84 x 84 grey frames, skip 4, stack 4, Nature CNN, 256 rows per update and one pass. The limit is the speed of
@@ -10,22 +10,18 @@ alone, on one core. All programs run in turn in each round, and the ratios are c
 """
 
 import argparse
-import csv
 import os
 import statistics
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
-from learner_speed import NETWORKS, fastest, updater
-from random_actions import random_actions
-from running import COMMAND, machine, table
 
+from benchmarks.learner_speed import NETWORKS, fastest, updater
+from benchmarks.random_actions import random_actions
+from benchmarks.running import learning_rate, machine, per_call, table
 from daedalus.actor.environments.make import make_environments
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
@@ -48,23 +44,13 @@ SETTINGS = {
     "evaluation.seconds": 1e6,
     "evaluation.final_episodes": 1,
 }
-_WARM_SECONDS = 10.0  # after the first row of the metrics: start of the processes
 
 
 def ours(backend: str, env_steps: int) -> float:
     """Measure env_steps/s of `daedalus train pong` after the warm-up."""
-    with tempfile.TemporaryDirectory() as folder:
-        directory = Path(folder) / "run"
-        settings = {"environment.backend": backend, **SETTINGS}
-        words = ["train", "pong", "--env-steps", str(env_steps), "--run-dir", str(directory)]
-        words += [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
-        finished = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
-        if finished.returncode not in (0, 3):
-            raise SystemExit(f"daedalus train pong failed:\n{finished.stdout}{finished.stderr}")
-        with open(directory / "metrics.csv", newline="", encoding="utf-8") as file:
-            points = [(float(row["wall_seconds"]), int(row["env_steps"])) for row in csv.DictReader(file)]
-    warm = next(point for point in points if point[0] >= points[0][0] + _WARM_SECONDS)
-    return (points[-1][1] - warm[1]) / (points[-1][0] - warm[0])
+    settings = {"environment.backend": backend, **SETTINGS}
+    changed = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    return learning_rate("pong", "--env-steps", env_steps, *changed)
 
 
 def peer(python: str, script: str, *options: str) -> float:
@@ -81,7 +67,7 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
         environments.reset(1)
         spaces, random = environments.spaces, np.random.default_rng(1)
         actions = [random_actions(spaces, ENVIRONMENTS, random) for _ in range(1000)]
-        stepping = _per_call(lambda index: environments.step(actions[index % 1000]), seconds)
+        stepping = per_call(lambda index: environments.step(actions[index % 1000]), seconds)
     finally:
         environments.close()
     policy, space, _, _ = NETWORKS["nature"]
@@ -93,23 +79,12 @@ def limit(backend: str, seconds: float) -> tuple[float, dict[str, float]]:
     seen = {"observation": random.integers(0, 256, (ENVIRONMENTS, *space.stacked_shape), dtype=np.uint8)}
     state = np.zeros((ENVIRONMENTS, network.state_size), np.float32)
     size = runtime.noise_size
-    acting = _per_call(lambda _: runtime.act(seen, state, draw_noise(size, ENVIRONMENTS, random), {}), seconds)
+    acting = per_call(lambda _: runtime.act(seen, state, draw_noise(size, ENVIRONMENTS, random), {}), seconds)
     torch.set_num_threads(1)
     learning = fastest(updater(policy, space, ROWS, ENVIRONMENTS, bfloat16=True), seconds) / ROWS
     parts = {"environment": stepping, "forward": acting, "update": learning}
     microseconds = {name: 1e6 * spent / ENVIRONMENTS for name, spent in parts.items()}
     return 1e6 * (os.cpu_count() or 1) / sum(microseconds.values()), microseconds
-
-
-def _per_call(call: Callable[[int], object], seconds: float) -> float:
-    """Return the CPU seconds per call, without the first calls."""
-    for index in range(20):
-        call(index)
-    calls, began, ends = 0, time.process_time(), time.monotonic() + seconds
-    while time.monotonic() < ends:
-        call(calls)
-        calls += 1
-    return (time.process_time() - began) / calls
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Compare the fast backend of CarRacing-v3 with gymnasium's, frame by frame, in one episode.
 
-    python benchmarks/side_by_side.py --output docs/car_racing_frames.png
+    python -m benchmarks.side_by_side --output docs/car_racing_frames.png
 
 Both get the same seed and the same actions. Prints the difference of the frames in grey values, and whether rewards and
 ends are equal. The picture shows frames of gymnasium, frames of the fast backend, and ten times the difference.

@@ -1,6 +1,6 @@
 """Measure the seconds from the start of `daedalus train cartpole` until it is solved, one run per seed.
 
-    python benchmarks/solve_time.py --seeds 1 2 3 4 5
+    python -m benchmarks.solve_time --seeds 1 2 3 4 5
 
 Solved means that the mean of the last 100 training episodes is at least 475, as in the preset. The time starts with the
 `daedalus` process and does not include the final evaluation. One run before the others warms the disk cache; it is not
@@ -10,7 +10,7 @@ counted.
 import argparse
 import statistics
 
-from running import machine, table, train
+from benchmarks.running import machine, table, train
 
 
 def main() -> None:

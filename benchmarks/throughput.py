@@ -1,6 +1,6 @@
 """Measure env_steps/s on CartPole with learning, of Daedalus and of A2C of stable-baselines3, and the memory.
 
-    python benchmarks/throughput.py --rounds 3
+    python -m benchmarks.throughput --rounds 3
 
 Both run in turn, each alone on the machine. The ratio is computed per round.
 """
@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from running import COMMAND, machine, table
+from benchmarks.running import COMMAND, machine, table
 
 
 def resident_megabytes(pid: int) -> float:

@@ -1,6 +1,6 @@
 """Measure the share of codec and transport in the CPU time of learner and actors, on CartPole.
 
-    python benchmarks/transport_share.py --env-steps 8000000
+    python -m benchmarks.transport_share --env-steps 8000000
 
 The total includes the start of the processes and imports. benchmarks/profiled.py describes what is counted.
 """
@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from running import machine, table
+from benchmarks.running import machine, table
 
 
 def free_address() -> str:

@@ -1,6 +1,6 @@
 """Checks that an actor installs without a compiler: a wheel of each dependency for every system that actors run on.
 
-    python benchmarks/wheels.py
+    python -m benchmarks.wheels
 
 Asks the index that pip is configured with; nothing is installed. pip resolves the dependencies for each system, and
 those of the dependencies too. Exit status: 0 all have wheels, 1 some have none.

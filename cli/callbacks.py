@@ -91,7 +91,7 @@ class CallbackObserver(RunObserver):
         """See RunObserver."""
         return ["--rows-to", str(self._writing)]
 
-    def begin(self) -> None:
+    def begin(self, address: str) -> None:
         """See RunObserver."""
         self._callback.on_start(self._run)
 

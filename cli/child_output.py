@@ -1,4 +1,4 @@
-"""Output of child processes: every line goes to a log file and, within a rate limit, to the screen.
+"""Output of child processes: every line goes to a log file and, without repetitions and within a rate limit, is shown.
 
 The environments of a user may print at every step: this must neither flood the terminal nor stop the processes.
 """
@@ -7,17 +7,20 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Self
+
+STREAMS = ("stdout", "stderr")
 
 _LONGEST_LINE = 1 << 16  # bytes; a longer line is split
 _LOG_BYTES = 8 << 20  # of the log file, and of the one before it
 _SHOWN_AT_ONCE = 40  # lines; afterwards one line in so many seconds
 _SECONDS_A_LINE = 5.0
 _KEPT_LINES = 40
+_REPETITION = 2  # a line that equals one of so many before it is not shown: a warning that every environment repeats
 _CLOSE_SECONDS = 5.0
 
 
@@ -90,24 +93,25 @@ class ChildOutput:
           log: file for all lines.
           write_out, write_err: show a line of standard output, or of standard error. Called by several threads in turn.
         """
-        self._log, self._log_path = OutputLog(log), log
+        self._log, self.path = OutputLog(log), log
         self._write = {"stdout": write_out, "stderr": write_err}
         now = time.monotonic()
         self._limits = {stream: RateLimit(now) for stream in self._write}
         self._lock = threading.Lock()  # guards all but the threads
         self.withheld = 0  # lines that should have been shown, and were not
         self._unshown: dict[str, deque[str]] = {}  # newest lines of standard error that were not shown, by process
+        self._newest: dict[tuple[str, str], deque[str]] = {}  # newest lines by process and stream
         self._threads: dict[str, list[threading.Thread]] = {}
 
     @contextmanager
-    def pipes(self, name: str, *, shown: bool = True) -> Iterator[Streams]:
+    def pipes(self, name: str, *, shown: Collection[str] = STREAMS) -> Iterator[Streams]:
         """Return the streams for one process, which must be started in the block.
 
         Args:
           name: of the process.
-          shown: show its lines, within the limit; otherwise they only go to the log.
+          shown: streams whose lines are shown, within the limit; those of others only go to the log.
         """
-        with self._reading(name, lambda stream, lines: self._take(name, stream, lines, shown)) as streams:
+        with self._reading(name, lambda stream, lines: self._take(name, stream, lines, stream in shown)) as streams:
             yield streams
 
     @contextmanager
@@ -128,7 +132,7 @@ class ChildOutput:
         with self._lock:
             self._log.close()
             if self.withheld:
-                self._show("stdout", [f"{self.withheld:,} lines of output were not shown; see {self._log_path}"])
+                self._show("stdout", [f"{self.withheld:,} lines of output were not shown; see {self.path}"])
 
     def __enter__(self) -> Self:
         return self
@@ -156,14 +160,24 @@ class ChildOutput:
     def _take(self, name: str, stream: str, lines: list[str], shown: bool) -> None:
         with self._lock:
             self._log.write([f"[{name}] {line}\n".encode() for line in lines])
+            lines = self._without_repetitions(name, stream, lines)
             count = self._limits[stream].take(len(lines), time.monotonic()) if shown else 0
             self._show(stream, lines[:count])
             if stream == "stderr":
                 self._unshown.setdefault(name, deque(maxlen=_KEPT_LINES)).extend(lines[count:])
             if shown and count < len(lines):
                 if not self.withheld:
-                    self._show("stdout", [f"more lines of output are in {self._log_path} only"])
+                    self._show("stdout", [f"more lines of output are in {self.path} only"])
                 self.withheld += len(lines) - count
+
+    def _without_repetitions(self, name: str, stream: str, lines: Sequence[str]) -> list[str]:
+        newest = self._newest.setdefault((name, stream), deque(maxlen=_REPETITION))
+        kept = []
+        for line in lines:
+            if line not in newest:
+                kept.append(line)
+            newest.append(line)
+        return kept
 
     def _show(self, stream: str, lines: Sequence[str]) -> None:
         for line in lines:

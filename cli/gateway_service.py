@@ -4,6 +4,7 @@ The web server answers before the network is reached: clients wait, and the page
 """
 
 import asyncio
+import gc
 import logging
 import os
 import socket
@@ -14,8 +15,9 @@ from dataclasses import dataclass, field
 
 from daedalus.cli.run_source import LearnerSource
 from daedalus.gateway.app import application
+from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.gateway import JOIN_SECONDS, Gateway, GatewayConfig
+from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
 from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
@@ -77,6 +79,8 @@ class GatewayService:
 
     async def run(self, listener: socket.socket) -> None:
         """Serve until `stop` is set. Raises what makes the gateway fail."""
+        gc.collect()
+        gc.freeze()  # the modules: a full collection would else take 50 ms, for which all clients wait
         settings, port = self._settings, listener.getsockname()[1]
         tokens = None if settings.serving is None else Tokens(settings.serving.directory)
         tls = None if settings.serving is None else tls_context(settings.serving.directory)
@@ -153,7 +157,7 @@ class GatewayService:
         return transport
 
     def _begin_to_watch(self, transport: Transport, gateway: Gateway) -> None:
-        source = LearnerSource(transport, self._settings.run, lambda: gateway.followed_run)
+        source = LearnerSource(transport, self._settings.run, lambda: gateway.run.name)
 
         def show(seen: Observation) -> None:
             if not self._stop.is_set():
@@ -168,8 +172,8 @@ class GatewayService:
             except (TransportError, ProtocolError) as error:
                 return str(error)
 
-        self._monitor = RunMonitor(source, show, lambda: gateway.last_run_end)
-        gateway.on_run_change = self._monitor.look
+        self._monitor = RunMonitor(source, show, lambda: gateway.run.last_end)
+        gateway.run.on_change = self._monitor.look
         self._data.on_watch, self._data.give_order = self._monitor.watch, give
         self._monitor.watch(self._data.is_watched)
         self._monitor.open()

@@ -7,6 +7,7 @@ import logging
 import subprocess
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.confirmation import confirmation, confirmation_arguments
 from daedalus.cli.processes import ORDERED
 from daedalus.cli.run_observer import RunObserver
-from daedalus.cli.select_best import EvaluationFailedError, play, select_best
+from daedalus.cli.sampled_evaluation import is_below_training, sampled_note
+from daedalus.cli.select_best import EvaluationFailedError, play, select_best, without_episodes
 from daedalus.cli.supervisor import (
     GATEWAY,
     FailedError,
@@ -25,7 +27,9 @@ from daedalus.cli.supervisor import (
     supervised_actor,
     supervised_gateway,
 )
+from daedalus.cli.tracking.tracker_processes import TrackerProcesses
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.event_file import EventFile
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -66,6 +70,7 @@ class LocalRun:
     resume: bool = False
     trained: int | None = None  # exit status of a run that is already trained and that only lacks its evaluation
     spaces: Spaces | None = None  # of the environment, if it was checked
+    processes: int = 1  # of the learner
     init_from: Path | None = None  # another run, whose weights the learner begins with
     listen: str | None = None  # address for actors of other hosts, in addition to a private one of this machine
     tls: Path | None = None
@@ -74,6 +79,7 @@ class LocalRun:
     log_json: bool = False
     watch: bool = False  # start a gateway with the page of the run
     camera: bool = True  # with a camera
+    log: Sequence[str] = ()  # trackers that the run is logged to
     observer: RunObserver = field(default_factory=RunObserver)
 
 
@@ -101,8 +107,13 @@ def run_locally(
     Raises RunFailedError or RunStoppedError.
     """
     page: list[Supervised] = []
+    trackers = TrackerProcesses(run.log, run.directory, output, log_json=run.log_json)
     try:
-        status = _train(run, stopping, output, learner_streams, page) if run.trained is None else run.trained
+        if run.trained is None:
+            status = _train(run, stopping, output, learner_streams, page, trackers)
+        else:
+            trackers.start()
+            status = run.trained
         if stopping.is_set() or status == ORDERED:
             raise RunStoppedError
         if status not in _FINISHED:
@@ -115,6 +126,7 @@ def run_locally(
         raise RunFailedError("\n".join([*unshown, str(error)])) from None
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
+        trackers.finish(stopping)
 
 
 def _train(
@@ -123,17 +135,18 @@ def _train(
     output: ChildOutput,
     learner_streams: OpenStreams,
     page: list[Supervised],
+    trackers: TrackerProcesses,
 ) -> int:
     """Run the learner and the actors; return the learner's exit status. Raises FailedError.
 
-    Adds the gateway to `page`, which the caller stops.
+    Adds the gateway to `page`, and starts the trackers. The caller ends them.
     """
-    run.observer.begin()
-    try:
-        with private_address() as address:
-            return _train_at(address, run, stopping, output, learner_streams, page)
-    finally:
-        run.observer.end()
+    with private_address() as address:
+        run.observer.begin(address)
+        try:
+            return _train_at(address, run, stopping, output, learner_streams, page, trackers)
+        finally:
+            run.observer.end()
 
 
 def _train_at(
@@ -143,6 +156,7 @@ def _train_at(
     output: ChildOutput,
     learner_streams: OpenStreams,
     page: list[Supervised],
+    trackers: TrackerProcesses,
 ) -> int:
     """Run the learner, and connect this machine's actors to it at an address."""
     spec, options = run.spec, _actor_options(run)
@@ -167,7 +181,8 @@ def _train_at(
             actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
         if run.watch:
             page.append(supervised_gateway(address, _gateway_options(run), output.pipes))
-        return watch(learner, [*actors, *page], spec, stopping, run.observer)
+        trackers.start()
+        return watch(learner, [*actors, *page], spec, stopping, run.observer, EventFile(run.directory))
     finally:
         stop([learner.process, *(actor.process for actor in actors)])
 
@@ -212,6 +227,8 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         arguments += allow_settings(run.spec.learner_modules)
         if run.spaces is not None:
             arguments += ["--spaces", run.spaces.model_dump_json()]
+        if run.processes > 1:
+            arguments += ["--processes", str(run.processes)]
         if run.init_from is not None:
             arguments += ["--init-from", str(run.init_from)]
         if run.resume or not first:
@@ -236,11 +253,12 @@ def watch(
     spec: RunSpec,
     stopping: threading.Event,
     observer: RunObserver | None = None,
+    record: EventFile | None = None,
 ) -> int:
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
-    Return 0 if the observer ends training. Raises FailedError if the learner failed too often, or if too few actors are
-    left.
+    The log shows each restart, and `record` keeps it. Return 0 if the observer ends training. Raises FailedError if the
+    learner failed too often, or if too few actors are left.
     """
     observer = observer or RunObserver()
     while not stopping.wait(_POLL_SECONDS):
@@ -250,10 +268,10 @@ def watch(
             return 0
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
-        _warn(learner.check())
+        _warn(learner.check(), record)
         for actor in list(actors):
             try:
-                _warn(actor.check())
+                _warn(actor.check(), record)
             except FailedError as error:
                 actors.remove(actor)
                 stop([actor.process])
@@ -263,19 +281,22 @@ def watch(
                 )  # a synchronous algorithm waits for all actors at its start
                 if needed and actor.name not in _HELPERS:
                     raise
-                _warn(f"{error}; training continues without this process")
+                _warn(f"{error}; training continues without this process", record)
     return 1
 
 
-def _warn(message: str | None) -> None:
+def _warn(message: str | None, record: EventFile | None) -> None:
     if message:
         _logger.warning("%s", message)
+        if record is not None:
+            record.add_restart(message)
 
 
 def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
-    If training stopped at its target, the policy of that moment also plays new sampled episodes. Raises
+    If training stopped at its target, the policy of that moment also plays new sampled episodes. Otherwise, if greedy
+    episodes are clearly worse than training was, the same episodes are played with sampled actions, too. Raises
     EvaluationFailedError.
     """
     began = time.monotonic()
@@ -288,10 +309,16 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
         evaluations.append([*confirmation_arguments(run.spec), *common])
     evaluation, *confirmations = play([[str(run.directory), *each] for each in evaluations], stopping, output)
     for confirmed in confirmations:
-        summary["confirmation"] = confirmation(confirmed)
+        summary["confirmation"] = confirmation(without_episodes(confirmed))
         summary["confirmation_return_mean"] = confirmed["return_mean"]
+    if not confirmations and is_below_training(evaluation, summary.get("episode_return_mean")):
+        (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
+        evaluation["notes"].append(sampled_note(evaluation, sampled))
+        summary["sampled_evaluation"] = without_episodes(sampled)
     summary["evaluation_return_mean"] = evaluation["return_mean"]
     summary["evaluation_return_std"] = evaluation["return_std"]
-    summary["evaluation"] = {**evaluation, "select_best": chosen, "seconds": time.monotonic() - began}
+    seconds = time.monotonic() - began
+    summary["evaluation"] = {**without_episodes(evaluation), "select_best": chosen, "seconds": seconds}
+    run_directory.write_json(run.directory / run_directory.EVALUATION, evaluation)
     run_directory.write_json(run.directory / run_directory.SUMMARY, summary)
     return summary

@@ -31,6 +31,8 @@ after training:
   evaluate   play episodes with the policy of a run, or record a video
   plot       draw the learning curves of one or more runs
   compare    print a table of groups of runs, with intervals
+  report     write one HTML file about one or more runs
+  push       upload the policy of a run to the Hugging Face Hub
 
 for the shell:
   completion print a script that completes commands, options and presets
@@ -131,6 +133,18 @@ def _compare(arguments: list[str]) -> int:
     return compare(arguments)
 
 
+def _report(arguments: list[str]) -> int:
+    from daedalus.cli.commands.report import report
+
+    return report(arguments)
+
+
+def _push(arguments: list[str]) -> int:
+    from daedalus.cli.commands.push import push
+
+    return push(arguments)
+
+
 def _certs(arguments: list[str]) -> int:
     from daedalus.cli.commands.certs import certs
 
@@ -154,6 +168,8 @@ _COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "exporter": _exporter,
     "plot": _plot,
     "compare": _compare,
+    "report": _report,
+    "push": _push,
     "certs": _certs,
     "completion": _completion,
 }

@@ -17,6 +17,7 @@ _logger = logging.getLogger(__name__)
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
 STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
+RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine

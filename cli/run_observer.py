@@ -16,8 +16,8 @@ class RunObserver:
         """Options of the learner."""
         return []
 
-    def begin(self) -> None:
-        """Called before the processes start."""
+    def begin(self, address: str) -> None:
+        """Called before the processes start. `address` is where the learner will answer."""
 
     def end(self) -> None:
         """Called after they have ended, in any way."""

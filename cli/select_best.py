@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
-from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.child_output import STREAMS, ChildOutput
 from daedalus.cli.supervisor import stop
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
@@ -83,7 +83,7 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
         try:
             for arguments, file in zip(commands, files, strict=True):
                 name = f"evaluation-{len(processes)}"
-                with output.pipes(name, shown=not processes) as streams:
+                with output.pipes(name, shown=() if processes else STREAMS) as streams:
                     processes[name] = _start_evaluation(arguments, file, streams.stderr)
             while any(process.poll() is None for process in processes.values()) and not stopping.wait(_POLL_SECONDS):
                 pass
@@ -96,11 +96,12 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
             raise EvaluationFailedError("\n".join(unshown))
         for file in files:
             file.seek(0)
-        results = [json.load(file) for file in files]
-    for result in results:
-        for each_episode in ("returns", "lengths"):
-            del result[each_episode]
-    return results
+        return [json.load(file) for file in files]
+
+
+def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
+    """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
+    return {name: value for name, value in result.items() if name not in ("returns", "lengths")}
 
 
 def _start_evaluation(arguments: list[str], output: IO[bytes], error: int | None) -> subprocess.Popen[bytes]:

@@ -7,9 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, command_parser
+from daedalus.cli.arguments import (
+    MOST_PROCESSES,
+    add_allow_module,
+    add_insecure,
+    add_processes,
+    add_tls,
+    command_parser,
+)
 from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
+from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
@@ -31,6 +39,7 @@ examples:
   daedalus learner --env Acrobot-v1 --set training.learning_rate=0.001 --run-dir runs/acrobot
   daedalus learner cartpole --listen tls/0.0.0.0:7447 --tls certs/learner      (daedalus certs --help)
   daedalus learner cartpole --connect tcp/router:7447
+  daedalus learner car_racing_article --processes 2
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
 
 exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
@@ -87,6 +96,19 @@ def add_new_run(options: argparse.ArgumentParser) -> None:
         help="begin with the weights of another run, or of one of its checkpoints. The network must be the same",
     )
     options.add_argument("--run-dir", type=Path, metavar="DIR", help="run directory (default: a new folder in runs/)")
+    add_log(options)
+
+
+def add_log(options: argparse._ActionsContainer) -> None:
+    """Add --log, which may be given several times."""
+    options.add_argument(
+        "--log",
+        action="append",
+        default=[],
+        choices=TRACKERS,
+        help="log the run to this tracker too, in addition to metrics.csv and TensorBoard. May be given several times. "
+        "`daedalus resume` continues the run there",
+    )
 
 
 def resolve(arguments: argparse.Namespace, defaults: dict[str, Any] | None = None) -> tuple[RunSpec, Path]:
@@ -171,6 +193,17 @@ def check_environment(env: str | None, settings: dict[str, Any]) -> None:
         raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
 
 
+def check_processes(number: int, spec: RunSpec) -> None:
+    """Raise SettingsError if a learner of so many processes cannot learn what `spec` defines."""
+    if number > 1 and spec.uploads_gradients:
+        raise SettingsError(
+            "collection.upload is gradients: the actors compute them, so that several processes of the learner would "
+            "have nothing to do; leave out --processes, or set collection.upload=rollouts"
+        )
+    if not 1 <= number <= MOST_PROCESSES:
+        raise SettingsError(f"the learner cannot have {number} processes: choose a number from 1 to {MOST_PROCESSES}")
+
+
 def named_directory(preset: str | None, spec: RunSpec) -> Path:
     """Return the default run directory, named after the preset or file, or after the environment.
 
@@ -245,6 +278,7 @@ def learner_parser() -> argparse.ArgumentParser:
         help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
         "For a supervisor that repeats the same command",
     )
+    add_processes(options)
     add_allow_module(options, "config.toml of an existing run")
     add_tls(options)
     add_insecure(options)
@@ -252,6 +286,7 @@ def learner_parser() -> argparse.ArgumentParser:
     # Options for `daedalus train`, which has created the run directory and its config.toml.
     options.add_argument("--prepared", type=Path, help=argparse.SUPPRESS)
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
+    options.add_argument("--no-progress", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
     options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)

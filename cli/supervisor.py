@@ -9,9 +9,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from daedalus.cli.child_output import OpenStreams, Streams, inherited
-from daedalus.cli.processes import STOPPED
+from daedalus.cli.processes import RANK_LOST, STOPPED
 
 GATEWAY = "gateway"  # name of its process
+_NO_FAULT = {STOPPED, RANK_LOST}  # exit statuses of a process that has not failed by itself
 
 _MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
 _SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
@@ -27,7 +28,12 @@ _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THR
 
 
 def start(
-    module: str, *arguments: str, streams: Streams, descriptors: tuple[int, ...] = (), one_thread: bool = False
+    module: str,
+    *arguments: str,
+    streams: Streams,
+    descriptors: tuple[int, ...] = (),
+    one_thread: bool = False,
+    own_session: bool = False,
 ) -> subprocess.Popen[bytes]:
     """Start `python -m module` with a pipe as its standard input.
 
@@ -39,6 +45,7 @@ def start(
       streams: its standard output and standard error.
       descriptors: file descriptors that it inherits.
       one_thread: limit the thread pools of its libraries.
+      own_session: keep it out of the terminal's group for Ctrl-C. It leads a process group of its own.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
@@ -47,6 +54,7 @@ def start(
         stderr=streams.stderr,
         env={**os.environ, **_ONE_THREAD} if one_thread else None,
         pass_fds=descriptors,
+        start_new_session=own_session,
     )
 
 
@@ -84,7 +92,7 @@ class Supervised:
     def failed_at_once(self) -> bool:
         """Whether the first process failed soon after its start, so that a restart would not help."""
         status = self.process.poll()
-        failed = status is not None and status > 0 and status not in (STOPPED, *self.ended)
+        failed = status is not None and status > 0 and status not in _NO_FAULT | self.ended
         return failed and self.restarts == 0 and time.monotonic() - self._started < _SOON_SECONDS
 
     def check(self) -> str | None:
@@ -102,7 +110,7 @@ class Supervised:
                 return None
             self._start(first=False)
             return f"{self.name} ended before the run; started again"
-        if status > 0 and status != STOPPED:
+        if status > 0 and status not in _NO_FAULT:
             lived = now - self._started
             self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
         if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
@@ -116,6 +124,8 @@ def _describe(status: int) -> str:
     """Return how a process ended that had more to do."""
     if status == STOPPED:
         return "was stopped by a signal"
+    if status == RANK_LOST:
+        return "lost one of its processes"
     return f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
 
 

@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +17,8 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
-from daedalus.cli.settings_arguments import Choice, named_directory
+from daedalus.cli.settings_arguments import Choice, check_processes, named_directory
+from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -63,7 +64,9 @@ def train(
     settings: Mapping[str, Any] | None = None,
     wrap: str | None = None,
     init_from: str | Path | None = None,
+    processes: int = 1,
     callback: Callback | None = None,
+    log: str | Sequence[str] = (),
     quiet: bool = False,
 ) -> RunResult:
     """Train with a learner and actors as processes of this machine, evaluate the policy, and return the result.
@@ -83,16 +86,22 @@ def train(
       settings: any other settings, such as {"training.learning_rate": 0.001}; None unsets one.
       wrap: "module:function", called with each gymnasium environment; returns the environment to play.
       init_from: another run, or one of its checkpoints, whose weights to begin with; the network must be the same.
+      processes: of the learner; each computes the gradients of its share of every batch.
       callback: called with each row of metrics; it can log metrics of its own and end training.
+      log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TrainingError if a process failed.
     """
     started = time.monotonic()
+    log = (log,) if isinstance(log, str) else log
+    if unknown := set(log) - set(TRACKERS):
+        raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
     choice = Choice(
         preset=preset, env=env, algorithm=algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap
     )
     spec = choice.spec(partial(_assign, changes=settings or {}))
+    check_processes(processes, spec)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     run_directory.check_free(directory)  # before the environment is made
     with _checking(quiet):
@@ -117,6 +126,8 @@ def train(
             lock=lock.inheritable,
             spaces=spaces,
             init_from=weights,
+            log=tuple(log),
+            processes=processes,
             observer=observer,
         )
         end = _run(run, quiet)

@@ -3,6 +3,7 @@
 This is the public API. Each name is imported when it is first used, so `import daedalus` loads no other package:
 
     result = daedalus.train("cartpole")
+    evaluation = daedalus.evaluate(result.directory)
     policy = daedalus.load_policy(result.directory)
     action = policy.act(observation)
 """
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from daedalus.actor.client import Client
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
     from daedalus.cli.callbacks import Callback, TrainingRun
+    from daedalus.cli.comparing.recorded_run import RunDataError, read_metrics
+    from daedalus.cli.evaluate_function import EvaluationResult, evaluate
     from daedalus.cli.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.settings import SettingsError
 
@@ -21,25 +24,33 @@ if TYPE_CHECKING:
 __all__ = [
     "Callback",
     "Client",
+    "EvaluationResult",
     "Policy",
+    "RunDataError",
     "RunResult",
     "SettingsError",
     "TrainingError",
     "TrainingRun",
     "__version__",
+    "evaluate",
     "load_policy",
+    "read_metrics",
     "train",
 ]
 
 _MODULES = {
     "Callback": "daedalus.cli.callbacks",
     "Client": "daedalus.actor.client",
+    "EvaluationResult": "daedalus.cli.evaluate_function",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
+    "RunDataError": "daedalus.cli.comparing.recorded_run",
     "RunResult": "daedalus.cli.train_function",
     "SettingsError": "daedalus.learner.run.settings",
     "TrainingError": "daedalus.cli.train_function",
     "TrainingRun": "daedalus.cli.callbacks",
+    "evaluate": "daedalus.cli.evaluate_function",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
+    "read_metrics": "daedalus.cli.comparing.recorded_run",
     "train": "daedalus.cli.train_function",
 }
 

@@ -1,50 +1,48 @@
 """One client as an actor towards the learner: its rows and its rollouts. For the gateway's event loop."""
 
-import asyncio
 import copy
 import time
-from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from daedalus.actor.collecting.client_rows import ClientRows, check_run
-from daedalus.actor.collecting.rollout_writer import RolloutWriter
+from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.session.learner_queries import ActorError
-from daedalus.actor.session.upload_session import UploadSession
 from daedalus.gateway.client_spaces import ClientSpaces
+from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.messages import Act, EndEpisode
-from daedalus.gateway.policy_version import PolicyVersion
+from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.runtime import Choice
-from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Welcome
+from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import RolloutIdentity
 
-_MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
 _NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # sending replaces it
 
 
 class ClientActor:
     """The state of one client, across its connections and the learner's epochs."""
 
-    def __init__(self, join: Join, spaces: ClientSpaces, uploads: UploadSession) -> None:
+    def __init__(self, join: Join, spaces: ClientSpaces, uploads: ClientUploads) -> None:
         """`join` names the actor and its incarnation."""
-        self.join, self.spaces, self._uploads = join, spaces, uploads
+        self.join, self.spaces, self.uploads = join, spaces, uploads
         self.heard_at = time.monotonic()
         self.version: PolicyVersion | None = None  # of the rollout that is being written
-        self.chosen: asyncio.Future[Any] | None = None  # the action that the client waits for
+        self._on_action: Callable[[Any], None] = _ignore  # receives the action that the client waits for
         self._session: Welcome | None = None  # that it has joined
         self._transforms: Transforms | None = None  # of that session
         self._rows: ClientRows | None = None
         self._rows_epoch = -1  # of the learner that the rows are for
-        self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
-        self._sequence = 0  # of the next rollout
+        self._full_version = -1  # of the last full rollout for that learner
+        self._override: Any = None  # the action that is played in the row that has begun, in place of the policy's
 
     @property
     def name(self) -> str:
@@ -63,11 +61,6 @@ class ClientActor:
         mask = None if self.spaces.example_mask is None else mask_of_one(self.spaces.example_mask)
         try:
             check_run(spec)
-            if spec.algorithm.synchronous:
-                raise ActorError(
-                    f"a run with {spec.training.algorithm} makes its actors wait for each update, which clients of a "
-                    "gateway do not: use another algorithm"
-                )
             transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
@@ -76,19 +69,22 @@ class ClientActor:
     def joined(self, session: Welcome, transforms: Transforms) -> None:
         """Take part in a session from now on; the rollouts for an earlier one are dropped."""
         if session.learner_epoch != self.epoch:
-            self._uploads.begin(session.run, session.spec.collection.window)
-            self._sequence = 0
-            self._full.clear()
+            self.uploads.begin(session)
         else:
-            self._uploads.resume()
+            self.uploads.resume()
         self._session, self._transforms = session, transforms
 
     # ---------------------------------------------------------------------------------------------- acting
 
-    def observe(self, message: Act, current: PolicyVersion) -> None:
-        """Note an observation to act on. Raises ClientError if the message does not fit; nothing has changed then."""
+    def observe(self, message: Act, current: PolicyVersion, on_action: Callable[[Any], None]) -> None:
+        """Note an observation to act on, and what to call with the action.
+
+        Raises ClientError if the message does not fit; nothing has changed then.
+        """
         values = self.spaces.observation(message.observation)
         mask = self.spaces.action_mask(message.action_mask)
+        if message.override is not None:
+            self.spaces.check_action(message.override)
         self._add_reward(message.reward)
         epoch = current.session.learner_epoch
         if self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch):
@@ -97,6 +93,7 @@ class ClientActor:
             self.rows.observe(values, mask)
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
+        self._on_action, self._override = on_action, message.override
 
     def _add_reward(self, value: float) -> None:
         if value and (self._rows is None or not self._rows.in_episode):
@@ -124,7 +121,7 @@ class ClientActor:
             )
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
-        self._rows_epoch, self.version = current.session.learner_epoch, current
+        self._rows_epoch, self._full_version, self.version = current.session.learner_epoch, -1, current
         self._rows = ClientRows(
             self._transforms,
             writer,
@@ -146,12 +143,26 @@ class ClientActor:
         assert self.version is not None
         return self.version
 
+    def begin_row(self) -> RowInputs:
+        """Return what the policy chooses from. Call `select_version` before."""
+        return self.rows.begin_row(overridden=self._override is not None, idle=self._awaits_update)
+
+    @property
+    def _awaits_update(self) -> bool:
+        """Whether the run makes its actors wait for each update: the client goes on, and its rows are not written."""
+        assert self.version is not None
+        synchronous = self.version.session.spec.algorithm.synchronous
+        return synchronous and self.rows.is_between_rollouts and self.version.version <= self._full_version
+
     def take(self, choice: Choice) -> bool:
         """Take a choice; return False if the policy must choose once more, after a reset row."""
         if not self.rows.take_choice(choice):
             return False
-        if self.chosen is not None and not self.chosen.done():
-            self.chosen.set_result(self.spaces.action(self.rows.env_action(choice.actions)))
+        if self._override is None:
+            self._on_action(self.spaces.action(self.rows.env_action(choice.actions)))
+        else:
+            self.uploads.overridden_actions += 1
+            self._on_action(self._override)
         return True
 
     def reward(self, value: float) -> None:
@@ -174,6 +185,7 @@ class ClientActor:
 
     def cut(self) -> None:
         """End the episode as truncated: the client disconnected."""
+        self._on_action = _ignore
         if self._rows is not None:
             self._rows.cut()
 
@@ -181,36 +193,13 @@ class ClientActor:
         """Let go of the policy version: this actor will not act again."""
         self.version = self._rows = None
 
-    # --------------------------------------------------------------------------------------------- sending
-
     def _keep(self, writer: RolloutWriter) -> None:
         assert self.version is not None
         rollout = copy.deepcopy(writer.finish(_NO_IDENTITY, self.version.version))
+        self._full_version = self.version.version
         if self._rows_epoch == self.epoch:  # otherwise it is meant for a previous learner
-            self._full.append(rollout)
-            self.send()
+            self.uploads.keep(rollout)
 
-    def send(self) -> None:
-        """Send full rollouts while there is room in the window, and again those that are due."""
-        session = self._session
-        while session is not None and self._full and self._uploads.in_flight.has_room:
-            identity = RolloutIdentity(
-                actor=self.join.actor,
-                incarnation=self.join.incarnation,
-                sequence=self._sequence,
-                learner_epoch=session.learner_epoch,
-            )
-            self._uploads.send(self._sequence, encode(replace(self._full.popleft(), identity=identity)))
-            self._sequence += 1
-        if self._uploads.in_flight.rollouts:
-            self._uploads.send_due()
 
-    @property
-    def newest_version(self) -> int:
-        """The newest policy version that an acknowledgement mentioned."""
-        return self._uploads.in_flight.newest_version
-
-    @property
-    def ended_by(self) -> tuple[str, str]:
-        """The verdict that ended this actor's session, and the reason; both empty while it goes on."""
-        return self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
+def _ignore(action: Any) -> None:
+    """Receive an action that no client waits for."""

@@ -48,7 +48,7 @@ class ClientSpaces:
         for space in self._observations.values():
             number = _NUMBER_BYTES if space.dtype == "float32" else _INTEGER_BYTES
             size += _NAME_BYTES + number * math.prod(space.shape)
-        return size
+        return size + sum(_NAME_BYTES + _NUMBER_BYTES * space.size for space in self._actions.values())
 
     def observation(self, value: Any) -> Any:
         """Return an observation as gymnasium has it. Raises ClientError if it does not fit."""
@@ -71,6 +71,13 @@ class ClientSpaces:
         bare = self._masks.keys() == {"action"} and not isinstance(value, dict)
         parts = {"action": value} if bare else _components(value, self._masks.keys(), "the action_mask")
         return {name: _mask(parts[name], self._actions[name], name) for name in self._masks}
+
+    def check_action(self, value: Any) -> None:
+        """Raise ClientError unless a value, as `action` returns it, is an action of the space."""
+        bare = self._actions.keys() == {"action"} and not isinstance(value, dict)
+        parts = {"action": value} if bare else _components(value, self._actions.keys(), "the override")
+        for name, space in self._actions.items():
+            _check_action(parts[name], space, "the override" if bare else f"{name} of the override")
 
     def action(self, value: Any) -> Any:
         """Return gymnasium's action as numbers, lists and maps by component."""
@@ -169,13 +176,30 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
         if array.dtype != np.uint8 and ((array < 0).any() or (array > 255).any()):
             raise ClientError("misfit", f"{what} has a value that is not from 0 to 255")
         return array.astype(np.uint8).reshape(space.shape)
-    with np.errstate(over="ignore"):
-        numbers = array.astype(np.float32).reshape(space.shape)
-    if not np.isfinite(numbers).all():
-        raise ClientError("misfit", f"{what} has a value that is not finite")
-    if (np.abs(numbers) > LARGEST_OBSERVATION).any():
+    numbers = np.asarray(array, np.float64)
+    if not (np.abs(numbers) <= LARGEST_OBSERVATION).all():  # false for NaN too
+        if not np.isfinite(numbers).all():
+            raise ClientError("misfit", f"{what} has a value that is not finite")
         raise ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
-    return numbers
+    return numbers.astype(np.float32).reshape(space.shape)
+
+
+def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:
+    try:
+        array = np.asarray(value).reshape(-1)
+    except (ValueError, OverflowError, RecursionError):
+        array = np.array(["not numbers"])
+    if array.dtype.kind not in ("iu" if isinstance(space, DiscreteSpace) else "iuf") or array.size != space.size:
+        kind = "integers" if isinstance(space, DiscreteSpace) else "numbers"
+        raise ClientError("misfit", f"{what} must have {space.size} {kind}, as its space is {space}")
+    if isinstance(space, DiscreteSpace):
+        fits = (array >= 0) & (array < space.counts)
+    else:
+        low = np.array([-np.inf if bound is None else bound for bound in space.low])
+        high = np.array([np.inf if bound is None else bound for bound in space.high])
+        fits = np.isfinite(array) & (array >= low) & (array <= high)
+    if not fits.all():
+        raise ClientError("misfit", f"{what} is outside its space, {space}")
 
 
 def _mask(value: Any, space: _Component, name: str) -> np.ndarray:

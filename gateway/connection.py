@@ -4,9 +4,11 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import deque
 from typing import Any
 
 from daedalus.gateway import messages
+from daedalus.gateway.channel import channel_of
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
@@ -18,22 +20,32 @@ _logger = logging.getLogger(__name__)
 
 HELLO_SECONDS = 10.0  # from the connection to the hello
 _SEND_SECONDS = 5.0  # for the last message
+_MAX_UNANSWERED = 8  # messages of one client; then reading pauses
 _MAX_FAULTS = 10  # of one client; then it is disconnected
 _OK, _FAULT, _TRY_LATER = 1000, 1008, 1013  # codes of RFC 6455
 
 
 class ClientConnection:
-    """The conversation with one client."""
+    """The conversation with one client.
+
+    The hello is read as ASGI has it. After it each message is answered as it arrives, without a switch of tasks: that
+    would take as long as the answer.
+    """
 
     def __init__(self, gateway: "asyncio.Future[Gateway]", guard: Guard, scope: Any, receive: Any, send: Any) -> None:
         """`gateway` has its result when the network is reached."""
         self._reached, self._guard, self._scope = gateway, guard, scope
         self._receive_event, self._send_event = receive, send
+        self._channel = channel_of(scope)
         self._state: State = "new"
         self._as_text = True
         self._end: ClientError | str | None = None  # why the gateway ends the connection
         self._task: asyncio.Task[Any] | None = None
+        self._seat: tuple[Gateway, ClientActor] | None = None  # while messages are answered
+        self._unanswered: deque[str | bytes] = deque()
+        self._is_waiting = False  # for an action, or for the rate limit
         self._rate = RateLimit()
+        self._faults = 0
 
     async def serve(self) -> None:
         """Serve the client until it disconnects, the run ends, or it breaks the rules too often."""
@@ -59,27 +71,31 @@ class ClientConnection:
     async def _converse(self) -> None:
         try:
             async with asyncio.timeout(HELLO_SECONDS):
-                data = await self._receive()
+                event = await self._receive_event()
         except TimeoutError:
             raise ClientError("malformed", f"no hello came within {HELLO_SECONDS:g} s") from None
-        if data is None:
+        if event["type"] == "websocket.disconnect":
             return
-        self._as_text = isinstance(data, str)
-        hello = messages.read(data, self._state)
+        text = event.get("text")
+        self._as_text = text is not None
+        hello = messages.read(event["bytes"] if text is None else text, self._state)
         assert isinstance(hello, Hello)
         self._guard.check_token(hello.name, hello.token)
         address = self._address()
         gateway = await self._reach()
         actor = await gateway.admit(hello, address, self.end)
         try:
-            self._scope["extensions"]["daedalus.limit"](actor.spaces.max_message_bytes)
-            session = gateway.session
+            self._channel.limit(actor.spaces.max_message_bytes)
+            session = gateway.run.session
             if session is not None:
-                await self._send(messages.welcome(session.run, session.spec.environment.id, hello.name))
+                self._write(messages.welcome(session.run, session.spec.environment.id, hello.name))
             _logger.info("client %s connected from %s", actor.name, address)
-            self._state = "ready"
-            await self._serve_actor(gateway, actor)
+            self._state, self._seat = "ready", (gateway, actor)
+            self._channel.divert(self._on_message, self._go_on)
+            while (await self._receive_event())["type"] != "websocket.disconnect":
+                pass
         finally:
+            self._seat = None
             gateway.leave(actor)
             _logger.info("client %s disconnected", actor.name)
 
@@ -94,43 +110,57 @@ class ClientConnection:
         host, port = self._scope.get("client") or ("", 0)
         return f"ws/{host}:{port}"
 
-    async def _serve_actor(self, gateway: Gateway, actor: ClientActor) -> None:
-        faults = 0
-        while (data := await self._receive()) is not None:
-            actor.heard_at = time.monotonic()
-            if pause := self._rate.take(actor.heard_at):
-                await asyncio.sleep(pause)
-            try:
-                await self._answer(gateway, actor, messages.read(data, self._state))
-            except ClientError as error:
-                faults += 1
-                if faults == _MAX_FAULTS:
-                    raise
-                await self._send(messages.error(error))
+    # ---------------------------------------------------------------------------------- called by the channel
 
-    async def _answer(self, gateway: Gateway, actor: ClientActor, message: messages.ClientMessage) -> None:
-        match message:
-            case Act():
-                action = await gateway.act(actor, message)
-                self._state = TRANSITIONS[self._state, "act"]
-                await self._send(messages.action(action))
-            case Reward():
-                actor.reward(message.reward)
-            case EndEpisode():
-                actor.end_episode(message)
-                self._state = TRANSITIONS[self._state, "end_episode"]
+    def _on_message(self, data: str | bytes) -> None:
+        self._unanswered.append(data)
+        self._go_on()
 
-    async def _receive(self) -> str | bytes | None:
-        """Return the next message, or None if the client disconnected."""
-        event = await self._receive_event()
-        if event["type"] == "websocket.disconnect":
-            return None
-        text = event.get("text")
-        return event["bytes"] if text is None else text
+    def _go_on(self) -> None:
+        """Answer messages in turn, until an action must be chosen, the client is too fast, or it does not read."""
+        while self._unanswered and not self._is_waiting and self._channel.is_writable and self._end is None:
+            if self._seat is None:
+                return
+            now = self._seat[1].heard_at = time.monotonic()
+            if pause := self._rate.take(now):
+                self._is_waiting = True
+                asyncio.get_running_loop().call_later(pause, self._after_pause)
+            else:
+                self._answer(*self._seat, self._unanswered.popleft())
+        self._channel.pause(len(self._unanswered) >= _MAX_UNANSWERED)
 
-    async def _send(self, message: dict[str, Any]) -> None:
-        data = messages.encode(message, as_text=self._as_text)
-        await self._send_event({"type": "websocket.send", "text" if self._as_text else "bytes": data})
+    def _after_pause(self) -> None:
+        self._is_waiting = False
+        if self._seat is not None:
+            self._answer(*self._seat, self._unanswered.popleft())
+            self._go_on()
+
+    def _answer(self, gateway: Gateway, actor: ClientActor, data: str | bytes) -> None:
+        try:
+            match message := messages.read(data, self._state):
+                case Act():
+                    gateway.act(actor, message, self._on_action)
+                    self._is_waiting = True
+                case Reward():
+                    actor.reward(message.reward)
+                case EndEpisode():
+                    actor.end_episode(message)
+                    self._state = TRANSITIONS[self._state, "end_episode"]
+        except ClientError as error:
+            self._faults += 1
+            if self._faults == _MAX_FAULTS:
+                self.end(error)
+            else:
+                self._write(messages.error(error))
+
+    def _on_action(self, action: Any) -> None:
+        self._is_waiting, self._state = False, TRANSITIONS[self._state, "act"]
+        self._write(messages.action(action))
+        if self._unanswered:
+            self._go_on()
+
+    def _write(self, message: dict[str, Any]) -> None:
+        self._channel.write(messages.encode(message, as_text=self._as_text))
 
     async def _finish(self, reason: ClientError | str) -> None:
         """Say why the connection ends, and close it."""
@@ -140,5 +170,5 @@ class ClientConnection:
             message, code = messages.error(reason), _TRY_LATER if reason.code == "unavailable" else _FAULT
         with contextlib.suppress(TimeoutError, OSError):  # OSError: the client is gone
             async with asyncio.timeout(_SEND_SECONDS):
-                await self._send(message)
+                self._write(message)
                 await self._send_event({"type": "websocket.close", "code": code})

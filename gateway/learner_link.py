@@ -12,7 +12,7 @@ from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQuer
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock
-from daedalus.gateway.policy_version import PolicyVersion
+from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Snapshot, Welcome
@@ -119,7 +119,9 @@ class LearnerLink:
         program = self._await_program(session.run)
         policy = OnnxRuntime(program, self._stop)
         self._await_snapshot()
-        self._feed.use_fetches()
+        synchronous = session.spec.algorithm.synchronous
+        if not synchronous:  # otherwise all actors wait for each version: it is pushed
+            self._feed.use_fetches()
         loaded = -1
         while True:
             newest = self._feed.newest
@@ -137,6 +139,8 @@ class LearnerLink:
             if due and time.monotonic() > self._feed.fetched_at + self._pause():
                 self._fetch_wanted = False
                 self._feed.fetch()
+            if synchronous and time.monotonic() > self._feed.confirmed_at + _MISSED_PUSH_SECONDS:
+                self._feed.request_confirmation()
             self._feed.read()
 
     def _pause(self) -> float:

@@ -53,6 +53,7 @@ class Act(NamedTuple):
     observation: Any
     action_mask: Any
     reward: float  # of the last action; it is added to those that came before
+    override: Any = None  # the action that is played in place of the policy's
 
 
 class Reward(NamedTuple):
@@ -73,10 +74,11 @@ ClientMessage = Hello | Act | Reward | EndEpisode
 
 _FIELDS: dict[str, tuple[set[str], set[str]]] = {  # required and optional fields of each type
     "hello": ({"version", "name", "observations", "actions"}, {"token"}),
-    "act": ({"observation"}, {"action_mask", "reward"}),
+    "act": ({"observation"}, {"action_mask", "reward", "override"}),
     "reward": ({"reward"}, set()),
     "end_episode": ({"terminated"}, {"observation", "reward"}),
 }
+_to_json = json.JSONEncoder(separators=(",", ":")).encode
 _RAW_FIELDS = {"type", "version", "name", "token"}
 _ALLOWED = {kind: {"type"} | required | optional for kind, (required, optional) in _FIELDS.items()}
 
@@ -97,7 +99,8 @@ def read(data: str | bytes, state: State) -> ClientMessage:
         raise ClientError("malformed", f"{kind} lacks the field {min(missing)!r}")
     match kind:
         case "act":
-            return Act(message["observation"], message.get("action_mask"), _number(message.get("reward", 0.0)))
+            reward = _number(message.get("reward", 0.0))
+            return Act(message["observation"], message.get("action_mask"), reward, message.get("override"))
         case "reward":
             return Reward(_number(message["reward"]))
         case "end_episode":
@@ -161,7 +164,7 @@ def _shown(value: Any) -> str:
 def encode(message: dict[str, Any], *, as_text: bool) -> str | bytes:
     """Return a message of the gateway as JSON or msgpack."""
     if as_text:
-        return json.dumps(message, separators=(",", ":"))
+        return _to_json(message)
     packed = msgpack.packb(message)
     assert packed is not None  # its annotation is for streams too
     return packed

@@ -12,6 +12,7 @@ from pathlib import Path
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidState
 from websockets.http11 import Request as HandshakeRequest
 
 from daedalus.gateway.app import Application
@@ -39,26 +40,55 @@ class PromptHttp(H11Protocol):
             self.transport.close()
 
 
-class LimitedWebSocket(WebSocketsSansIOProtocol):
-    """A WebSocket whose largest message the application sets, before memory is allocated for it."""
+class OurWebSocket(WebSocketsSansIOProtocol):
+    """A WebSocket that is a Channel (channel.py) to the application."""
+
+    _on_message: Callable[[str | bytes], None] | None = None  # after `divert`
+    _on_writable: Callable[[], None] | None = None
 
     def handle_connect(self, event: HandshakeRequest) -> None:
-        """Give the application the function that sets the limit."""
+        """Give the application the channel."""
         super().handle_connect(event)
         if self.response.status_code == 101:
-            ours = {"daedalus.limit": self._set_limit, "daedalus.stream": self._become_stream}
-            self.scope["extensions"] = {**(self.scope["extensions"] or {}), **ours}  # type: ignore[typeddict-item] - extensions may have any name
+            self.scope["extensions"] = {**(self.scope["extensions"] or {}), "daedalus": self}  # type: ignore[typeddict-item] - extensions may have any name
 
     def send_receive_event_to_app(self) -> None:
-        """Queue a message; pause reading only if the application is behind, which costs two system calls."""
+        """Deliver a message; pause reading only if the application is behind, which costs two system calls."""
+        if self._on_message is not None and not self.close_sent:
+            self._deliver(self._on_message)
+            return
         paused = self.read_paused
         self.read_paused = paused or self.queue.qsize() < _QUEUED_MESSAGES
         super().send_receive_event_to_app()
         self.read_paused = paused or self.queue.qsize() > _QUEUED_MESSAGES
 
-    def _become_stream(self, size: int) -> None:
-        """Let the client wait for any time: TCP detects a host that vanished, in place of pings."""
-        self._set_limit(size)
+    def _deliver(self, on_message: Callable[[str | bytes], None]) -> None:
+        data = self.frames[0] if len(self.frames) == 1 else b"".join(self.frames)
+        if self.curr_msg_data_type == "bytes":
+            message: str | bytes = data
+        else:
+            try:
+                message = data.decode()
+            except UnicodeDecodeError:
+                self._on_message = None  # uvicorn closes the connection
+                super().send_receive_event_to_app()
+                return
+        self.frames = []
+        on_message(message)
+
+    def resume_writing(self) -> None:
+        """Tell the application that the client reads again."""
+        super().resume_writing()
+        if self._on_writable is not None:
+            self._on_writable()
+
+    def limit(self, size: int) -> None:
+        """See Channel."""
+        self.conn.max_message_size = size
+
+    def become_stream(self, size: int) -> None:
+        """See Channel. TCP detects a host that vanished, in place of pings."""
+        self.limit(size)
         self.stop_keepalive()
         connection = self.transport.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -66,8 +96,39 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
             if hasattr(socket, name):
                 connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
-    def _set_limit(self, size: int) -> None:
-        self.conn.max_message_size = size
+    def divert(self, on_message: Callable[[str | bytes], None], on_writable: Callable[[], None]) -> None:
+        """See Channel."""
+        queued = [self.queue.get_nowait() for _ in range(self.queue.qsize())]
+        self._on_message, self._on_writable = on_message, on_writable
+        self.pause(False)
+        for event in queued:
+            if event["type"] == "websocket.receive":
+                text = event.get("text")
+                on_message(event.get("bytes") or b"" if text is None else text)
+            else:
+                self.queue.put_nowait(event)
+
+    @property
+    def is_writable(self) -> bool:
+        """See Channel."""
+        return self.writable.is_set()
+
+    def write(self, data: str | bytes) -> None:
+        """See Channel."""
+        if self.close_sent or self.transport.is_closing():
+            return
+        with contextlib.suppress(InvalidState):  # the client has closed the connection
+            if isinstance(data, str):
+                self.conn.send_text(data.encode())
+            else:
+                self.conn.send_binary(data)
+            self.transport.write(b"".join(self.conn.data_to_send()))
+
+    def pause(self, paused: bool) -> None:
+        """See Channel."""
+        if paused != self.read_paused and not self.transport.is_closing():
+            self.read_paused = paused
+            (self.transport.pause_reading if paused else self.transport.resume_reading)()
 
 
 class Server(uvicorn.Server):
@@ -77,7 +138,7 @@ class Server(uvicorn.Server):
         config = uvicorn.Config(
             application,
             http=PromptHttp,
-            ws=LimitedWebSocket,
+            ws=OurWebSocket,
             ws_max_size=MAX_HELLO_BYTES,
             ws_per_message_deflate=False,
             ws_ping_interval=_PING_SECONDS,
@@ -110,6 +171,9 @@ class Server(uvicorn.Server):
         self.should_exit = True
         ends[1].cancel()
         await ends[0]
+        for connection in list(self.server_state.connections):  # of clients that did not close theirs in time
+            connection.transport.abort()
+        await asyncio.sleep(0)  # the loop ends them now
 
 
 def tls_context(directory: Path) -> ssl.SSLContext:

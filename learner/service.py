@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daedalus.learner.ranks.errors import RankLostError
+from daedalus.learner.ranks.opening import OpenRanks, one_process
 from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
@@ -21,6 +23,7 @@ from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.rollout_length import check_rollout_length
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, write_json
@@ -31,13 +34,14 @@ from daedalus.learner.serving.orders import Orders
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.messages import Gradient, Rollout, Upload
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
+from daedalus.protocol.uploads import Gradient, Rollout, Upload
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
+    from daedalus.learner.ranks.leader import Distribution
     from daedalus.learner.training.checkpoint import Checkpoint
     from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
@@ -78,6 +82,7 @@ class LearnerService:
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
         user_metrics: UserMetrics | None = None,
+        open_ranks: OpenRanks = one_process,
     ) -> None:
         """Construct the service.
 
@@ -95,9 +100,12 @@ class LearnerService:
           modules: modules that may be imported for the policy.
           certificate_days_left: function that returns the days until the certificate of this process expires.
           user_metrics: metrics of the program that started the run.
+          open_ranks: connects the other processes of the learner.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._modules = open_writers, modules
+        self._open_ranks = open_ranks
+        self._ranks: Distribution | None = None  # None: not connected yet
         self._restored, self._initial = restored, initial if restored is None else None
         self._counters = RunCounters(spec.training.target_episodes)
         self._annealing = Annealing(budget=spec.training.env_steps)
@@ -107,6 +115,7 @@ class LearnerService:
         self.learner_epoch = epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch)
         self._heartbeat = Heartbeat(directory)
+        self._event_file = EventFile(directory)
         self._health = Health(
             started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
         )
@@ -143,7 +152,8 @@ class LearnerService:
         Once training has begun, the run always ends with a checkpoint and a summary. Raises TransportError if another
         learner serves the run, CheckpointMismatchError if a checkpoint does not fit the settings, NetworkError if
         the policy or the algorithm does not support the spaces, SettingsError if the device is not available or
-        rollouts are too short for masked actions.
+        rollouts are too short for masked actions, RankLostError or RanksDisagreeError of the other processes of the
+        learner.
         """
         try:
             self._server.open()
@@ -151,12 +161,13 @@ class LearnerService:
             from daedalus.learner.training.learner import Learner
 
             fleet = self._server.fleet
-            if fleet.spaces is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+            self._ranks = ranks = self._open_ranks(self._spec, self._stop)
+            if ranks is None or (fleet.spaces is None and not self._await_actor()):
                 return self._stopped_without_actors()
             spaces = fleet.spaces
             assert spaces is not None
             check_rollout_length(self._spec, spaces)
-            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules)
+            learner = Learner(self._spec.training, self._spec.policy, spaces, self._modules, ranks)
             if self._restored is not None:
                 policy = self._restored.policy
                 learner.restore(policy.policy_version, policy.weights, self._restored.state)
@@ -170,12 +181,29 @@ class LearnerService:
             checkpointer = self._checkpointer(learner)
             if self._initial is not None:
                 checkpointer.save()  # a learner that is killed before its first checkpoint continues from this one
-            if self._restored is None and not self._server.await_actor(self._stop, self._heartbeat.beat):
+            ranks.begin(spaces, learner.shared_state)
+            if self._restored is None and not self._await_actor():
                 return self._stopped_without_actors()
             return self._learn(learner, checkpointer)
+        except RankLostError:
+            if not self._stop.is_set():  # a signal may end all processes of the learner at once
+                raise
+            return self._stopped_without_actors()
         finally:
             self._server.close(_STOPPED)  # unless it is closed
             self._heartbeat.clear()
+            if self._ranks is not None:
+                self._ranks.close()
+
+    def _await_actor(self) -> bool:
+        """Wait until an actor has joined, and return whether one has; False if the run is stopped first."""
+        return self._server.await_actor(self._stop, self._beat)
+
+    def _beat(self) -> None:
+        """Show the supervisor and the other ranks that this process works."""
+        self._heartbeat.beat()
+        if self._ranks is not None:
+            self._ranks.wait()
 
     def _stopped_without_actors(self) -> Outcome:
         _logger.info("stopped before the first actor joined")
@@ -218,10 +246,13 @@ class LearnerService:
         """Run the main loop, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
-        finished, saved = False, None
+        finished, saved, seconds_to_target = False, None, None
         try:
             seconds_to_target = self._loop(learner, checkpointer, recorder)
             finished = self._is_finished(seconds_to_target)
+        except RankLostError:
+            if not self._stop.is_set():  # a signal may end all processes of the learner at once
+                raise
         finally:
             ended = time.monotonic()
             self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
@@ -258,7 +289,7 @@ class LearnerService:
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
-            self._heartbeat.beat()
+            self._beat()
             self._update(learner)
             now = time.monotonic()
             if seconds_to_target is None and self._is_solved():
@@ -280,6 +311,7 @@ class LearnerService:
         row = self._reporter.row(learner, now, last=last)
         self._server.history.add(row)
         recorder.record(row, self._reporter.details(learner))
+        self._event_file.add(self._server.events.take_new())
 
     def _is_solved(self) -> bool:
         """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""

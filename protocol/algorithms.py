@@ -66,9 +66,7 @@ ALGORITHMS = {
         max_lag_batches=8,  # measured: docs/results.md
     ),
     "impala": AlgorithmRecord(summary="asynchronous, corrected for policy lag", corrected=True),
-    "appo": AlgorithmRecord(
-        summary="as impala, several passes over each batch", corrected=True, passes_over_batch=True
-    ),
+    "appo": AlgorithmRecord(summary="asynchronous PPO: several passes over each batch", passes_over_batch=True),
     "one_step_q": _of_action_values("Q-learning with one-step targets"),
     "one_step_sarsa": _of_action_values("as one_step_q, on the action that was taken next", next_action=True),
     "n_step_q": _of_action_values("Q-learning with n-step targets"),

@@ -30,9 +30,10 @@ from pydantic import ValidationError
 
 from daedalus.protocol import schema
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import CompactSnapshot, Gradient, Message, Origin, Program, Rollout
+from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program
+from daedalus.protocol.uploads import Gradient, Rollout
 
-PROTOCOL_VERSION = 8
+PROTOCOL_VERSION = 9
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")

@@ -149,7 +149,7 @@ class TrainingSpec(Specification):
     """How the learner learns, and when it stops."""
 
     algorithm: Annotated[str, Field(max_length=200), AfterValidator(check_algorithm)] = "impala"
-    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: as `impala`, in several passes;
+    """`a2c`: synchronous; `a3c`: asynchronous; `impala`: with V-trace; `appo`: PPO, asynchronous, in several passes;
     `one_step_q`, `one_step_sarsa` and `n_step_q`: action values, for one discrete action. Or `module:Class` for your
     own."""
     algorithm_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
@@ -172,7 +172,7 @@ class TrainingSpec(Specification):
     """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
     max_policy_lag: NaturalInt | None = None
     """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches for `impala` and
-    `appo`, of 8 for the others; of more if `collection.actors` can have more than half as many in flight."""
+    `appo`, of 8 for the others; of more where the live actors can have more than half as many in flight."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""
@@ -180,17 +180,21 @@ class TrainingSpec(Specification):
     """Decay of the multi-step targets. 1: n-step returns; below 1: lambda-returns. Not for `one_step_q` and
     `one_step_sarsa`."""
     rho_clip: Annotated[float, Field(gt=0.0)] = 1.0
-    """Upper bound of the importance weights rho: of V-trace in `impala` and `appo`, and of the policy gradient in `a2c`
-    and `a3c` where actors explore."""
+    """Upper bound of the importance weights rho: of V-trace in `impala`, and of the policy gradient in `a2c`, `a3c` and
+    `appo` where actors explore."""
     trace_clip: Annotated[float, Field(gt=0.0)] = 1.0
-    """Upper bound of V-trace's trace coefficients c; `impala` and `appo` only."""
+    """Upper bound of V-trace's trace coefficients c; `impala` only."""
     passes: Annotated[int, Field(ge=1, le=64)] = 3
     """Passes over each batch; `appo` only."""
     minibatches: Annotated[int, Field(ge=1, le=4096)] = 4
     """Minibatches that each pass shuffles the batch into, one update for each; `appo` only. A batch with fewer parts
     (environments with memory, else valid rows) makes as many minibatches as it has parts."""
     clip_range: Annotated[float, Field(gt=0.0)] = 0.2
-    """Clip range of the probability ratio; `appo` only."""
+    """Clip range of the ratio between the probabilities of the new and the proximal policy; `appo` only."""
+    proximal_policy: Literal["newest", "behaviour"] = "newest"
+    """Policy that the clip keeps the new one near: the `newest` before the batch, or the `behaviour` policy, which
+    played the row. With `behaviour` the clip bounds the change over the policy lag too. Where actors explore it is
+    `newest`. `appo` only."""
     target_period: PositiveInt = 100
     """Updates between two copies of the network to the target network, where the algorithm has one."""
 
@@ -418,7 +422,11 @@ class RunSpec(Specification):
 
     @property
     def policy_lag_bound(self) -> int:
-        """Largest policy lag that is learned from, in updates.
+        """Largest policy lag that is learned from, in updates, with the expected actors."""
+        return self.policy_lag_bound_with(0)
+
+    def policy_lag_bound_with(self, live: int) -> int:
+        """Return the largest policy lag that is learned from, in updates, with so many live actors.
 
         Where the learner is slower than its actors, all rollouts in flight wait for it. Unless it is set, the bound
         leaves room for twice as many: otherwise every rollout of an actor slower than the others would be too old.
@@ -426,5 +434,6 @@ class RunSpec(Specification):
         training = self.training
         if training.max_policy_lag is not None:
             return training.max_policy_lag
-        in_flight = math.ceil(self.collection.actors * self.collection.window / self.batch_rollouts)  # batches
+        actors = max(self.collection.actors, live)
+        in_flight = math.ceil(actors * self.collection.window / self.batch_rollouts)  # batches
         return max(self.algorithm.max_lag_batches, 2 * in_flight) * training.updates_per_batch

@@ -5,6 +5,7 @@ from daedalus.policy.user_modules import UserModules
 TEST_MODULES = UserModules(
     frozenset(
         {
+            "absent_environment",
             "corridor",
             "corridor_wrappers",
             "counting_environment",

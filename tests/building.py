@@ -9,9 +9,10 @@ from plain import vector_spaces
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.messages import Join, Rollout, RolloutIdentity
+from daedalus.protocol.messages import Join
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 EPOCH = 77
 ROWS, ENVIRONMENTS = 6, 3

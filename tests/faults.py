@@ -17,7 +17,8 @@ from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Snapshot, Welcome
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.zenoh_transport import connect
 
 CARTPOLE = vector_spaces(4, 2)

@@ -14,7 +14,8 @@ from processes import LIMIT
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.gateway.app import application
-from daedalus.gateway.gateway import Gateway, GatewayConfig
+from daedalus.gateway.config import GatewayConfig
+from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context

@@ -24,13 +24,13 @@ from daedalus.protocol.messages import (
     Message,
     Program,
     Refusal,
-    Rollout,
     Snapshot,
     SnapshotRequest,
     Welcome,
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

@@ -14,8 +14,8 @@ from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.training.checkpoint import load_newest
-from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ENDLESS = 10**9

@@ -16,12 +16,14 @@ import gymnasium
 import numpy as np
 import pytest
 from processes import Running, processes_mentioning, until
+from recorded_runs import record
 from saved_runs import CARTPOLE, COUNTING, save
 
 import daedalus
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
+from daedalus.cli.commands.evaluate import main as evaluate_command
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.saved_policy import NoPolicyError, find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
@@ -144,6 +146,8 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
         ({"preset": "cartpole", "settings": {"seed": 1}}, "settings 'seed': 'seed' has no section"),
         ({"preset": "cartpole", "settings": {"training.sed": 1}}, "unknown setting training.sed: did you mean seed"),
         ({"preset": "cartpole", "run_dir": "."}, "run directory . exists"),
+        ({"preset": "cartpole", "log": "tensorboard"}, "log: unknown tracker 'tensorboard': choose from wandb, mlflow"),
+        ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
     ],
 )
 def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
@@ -169,6 +173,53 @@ def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
         assert any((tmp_path / "interrupted-run" / "checkpoints").iterdir())
     finally:
         running.end()
+
+
+# ---------------------------------------------------------------------------------- evaluate and read_metrics
+
+
+def test_evaluate_returns_what_the_command_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save(tmp_path, CARTPOLE, 3)
+    result = daedalus.evaluate(tmp_path, episodes=4, seed=9, actions="sampled", backend="envpool")
+    assert capsys.readouterr() == ("", "")
+    words = ["--episodes", "4", "--seed", "9", "--actions", "sampled", "--backend", "envpool", "--json"]
+    assert evaluate_command([str(tmp_path), *words]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (result.returns.tolist(), result.lengths.tolist()) == (printed["returns"], printed["lengths"])
+    assert result.return_mean == printed["return_mean"] == result.returns.mean()
+    assert (result.policy_version, result.seed, result.actions, result.backend) == (3, 9, "sampled", "envpool")
+    assert (result.environment, result.video) == ("CartPole-v1", None)
+
+
+def test_evaluate_records_a_video(tmp_path: Path) -> None:
+    pytest.importorskip("PIL")
+    save(tmp_path, CARTPOLE, 3)
+    result = daedalus.evaluate(tmp_path, video=tmp_path / "play.gif", max_seconds=0.2, width=32)
+    assert result.video == tmp_path / "play.gif"
+    assert (tmp_path / "play.gif").read_bytes().startswith(b"GIF89a")
+    assert len(result.returns) == 1
+
+
+def test_invalid_arguments_of_evaluate_are_refused(tmp_path: Path) -> None:
+    save(tmp_path / "run", COUNTING, 1)
+    with pytest.raises(ValueError, match="name either a run directory"):
+        daedalus.evaluate()
+    with pytest.raises(ValueError, match="choose at least 1"):
+        daedalus.evaluate(tmp_path / "run", episodes=0)
+    with pytest.raises(EnvironmentSetupError, match=r"pass allow_modules=\['counting_environment'\]"):
+        daedalus.evaluate(tmp_path / "run", episodes=1)
+    assert len(daedalus.evaluate(tmp_path / "run", episodes=1, allow_modules=["counting_environment"]).returns) == 1
+
+
+def test_read_metrics_returns_the_columns_without_rows_that_a_resumed_run_repeated(tmp_path: Path) -> None:
+    run = record(tmp_path / "run", returns=(1.0, None, 3.0, 4.0), env_steps=(1000, 3000, 2000, 4000))
+    metrics = daedalus.read_metrics(str(run))
+    assert metrics["env_steps"].tolist() == [1000.0, 2000.0, 4000.0]
+    assert metrics["episode_return_mean"].tolist() == [1.0, 3.0, 4.0]
+    with pytest.raises(daedalus.RunDataError, match="does not exist: name a run directory"):
+        daedalus.read_metrics(tmp_path / "nowhere")
+    with pytest.raises(daedalus.RunDataError, match="is a folder of run directories: name one of them"):
+        daedalus.read_metrics(tmp_path)
 
 
 # ------------------------------------------------------------------------------------------ load_policy

@@ -79,8 +79,10 @@ def test_no_decision_depends_on_the_system_clock() -> None:
     }
     assert users == {
         ("tensorboard_writer.py", "time.time"),
+        ("mlflow_tracker.py", "time.time"),  # dates metrics
         ("logs.py", "time.strftime"),  # dates log records
         ("events.py", "time.time"),  # dates events
+        ("event_file.py", "time.time"),  # dates restarts
         ("run_directory.py", "time.strftime"),
         ("certificate_authority.py", "datetime.datetime.now"),  # certificates are valid between two dates
         ("credentials.py", "time.time"),
@@ -98,6 +100,7 @@ def test_no_decision_depends_on_the_system_clock() -> None:
         ("cli.commands.learner", {"torch", "daedalus.actor", "gymnasium"}),
         ("cli.commands.train", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime"}),
         ("cli.train_function", {"torch", "daedalus.actor", "gymnasium", "zenoh", "onnxruntime", "shtab"}),
+        ("cli.evaluate_function", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
         ("actor.evaluation.loaded_policy", {"torch", "daedalus.learner", "daedalus.algorithms", "zenoh"}),
         ("cli.commands.router", {"torch", "daedalus.actor", "gymnasium", "onnxruntime"}),
         ("cli.commands.exporter", {"torch", "daedalus.actor", "gymnasium", "onnxruntime", "prometheus_client"}),

@@ -45,6 +45,7 @@ class ClientRows:
         self._last: Observed | None = None  # the newest observation
         self._acted = False  # the current row has an action and no outcome yet
         self._idle = False  # the row that has begun is not written
+        self._overridden = False  # another action than the policy's is played in it
         self._ending = False  # the episode ends with the current row, which late rewards may still change
         self._episode_ended = False  # the next row is a reset row
         self._cut: Literal["", "resets", "restarts"] = ""  # after `cut`: what the next observation does to the row
@@ -93,20 +94,21 @@ class ClientRows:
           overridden: another action than the policy's is played: the row is not learned from.
           idle: drop the rows of the unfinished rollout and this one; the memory of the policy still goes on.
         """
+        self._begin_row(overridden=overridden, idle=idle)
+        actions = self._writer.act()
+        return actions if self._has_acted() else None
+
+    def begin_row(self, *, overridden: bool = False, idle: bool = False) -> RowInputs:
+        """Return what the policy chooses from: see RolloutWriter. The arguments are those of `choose`."""
+        self._begin_row(overridden=overridden, idle=idle)
+        return self._writer.begin_row()
+
+    def _begin_row(self, *, overridden: bool, idle: bool) -> None:
         if idle:
             self._writer.discard()
         # No rollout begins with an overridden row: in each there is a row to learn from.
         self._idle = idle or (overridden and self.is_between_rollouts)
-        actions = self._writer.act()
-        if not self._has_acted():
-            return None
-        if overridden:
-            self._writer.override()
-        return actions
-
-    def begin_row(self) -> RowInputs:
-        """Return what the policy chooses from: see RolloutWriter."""
-        return self._writer.begin_row()
+        self._overridden = overridden
 
     def take_choice(self, choice: Choice) -> bool:
         """Write a choice; return False if it was for a reset row, whose action has no effect: choose once more."""
@@ -120,6 +122,8 @@ class ClientRows:
             self._record(self._last)
             return False
         self._acted = True
+        if self._overridden:
+            self._writer.override()
         return True
 
     def env_action(self, actions: dict[str, np.ndarray]) -> Any:

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 
 class Collector(Protocol):

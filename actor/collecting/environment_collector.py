@@ -9,9 +9,10 @@ from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 
 class EnvironmentCollector:

@@ -10,9 +10,9 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
-from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 
 class RowInputs(NamedTuple):

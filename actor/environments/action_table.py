@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.bounds import continuous_space, unscaled
+from daedalus.actor.environments.bounds import BoundedActions, continuous_space
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
 
@@ -41,15 +41,16 @@ class TableActions:
         self._rest = np.setdiff1d(np.arange(size), self._columns)
         self._table = _checked_table(table, self._columns, space)
         self._space = space
-        self._rest_space = gymnasium.spaces.Box(
+        rest_space = gymnasium.spaces.Box(
             space.low.ravel()[self._rest],
             space.high.ravel()[self._rest],
             dtype=space.dtype,  # pyright: ignore[reportArgumentType]  # gymnasium's annotation lacks np.dtype
         )
+        self._rest_actions = BoundedActions(rest_space)
         choice = DiscreteSpace(counts=(len(table),))
         self.spaces: dict[str, ActionSpace] = {"action": choice}
         if self._rest.size:
-            self.spaces = {_REST: continuous_space(self._rest_space), _CHOICE: choice}
+            self.spaces = {_REST: continuous_space(rest_space), _CHOICE: choice}
 
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
@@ -58,7 +59,7 @@ class TableActions:
             return chosen.reshape(len(chosen), *self._space.shape)
         actions = np.empty((len(values[_CHOICE]), self._columns.size + self._rest.size), self._space.dtype)
         actions[:, self._columns] = self._table[values[_CHOICE][:, 0]]
-        actions[:, self._rest] = unscaled(values[_REST], self._rest_space)
+        actions[:, self._rest] = self._rest_actions.of(values[_REST])
         return actions.reshape(len(actions), *self._space.shape)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces as gym
 from pydantic import ValidationError
 
-from daedalus.actor.environments.bounds import continuous_space, unscaled
+from daedalus.actor.environments.bounds import BoundedActions, continuous_space
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.leaves import Leaf, LeftOut, leaves
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
@@ -108,6 +108,9 @@ class ActionComponents:
             raise EnvironmentSetupError(
                 f"action space {described(space)} is not supported: {reason_of(error)}"
             ) from None
+        self._bounded = {
+            leaf.name: BoundedActions(leaf.space) for leaf in self._leaves if isinstance(leaf.space, gym.Box)
+        }
 
     def env_actions(self, values: dict[str, np.ndarray]) -> Any:
         """Return the environment's batched actions for values {name: [E, D]} of all components."""
@@ -133,8 +136,8 @@ class ActionComponents:
                 return values[:, 0] + space.start
             case gym.MultiDiscrete() as space:
                 return (values + space.start.ravel()).reshape(len(values), *space.shape).astype(space.dtype)
-            case gym.Box() as space:
-                return unscaled(values, space)
+            case gym.Box():
+                return self._bounded[leaf.name].of(values)
             case space:
                 return values.reshape(len(values), *(space.shape or ())).astype(space.dtype)
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from daedalus.protocol.keys import is_name
-from daedalus.protocol.messages import MAX_INFO_NAMES, MAX_INFO_VALUES
+from daedalus.protocol.uploads import MAX_INFO_NAMES, MAX_INFO_VALUES
 
 
 class EpisodeInfo:

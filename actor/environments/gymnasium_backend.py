@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
@@ -17,7 +17,9 @@ from daedalus.actor.environments.environment_errors import (
     unknown_environment,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
+from daedalus.actor.environments.rendering import render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
@@ -43,6 +45,8 @@ class EnvironmentFactory:
         kwargs = _kwargs(spec)
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
+        if self.render_mode == "rgb_array":
+            render_without_display()
         late_rendered = registered.entry_point == _CAR_RACING and spec.wrap is None
         environment = gymnasium.make(
             _late_rendered(registered, spec.backend) if late_rendered else registered,
@@ -185,7 +189,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
         return EnvironmentProcesses([factory] * count)
-    return SyncVectorEnv([factory] * count, autoreset_mode=AutoresetMode.NEXT_STEP)
+    return EnvironmentsInTurn([factory] * count)
 
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:

@@ -63,6 +63,11 @@ class EpisodeCamera:
     def _film(self, picture: np.ndarray) -> None:
         self._picture = picture
 
+    @property
+    def spaces(self) -> Spaces:
+        """The run's spaces."""
+        return self._environments.spaces
+
     def close(self) -> None:
         """Close the environment."""
         self._environments.close()

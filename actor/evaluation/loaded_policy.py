@@ -14,6 +14,7 @@ from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
@@ -102,35 +103,44 @@ def load_policy(
     *,
     newest: bool = False,
     pretrained: str | None = None,
+    from_hub: str | None = None,
+    revision: str | None = None,
     allow_modules: Collection[str] = (),
     observation_space: gymnasium.Space | None = None,
     action_space: gymnasium.Space | None = None,
 ) -> Policy:
-    """Load the policy of a run, or one that ships with the package.
+    """Load the policy of a run, one that ships with the package, or one on the Hub.
 
     Args:
       directory: a run directory, or one of its checkpoints; of a run the best checkpoint, else the newest.
       newest: load the newest checkpoint of the run, not the best.
       pretrained: the name of a policy that ships with the package, in place of a directory.
+      from_hub: USER/NAME of a policy on the Hugging Face Hub that `daedalus push` uploaded, in place of a directory.
+      revision: branch, tag or commit on the Hub (default: the newest of main).
       allow_modules: modules that may be imported to make the run's environment: those of an environment `module:Id` and
         of a wrapper `module:function`. Importing a module runs it, and a file named it.
       observation_space, action_space: of the environment to play, if it was changed by wrappers or cannot be made here;
         by default the run's environment is made once to learn its spaces.
 
     Raises DamagedError if there is no checkpoint that can be read, NoPolicyError for an unknown pretrained name,
-    EnvironmentSetupError if the environment cannot be made, needs a module that is not allowed or is not the one of the
-    run, and ValueError if not exactly
-    one of directory and pretrained is given, or only one of the spaces.
+    HubError if a policy cannot be pulled, EnvironmentSetupError if the environment cannot be made, needs a module that
+    is not allowed or is not the one of the run, and ValueError if not exactly one of directory, pretrained and from_hub
+    is given, or only one of the spaces.
     """
-    if (directory is None) == (pretrained is None):
-        raise ValueError("name either a run directory or a pretrained policy")
+    if sum(source is not None for source in (directory, pretrained, from_hub)) != 1:
+        raise ValueError("name either a run directory or a pretrained policy or one on the Hub (from_hub)")
+    if revision is not None and from_hub is None:
+        raise ValueError("revision is that of a policy on the Hub: give from_hub too")
     if (observation_space is None) != (action_space is None):
         raise ValueError("give both observation_space and action_space, or neither")
-    path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
+    if from_hub is not None:
+        path = pull(from_hub, revision)
+    else:
+        path = Path(directory) if directory is not None else pretrained_directory(pretrained or "")
     saved = find_policy(path, newest)
     if observation_space is None or action_space is None:
         spec = as_on_gymnasium(saved.spec.environment).model_copy(update={"processes": False})
-        modules = UserModules(frozenset(allow_modules), f"the run of {saved.directory}")
+        modules = UserModules(frozenset(allow_modules), f"the run of {from_hub or saved.directory}")
         try:
             modules.check(spec.user_modules)
         except ModuleNotAllowedError as error:

@@ -28,9 +28,10 @@ from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Join, Rollout, RolloutIdentity, Snapshot, Welcome
+from daedalus.protocol.messages import Join, Snapshot, Welcome
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)

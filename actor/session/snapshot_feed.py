@@ -120,7 +120,7 @@ class SnapshotFeed:
             self._apply(message, at)
 
     def _received(self) -> Iterator[tuple[Message, float]]:
-        """Yield the messages that have come, and the monotonic time of the request of each; a push has that of now."""
+        """Yield each message that has come, with the monotonic time of its request; a push has the present time."""
         for fetcher in (self._compact, self._whole, self._confirming):
             message = None if fetcher is None else fetcher.take()
             if fetcher is not None and message is not None:

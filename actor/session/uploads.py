@@ -6,9 +6,9 @@ import numpy as np
 
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.policy.user_modules import UserModuleError, UserModules
-from daedalus.protocol.messages import Rollout, Upload
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, Upload
 
 
 class Uploads(Protocol):

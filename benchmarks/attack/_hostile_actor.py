@@ -8,8 +8,9 @@ import numpy as np
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import LEARNER_LIMITS
-from daedalus.protocol.messages import Acknowledgement, Join, Message, Rollout, RolloutIdentity, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Message, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.zenoh_transport import connect
 
 _SPACES = Spaces(

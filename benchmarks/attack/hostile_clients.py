@@ -62,10 +62,10 @@ def hostile_clients() -> Verdict:
         gateway.expect("follows run")
         until = time.monotonic() + 5.0 + _SECONDS
         steps: list[float] = []
-        honest = threading.Thread(target=_play, args=(port, until, steps))
+        honest = threading.Thread(target=play, args=(port, until, steps))
         honest.start()
         here.wait_for_training("honest")
-        before = _megabytes(gateway.process.pid)
+        before = megabytes(gateway.process.pid)
         attackers = [threading.Thread(target=_attack, args=(port, until, seed)) for seed in range(4)]
         idle = []
         for thread in attackers:
@@ -75,7 +75,7 @@ def hostile_clients() -> Verdict:
                 idle.append(socket.create_connection(("127.0.0.1", port), 5.0))
         for thread in (*attackers, honest):
             thread.join()
-        grown = _megabytes(gateway.process.pid) - before
+        grown = megabytes(gateway.process.pid) - before
         for connection in idle:
             connection.close()
         escaped = all(line.isprintable() for line in gateway.lines)
@@ -88,7 +88,8 @@ def hostile_clients() -> Verdict:
     )
 
 
-def _play(port: int, until: float, steps: list[float]) -> None:
+def play(port: int, until: float, steps: list[float]) -> None:
+    """Be an honest client until a monotonic time; add the seconds of each step."""
     with connect(f"ws://127.0.0.1:{port}/actor") as client:
         client.send(json.dumps({**_HELLO, "name": "honest"}))
         client.recv(timeout=60)
@@ -119,7 +120,8 @@ def _attack_once(port: int, name: str, chosen: random.Random) -> None:
                 client.recv(timeout=0.2)
 
 
-def _megabytes(process: int) -> float:
+def megabytes(process: int) -> float:
+    """Return the memory of a process."""
     status = Path(f"/proc/{process}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0]) / 1024
 

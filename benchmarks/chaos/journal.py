@@ -11,7 +11,8 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import Acknowledgement
+from daedalus.protocol.uploads import Rollout
 from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.interface import Transport
 

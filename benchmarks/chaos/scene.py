@@ -131,7 +131,8 @@ class Scene:
 
 @contextlib.contextmanager
 def scene() -> Iterator[Scene]:
-    """Create a Scene and close it at the end."""
+    """Create a Scene and close it at the end, also after SIGTERM: its processes must not stay."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     made = Scene()
     try:
         yield made

@@ -10,7 +10,6 @@ actors send as fast as they get answers.
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import time
@@ -20,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.chaos.scene import ENDLESS, Scene, resident_mib, say, scene
-from benchmarks.running import machine, table
+from benchmarks.running import cpu_seconds, machine, table
 
 _PER_PROCESS = 250
 _HEADER = (
@@ -123,7 +122,7 @@ def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str,
         swarm = Swarm(here, count, pace, seconds)
         try:
             swarm.await_ready()
-            began, before = time.monotonic(), {name: _cpu_seconds(pid) for name, pid in pids.items()}
+            began, before = time.monotonic(), {name: cpu_seconds(pid) for name, pid in pids.items()}
             swarm.go()
             results = swarm.results()
             took = time.monotonic() - began
@@ -135,7 +134,7 @@ def _measured(here: Scene, count: int, rate: float, seconds: float) -> dict[str,
             continue
         row["rate"] = accepted / seconds
         for name, pid in pids.items():
-            row[f"{name}_cpu"] = 1000 * (_cpu_seconds(pid) - before[name]) / max(accepted, 1)
+            row[f"{name}_cpu"] = 1000 * (cpu_seconds(pid) - before[name]) / max(accepted, 1)
             row[f"{name}_mib"] = resident_mib(pid)
         latencies = [latency for result in results for latency in result["latencies"]]
         row["ack_50"], row["ack_99"] = (1000 * np.quantile(latencies, (0.5, 0.99))).tolist()
@@ -163,11 +162,6 @@ def _snapshots(notes: Path, came: Sequence[Sequence[tuple[int, float]]], began: 
         "last_50": 1000 * float(np.median(last)),
         "missed": 1 - len(every) / (len(delays) * len(came)),
     }
-
-
-def _cpu_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _cells(row: dict[str, float]) -> tuple[str, ...]:

@@ -23,8 +23,9 @@ from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Acknowledgement, Join, Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.connecting import connect_with_retry
 
 SPACES = Spaces(

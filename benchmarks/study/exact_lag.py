@@ -15,8 +15,9 @@ from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Gradient, Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
 _IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 

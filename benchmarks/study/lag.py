@@ -1,20 +1,19 @@
 """Study what policy lag costs: final return and env_steps to a threshold, when snapshots reach the actors late.
 
-    python -m benchmarks.study.lag --folder build/study
-    python -m benchmarks.study.lag --folder build/study --tasks catch --lags 0 16 --seeds 5 --jobs 4
+    python -m benchmarks.study.lag --file build/lag.csv
+    python -m benchmarks.study.lag --file build/lag.csv --tasks catch --lags 0 16 --seeds 5 --jobs 4
 
 Every rollout is played with weights of exactly so many updates ago, in one process, so that a run is determined by its
-seed. Each run adds a line to lag.csv in the folder; the same command again makes only the runs that are missing. At the
+seed. Each run adds a line to the file; the same command again makes only the runs that are missing. At the
 end, and with --table alone, the table is printed from the file: interquartile means and 95 % bootstrap intervals.
 """
 
 import argparse
-import csv
 import itertools
 import math
 import multiprocessing
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,24 +21,14 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import machine, table
 from benchmarks.study.tasks import TASKS, VARIANTS, specification
 from daedalus.cli.comparing.comparison import estimate, improvement
 from daedalus.cli.comparing.tables import written
 
-_COLUMNS: tuple[str, ...] = (
-    "task",
-    "variant",
-    "lag",
-    "seed",
-    "budget",
-    "env_steps",
-    "final_return",
-    "env_steps_to_threshold",
-    "lag_mean",
-    "seconds",
-)
-_FILE = "lag.csv"
+_IDENTITY = ("task", "variant", "lag", "seed", "budget")
+_RESULTS = ("env_steps", "final_return", "env_steps_to_threshold", "lag_mean", "seconds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,36 +61,17 @@ def run(cell: Cell) -> dict[str, Any]:
     }
 
 
-def read(path: Path) -> dict[Cell, dict[str, str]]:
-    """Return the lines of the file by run; empty without a file."""
-    if not path.exists():
-        return {}
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {
-        Cell(row["task"], row["variant"], int(row["lag"]), int(row["seed"]), int(row["budget"])): row for row in rows
-    }
+def cell(line: Mapping[str, str]) -> Cell:
+    """Return the run of a line of the file."""
+    return Cell(line["task"], line["variant"], int(line["lag"]), int(line["seed"]), int(line["budget"]))
 
 
-def remove_cut_line(path: Path) -> None:
-    """Remove what an interrupted study had written of a line."""
-    if path.exists():
-        content = path.read_bytes()
-        path.write_bytes(content[: content.rfind(b"\n") + 1])
-
-
-def make(cells: Sequence[Cell], path: Path, jobs: int) -> None:
+def make(cells: Sequence[Cell], runs: RecordedRuns, jobs: int) -> None:
     """Make runs, and add the line of each to the file when it has ended."""
-    new = not path.exists()
-    with open(path, "a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _COLUMNS)
-        if new:
-            writer.writeheader()
-        for number, row in enumerate(_results(cells, jobs), start=1):
-            writer.writerow(row)
-            file.flush()
-            shown = ", ".join(f"{name} {row[name]}" for name in _COLUMNS[:4])
-            print(f"{number} of {len(cells)}: {shown}: return {row['final_return']}, {row['seconds']} s", flush=True)
+    for number, row in enumerate(_results(cells, jobs), start=1):
+        runs.add(row)
+        shown = ", ".join(f"{name} {row[name]}" for name in _IDENTITY)
+        print(f"{number} of {len(cells)}: {shown}: return {row['final_return']}, {row['seconds']} s", flush=True)
 
 
 def _results(cells: Sequence[Cell], jobs: int) -> Iterable[dict[str, Any]]:
@@ -179,7 +149,7 @@ def _normalised(rows: dict[Cell, dict[str, str]], tasks: Sequence[str], variant:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--folder", type=Path, required=True, help="folder of lag.csv")
+    options.add_argument("--file", type=Path, required=True, help="CSV file of the runs")
     options.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     options.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     options.add_argument("--lags", nargs="+", type=int, default=[0, 1, 4, 16, 64])
@@ -188,7 +158,6 @@ def main() -> None:
     options.add_argument("--env-steps", type=int, help="budget of each run (default: that of the task)")
     options.add_argument("--table", action="store_true", help="only print the tables of the runs so far")
     parsed = options.parse_args()
-    path = parsed.folder / _FILE
     budgets = {name: parsed.env_steps or task.env_steps for name, task in TASKS.items()}
     # All settings with the first seed, then with the next: the tables make sense at any time.
     cells = [
@@ -196,13 +165,13 @@ def main() -> None:
         for seed in range(1, parsed.seeds + 1)
         for task, variant, lag in itertools.product(parsed.tasks, parsed.variants, parsed.lags)
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    runs = RecordedRuns(parsed.file, _IDENTITY, _RESULTS)
     if not parsed.table:
-        remove_cut_line(path)
-        done = read(path)
-        make([cell for cell in cells if cell not in done], path, parsed.jobs)
+        done = {cell(line) for line in runs.read()}
+        make([each for each in cells if each not in done], runs, parsed.jobs)
+    lines = {cell(line): line for line in runs.read()}
     print(machine())
-    print(tables({cell: row for cell, row in read(path).items() if cell.budget == budgets[cell.task]}))
+    print(tables({each: line for each, line in lines.items() if each.budget == budgets[each.task]}))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
 from daedalus.cli.arguments import add_allow_module
 from daedalus.cli.checkpoint_values import CheckpointValues
@@ -106,8 +106,6 @@ def main(output: BinaryIO) -> int:
     arguments = options.parse_args()
     configure_logging("warning", as_json=False, process="camera")
     os.nice(_NICENESS)
-    for name in ("SDL_VIDEODRIVER", "SDL_AUDIODRIVER"):  # a picture needs neither a window nor sound
-        os.environ.setdefault(name, "dummy")
     stop = stop_on_signals(exit_if_stuck=True)
     frames = _Output(output, stop)
     try:
@@ -122,6 +120,9 @@ def main(output: BinaryIO) -> int:
         if not stop.is_set():
             frames.write(note(f"The camera cannot play: {error}"))
         return 1
+    except Exception as error:  # of an environment's own renderer, such as OpenGL without a driver
+        frames.write(note(f"The camera cannot play: {type(error).__name__}: {first_line(error)}"))
+        raise
     return 0
 
 

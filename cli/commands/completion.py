@@ -35,6 +35,8 @@ _PARSERS = {
     "evaluate": ("commands.evaluate_arguments", "parser"),
     "plot": ("commands.plot", "parser"),
     "compare": ("commands.compare", "parser"),
+    "report": ("commands.report", "parser"),
+    "push": ("commands.push", "parser"),
     "completion": ("commands.completion", "parser"),
 }
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium
@@ -25,6 +26,7 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
+from daedalus.policy.saving.hub import HubError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
@@ -37,6 +39,9 @@ _ATARI_FRAMES_PER_SECOND = 60.0
 
 class _StoppedError(Exception):
     """Error of an evaluation that was stopped before its last episode ended."""
+
+
+_FAILURES = (_StoppedError, DamagedError, EnvironmentSetupError, HubError, NoPolicyError, PolicyError, VideoError)
 
 
 def main(
@@ -68,11 +73,11 @@ def main(
         exit_with_parent(stop)
     try:
         with redirect_stdout(sys.stderr):  # the environment may print
-            result = _evaluate(arguments, stop)
+            result = run_evaluation(arguments, stop, sys.stderr)
     except ModuleNotAllowedError as error:
         print(f"daedalus evaluate: {allowing(error, ['daedalus', 'evaluate', *words])}", file=sys.stderr)
         return 2
-    except (_StoppedError, DamagedError, NoPolicyError, EnvironmentSetupError, PolicyError, VideoError) as error:
+    except _FAILURES as error:
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
         print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
         return 1
@@ -90,14 +95,13 @@ def _reserved_stdout() -> TextIO:
     return result
 
 
-def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str, Any]:
-    """Return the result of the evaluation that the arguments describe."""
-    directory = arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
-    policy = find_policy(directory, arguments.newest)
+def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream: TextIO) -> dict[str, Any]:
+    """Return the result of the evaluation that the arguments describe, after `check`; `stream` shows its progress."""
+    policy = find_policy(_directory(arguments), arguments.newest)
     spec, modules = _environment(policy, arguments), _modules(policy, arguments)
     modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-    progress = _Progress(sys.stderr, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
+    progress = _Progress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
     try:
         if arguments.video is None:
@@ -110,6 +114,13 @@ def _evaluate(arguments: argparse.Namespace, stop: threading.Event) -> dict[str,
         progress.end()
     actions = _actions(policy, arguments)
     return {**_result(policy, spec, evaluation, actions), "seed": seed, "actions": actions, **filmed}
+
+
+def _directory(arguments: argparse.Namespace) -> Path:
+    """Return the run directory or checkpoint that the arguments name. Raises HubError, NoPolicyError."""
+    if arguments.from_hub is not None:
+        return pull(arguments.from_hub, arguments.revision)
+    return arguments.directory if arguments.pretrained is None else pretrained(arguments.pretrained)
 
 
 def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> EnvironmentSpec:
@@ -128,7 +139,8 @@ def _environment(policy: SavedPolicy, arguments: argparse.Namespace) -> Environm
 def _modules(policy: SavedPolicy, arguments: argparse.Namespace) -> UserModules:
     """Return the modules that the command line allows, with that of its own --wrap."""
     own = {module_of(arguments.wrap)} if arguments.wrap not in (None, "none") else set()
-    return UserModules(frozenset({*arguments.allow_module, *own}), f"the run of {policy.directory}")
+    source = f"the run of {arguments.from_hub or policy.directory}"
+    return UserModules(frozenset({*arguments.allow_module, *own}), source)
 
 
 def _play(

@@ -23,6 +23,7 @@ examples:
   daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
   daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
   daedalus evaluate RUN_DIR --render
+  daedalus evaluate --from-hub USER/NAME --revision main
   daedalus evaluate RUN_DIR --allow-module corridor      (the run plays corridor:Corridor-v0)
 
 exit status: 0 done, 1 failed or stopped, 2 bad usage"""
@@ -38,6 +39,12 @@ def parser() -> argparse.ArgumentParser:
         "directory", type=Path, nargs="?", metavar="RUN_DIR", help="a run directory, or one of its checkpoints"
     )
     options.add_argument("--pretrained", metavar="NAME", help="a policy that is part of the package, instead of a run")
+    options.add_argument(
+        "--from-hub", metavar="USER/NAME", help="a policy on the Hugging Face Hub (daedalus push), instead of a run"
+    )
+    options.add_argument(
+        "--revision", metavar="REVISION", help="branch, tag or commit of --from-hub (default: the newest of main)"
+    )
     options.add_argument("--newest", action="store_true", help="use the newest checkpoint of the run, not the best")
     options.add_argument(
         "--episodes",
@@ -100,8 +107,12 @@ def check(arguments: argparse.Namespace) -> None:
     watched = "--video" if arguments.video else "--render" if arguments.render else None
     if arguments.episodes is None:
         arguments.episodes = 1 if watched else _EPISODES
-    if (arguments.directory is None) == (arguments.pretrained is None):
-        raise ValueError("name either a run directory (or one of its checkpoints) or --pretrained NAME")
+    if sum(source is not None for source in (arguments.directory, arguments.pretrained, arguments.from_hub)) != 1:
+        raise ValueError(
+            "name either a run directory (or one of its checkpoints), or --pretrained NAME, or --from-hub USER/NAME"
+        )
+    if arguments.revision is not None and arguments.from_hub is None:
+        raise ValueError("--revision is that of a policy on the Hub: add --from-hub USER/NAME, or leave it out")
     if arguments.episodes < 1:
         raise ValueError(f"--episodes is {arguments.episodes}: choose at least 1")
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:

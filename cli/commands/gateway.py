@@ -60,6 +60,22 @@ def parser() -> argparse.ArgumentParser:
     options = command_parser("gateway", DESCRIPTION, EXAMPLES)
     add_connect(options, "address of the learner or of its router. May be given several times")
     options.add_argument(
+        "--run", default=keys.ANY_RUN, metavar="NAME", help="run to follow, if several runs share a network"
+    )
+    _add_serving(options)
+    _add_page(options)
+    add_allow_module(options, "the run")
+    add_tls(options)
+    add_insecure(options)
+    add_logging(options)
+    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
+    options.add_argument("--or-any-port", action="store_true", help=argparse.SUPPRESS)
+    return options
+
+
+def _add_serving(options: argparse.ArgumentParser) -> None:
+    """Add the options about who may connect, and where."""
+    options.add_argument(
         "--listen", default=LISTEN, metavar="HOST:PORT", help="address where clients connect (default: %(default)s)"
     )
     options.add_argument(
@@ -83,9 +99,10 @@ def parser() -> argparse.ArgumentParser:
         metavar="URL",
         help="web site whose pages may connect, such as http://localhost:3000. May be given several times",
     )
-    options.add_argument(
-        "--run", default=keys.ANY_RUN, metavar="NAME", help="run to follow, if several runs share a network"
-    )
+
+
+def _add_page(options: argparse.ArgumentParser) -> None:
+    """Add the options of the page."""
     options.add_argument(
         "--compare",
         nargs="+",
@@ -115,13 +132,6 @@ def parser() -> argparse.ArgumentParser:
         metavar="RUN_DIR",
         help="directory of the run, on this machine: its newest checkpoint estimates values for the camera, with torch",
     )
-    add_allow_module(options, "the run")
-    add_tls(options)
-    add_insecure(options)
-    add_logging(options)
-    options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
-    options.add_argument("--or-any-port", action="store_true", help=argparse.SUPPRESS)
-    return options
 
 
 def _origin(text: str) -> str:

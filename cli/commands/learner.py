@@ -2,7 +2,8 @@
 
 Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
-learner that a signal stopped exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED.
+learner that a signal stopped exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A
+learner of several processes that has lost one exits with processes.RANK_LOST, and is then started again.
 """
 
 import argparse
@@ -18,6 +19,8 @@ from typing import TYPE_CHECKING
 
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
+from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.learner_network import announce, learner_credentials, open_transport
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
@@ -30,11 +33,16 @@ from daedalus.cli.processes import (
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
-from daedalus.cli.settings_arguments import LISTEN, ChosenRun, choose_run, learner_parser, resolve
+from daedalus.cli.ranks import OneProcess, StartedRanks, follow_launched, meeting_for, ranks_for
+from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
+from daedalus.cli.supervised_learner import supervise_learner
+from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.reporting.progress import Progress, SilentProgress
 from daedalus.learner.reporting.recorder import OpenWriter
 from daedalus.learner.reporting.tensorboard_writer import TensorBoardWriter
+from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.finished import finished_run
@@ -42,24 +50,19 @@ from daedalus.learner.run.heartbeat import Heartbeat
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
-from daedalus.learner.serving.rollout_intake import largest_request
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
-from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError, allow_settings
+from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
-from daedalus.transport.connecting import connect_with_retry, listen
 from daedalus.transport.credentials import Credentials, CredentialsError
-from daedalus.transport.interface import Transport, TransportError
-from daedalus.transport.reachable import reachable
+from daedalus.transport.interface import TransportError
 from daedalus.transport.security import (
     SECURITY_ERRORS,
     certificate_days_left,
-    credentials_to_connect,
-    credentials_to_listen,
 )
 
 _logger = logging.getLogger("daedalus.cli")  # this module is __main__ when it runs
@@ -74,6 +77,7 @@ _FAILURES = (
     CredentialsError,
     DamagedError,
     NetworkError,
+    RanksDisagreeError,
     SettingsError,
     TransportError,
 )
@@ -90,15 +94,24 @@ def main() -> int:
     if arguments.exit_with_parent:
         exit_with_parent(stop, user_metrics.add_line)
     try:
+        meeting = meeting_for(arguments)
+        if meeting is not None and meeting.rank > 0:
+            return follow_launched(meeting, arguments, stop)
         run = choose_run(arguments)
-        credentials = _credentials(arguments)
+        ranks = ranks_for(arguments, run, meeting)
+        credentials = learner_credentials(arguments)
+        if isinstance(ranks, StartedRanks) and not arguments.exit_with_parent:
+            if arguments.run_dir is None:
+                run, _ = _with_spaces(run, arguments, stop)
+            return supervise_learner(run.directory, arguments, stop)
     except ModuleNotAllowedError as error:
         print(f"daedalus learner: {allowing(error, ['daedalus', 'learner', *sys.argv[1:]])}", file=sys.stderr)
         return BAD_USAGE
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return BAD_USAGE
-    progress = Progress(sys.stdout, run.spec.training.env_steps)
+    display = SilentProgress if arguments.no_progress else Progress
+    progress = display(sys.stdout, run.spec.training.env_steps)
     context = {"run": run.directory.name}
     process = "" if arguments.prepared else "learner"  # the launcher shows the lines to a person
     configure_logging(
@@ -107,7 +120,11 @@ def main() -> int:
     try:
         with ExitStack() as stack:
             began = arguments.started or started
-            return _serve(run, arguments, credentials, stop, progress, began, user_metrics, context, stack)
+            return _serve(run, arguments, credentials, stop, progress, began, user_metrics, context, ranks, stack)
+    except RankLostError as error:
+        text, status = ranks.fault(error)
+        print(f"daedalus learner: {text}", file=sys.stderr)
+        return status
     except _FAILURES as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return FAILED
@@ -122,11 +139,12 @@ def _serve(
     started: float,
     user_metrics: UserMetrics,
     context: dict[str, str],
+    ranks: OneProcess,
     stack: ExitStack,
 ) -> int:
-    """Run the learner to its end and return the exit status. Raises _FAILURES.
+    """Run the learner to its end and return the exit status. Raises _FAILURES or RankLostError.
 
-    `context` receives the fields of the log; `stack` closes what is opened.
+    `context` receives the fields of the log; `ranks` are its other processes; `stack` closes what is opened.
     """
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
@@ -135,16 +153,18 @@ def _serve(
     finished = finished_run(run.directory, run.spec) if resumed else None
     if finished is not None:
         _logger.info("nothing to do: %s", finished.reason)
+        ranks.dismiss(run.spec, stop)
         return NOT_REACHED if finished.missed else REACHED
     restored = _newest_checkpoint(run.directory) if resumed else None
     spaces = arguments.spaces
     if restored is None and arguments.prepared is None:
         run, spaces = _with_spaces(run, arguments, stop)
     initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
-    transport = _open_transport(arguments, run.spec, credentials, stop)
+    transport = open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered
         return stopped
+    stack.enter_context(ranks)
     stack.callback(transport.close)
     if not run.exists:
         new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
@@ -166,9 +186,12 @@ def _serve(
             modules=run.modules,
             certificate_days_left=partial(certificate_days_left, credentials),
             user_metrics=user_metrics,
+            open_ranks=ranks.open,
         )
         context["epoch"] = f"{service.learner_epoch:x}"
-        _announce(run, arguments, credentials)
+        announce(run, arguments, credentials)
+        if arguments.prepared is None:  # else the launcher starts them
+            _start_trackers(run.directory, arguments, progress, stop, stack)
         outcome = service.run()
     except _FAILURES:
         if not run.exists:
@@ -191,47 +214,6 @@ def _with_spaces(
     return replace(run, spec=chosen, directory=directory), spaces
 
 
-def _credentials(arguments: argparse.Namespace) -> Credentials | None:
-    """Return the credentials for the addresses, or None without TLS. Raises SECURITY_ERRORS."""
-    if arguments.connect:
-        return credentials_to_connect(arguments.connect, arguments.tls, "learner")
-    return credentials_to_listen(_addresses(arguments), arguments.tls, "learner", insecure=arguments.insecure)
-
-
-def _addresses(arguments: argparse.Namespace) -> list[str]:
-    """Return the addresses that actors connect to."""
-    return arguments.connect or arguments.listen or [LISTEN]
-
-
-def _open_transport(
-    arguments: argparse.Namespace, spec: RunSpec, credentials: Credentials | None, stop: threading.Event
-) -> Transport | None:
-    """Connect to a router or listen for actors; return None if stopped before a router answered.
-
-    Raises TransportError or CredentialsError.
-    """
-    limit = largest_request(spec)
-    if arguments.connect:
-        return connect_with_retry(arguments.connect, stop, credentials=credentials, max_message_bytes=limit)
-    return listen(_addresses(arguments), credentials=credentials, max_message_bytes=limit)
-
-
-def how_to_join(listening: list[str], credentials: Credentials | None, spec: RunSpec) -> str:
-    """Return the command of an actor, with the other addresses that it may use."""
-    address, *others = reachable(listening, credentials.hosts() if credentials else ())
-    tls = ["--tls", "DIR"] if credentials else []
-    command = ["daedalus actor --connect", address, *tls, *allow_settings(spec.actor_modules)]
-    return " ".join([*command, *([f"(or at {', '.join(others)})"] if others else [])])
-
-
-def _announce(run: ChosenRun, arguments: argparse.Namespace, credentials: Credentials | None) -> None:
-    """Log how actors join."""
-    if arguments.prepared is None:
-        spec = run.spec
-        _logger.info("run %s: learning %s with %s", run.directory, spec.environment.id, spec.training.algorithm)
-        _logger.info("actors join with: %s", how_to_join(_addresses(arguments), credentials, spec))
-
-
 def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:
     """Return the metrics writers; `rows_to` is a pipe to the program that started the run."""
     writers: list[OpenWriter] = [
@@ -239,6 +221,18 @@ def _writers(directory: Path, rows_to: int | None) -> list[OpenWriter]:
         lambda: TensorBoardWriter(directory),
     ]
     return writers if rows_to is None else [lambda: RowsWriter(rows_to), *writers]
+
+
+def _start_trackers(
+    directory: Path, arguments: argparse.Namespace, progress: Progress, stop: threading.Event, stack: ExitStack
+) -> None:
+    """Start the chosen trackers and those that have logged the run before; `stack` ends them."""
+    names = chosen_trackers(arguments.log, directory)
+    if names:
+        output = stack.enter_context(ChildOutput(directory / run_directory.OUTPUT, progress.say, progress.say))
+        trackers = TrackerProcesses(names, directory, output, service=True, log_json=arguments.log_json)
+        stack.callback(trackers.finish, stop)
+        trackers.start()
 
 
 def _newest_checkpoint(directory: Path) -> "Checkpoint | None":

@@ -8,12 +8,14 @@ from pathlib import Path
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import one_line, printable
 from daedalus.cli.status_query import ask, ask_events, fleet_size
+from daedalus.cli.watching.screen import Screen
+from daedalus.cli.watching.status_watch import watch_status
 from daedalus.learner.run.heartbeat import silence
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.transport.connecting import connect
-from daedalus.transport.credentials import WARNING_DAYS
+from daedalus.transport.credentials import WARNING_DAYS, Credentials
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
@@ -28,6 +30,7 @@ examples:
   daedalus status --connect tcp/127.0.0.1:7447
   daedalus status --connect tcp/gpu-box:7447 --json
   daedalus status --connect tcp/gpu-box:7447 --events
+  daedalus status --connect tcp/gpu-box:7447 --watch
   daedalus status --connect tcp/127.0.0.1:7447 --quiet || echo unhealthy
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
@@ -56,6 +59,12 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="show the newest events of each run, such as joins, rejections and checkpoints, instead of its state",
     )
+    options.add_argument(
+        "--watch",
+        action="store_true",
+        help="show the state again and again, with a curve of the return, until Ctrl-C: a table that is redrawn on a "
+        "terminal (needs the package rich), and the lines of each look every 5 s elsewhere",
+    )
     output = options.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print each run as one JSON object per line")
     output.add_argument("--quiet", action="store_true", help="print only problems")
@@ -65,7 +74,10 @@ def parser() -> argparse.ArgumentParser:
 
 def status(arguments: list[str]) -> int:
     """Run `daedalus status` and return its exit status."""
-    parsed = parser().parse_args(arguments)
+    options = parser()
+    parsed = options.parse_args(arguments)
+    if parsed.watch and (parsed.alive is not None or parsed.events or parsed.quiet):
+        options.error("--watch shows the state of the runs: leave out --alive, --events and --quiet")
     if parsed.alive is not None:
         return _check_alive(parsed.alive)
     try:
@@ -74,6 +86,8 @@ def status(arguments: list[str]) -> int:
         print(f"daedalus status: {error}", file=sys.stderr)
         return BAD_USAGE
     try:
+        if parsed.watch:
+            return _watch(parsed, credentials)
         transport = connect(parsed.connect, credentials)
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
@@ -90,9 +104,16 @@ def status(arguments: list[str]) -> int:
         _show_problems(statuses)
     else:
         for shown in filter(None, pages) if parsed.events else statuses:
-            # JSON in ASCII: texts of peers cannot command a terminal.
-            print(json.dumps(shown.model_dump(mode="json")) if parsed.json else _text(shown))
+            print(_json(shown) if parsed.json else _text(shown))
     return UNHEALTHY if any(status.problems for status in statuses) else HEALTHY
+
+
+def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
+    screen = Screen()
+    frames = screen.shows_frames and not parsed.json
+    shown = _json if parsed.json else _text
+    watch_status(lambda: connect(parsed.connect, credentials), parsed.run, screen, shown, frames=frames)
+    return HEALTHY
 
 
 def _check_alive(directory: Path) -> int:
@@ -107,6 +128,11 @@ def _show_problems(statuses: list[RunStatus]) -> None:
     for status in statuses:
         for problem in status.problems:
             print(one_line(f"{status.run}: {problem}"))
+
+
+def _json(shown: RunStatus | EventsPage) -> str:
+    """Return JSON in ASCII: texts of peers cannot command a terminal."""
+    return json.dumps(shown.model_dump(mode="json"))
 
 
 def _text(shown: RunStatus | EventsPage) -> str:

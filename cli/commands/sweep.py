@@ -15,7 +15,7 @@ from daedalus.cli.comparing.recorded_run import RunDataError
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
-from daedalus.cli.settings_arguments import add_settings, resolve_spec
+from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
 from daedalus.cli.sweeping.axes import Axis, Choices, read_axis
 from daedalus.cli.sweeping.display import Display
 from daedalus.cli.sweeping.plan import Planner
@@ -71,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         help="runs side by side; each has a learner and its actors (default: %(default)s)",
     )
+    add_log(options)
     options.add_argument("--folder", type=Path, metavar="DIR", help="folder for the results (default: one in sweeps/)")
     options.add_argument(
         "--sampler",

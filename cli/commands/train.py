@@ -5,18 +5,21 @@ import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TextIO
 
-from daedalus.cli.arguments import add_allow_module, add_insecure, add_tls, allowing, command_parser
-from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.arguments import add_allow_module, add_insecure, add_processes, add_tls, allowing, command_parser
+from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
+from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.run_report import report
-from daedalus.cli.settings_arguments import add_new_run, add_settings, resolve
+from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, check_processes, resolve
+from daedalus.cli.watching.screen import Screen
+from daedalus.cli.watching.training_display import TrainingDisplay
+from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
 from daedalus.learner.run.finished import FinishedRun, finished_run
@@ -76,7 +79,8 @@ def train(arguments: list[str]) -> int:
     """Run `daedalus train` and return its exit status."""
     started = process_started()
     parsed = train_parser().parse_args(arguments)
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    screen = Screen()
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=screen.out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
@@ -91,6 +95,7 @@ def train(arguments: list[str]) -> int:
             chosen, directory = resolve(parsed, defaults)
             spaces = transformed_spaces(chosen, spec, spaces, fork=True)
             spec = chosen
+        check_processes(parsed.processes or 1, spec)
         spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
     except (RunInUseError, EnvironmentProblemError) as error:
@@ -100,19 +105,21 @@ def train(arguments: list[str]) -> int:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
     with lock:
-        return _run(lock, spec, parsed, started, resume=False, spaces=spaces)
+        return _run(lock, spec, parsed, started, screen, resume=False, spaces=spaces)
 
 
 def resume(arguments: list[str]) -> int:
     """Run `daedalus resume` and return its exit status."""
     started = process_started()
     parsed = resume_parser().parse_args(arguments)
-    configure_logging(parsed.log_level, as_json=parsed.log_json, write=_print_out)
+    screen = Screen()
+    configure_logging(parsed.log_level, as_json=parsed.log_json, write=screen.out)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, until the run has handlers of its own
     try:
         _check_listening(parsed)
         _check_watching(parsed)
         spec = _resumed_spec(parsed)
+        check_processes(parsed.processes or 1, spec)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
         print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
@@ -134,7 +141,7 @@ def resume(arguments: list[str]) -> int:
             print(f"daedalus resume: {error}", file=sys.stderr)
             return 1
         run_directory.write_config(parsed.directory, spec)
-        return _run(lock, spec, parsed, started, resume=True, spaces=spaces, finished=finished)
+        return _run(lock, spec, parsed, started, screen, resume=True, spaces=spaces, finished=finished)
 
 
 def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
@@ -170,6 +177,7 @@ def resume_parser() -> argparse.ArgumentParser:
         "network, the algorithm and the seed cannot change",
     )
     add_allow_module(options, "config.toml of the run")
+    add_log(options)
     _add_machine_options(options)
     return options
 
@@ -187,6 +195,7 @@ def _add_machine_options(options: argparse.ArgumentParser) -> None:
         "token for its buttons is in RUN_DIR/operator-token",
     )
     options.add_argument("--no-camera", action="store_true", help="play no episodes for the page (with --watch)")
+    add_processes(options)
     add_tls(options)
     add_insecure(options)
     add_logging(options)
@@ -208,6 +217,7 @@ def _run(
     spec: RunSpec,
     parsed: argparse.Namespace,
     started: float,
+    screen: Screen,
     *,
     resume: bool,
     spaces: Spaces | None = None,
@@ -215,12 +225,14 @@ def _run(
 ) -> int:
     """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
     directory = lock.directory
+    live = screen.shows_frames and not parsed.log_json
     run = LocalRun(
         directory=directory,
         spec=spec,
         started=started,
         lock=lock.inheritable,
         spaces=spaces,
+        processes=parsed.processes or 1,
         init_from=None if resume else parsed.init_from,
         resume=resume,
         trained=None if finished is None else _MISSED if finished.missed else 0,
@@ -229,16 +241,18 @@ def _run(
         insecure=parsed.insecure,
         watch=parsed.watch,
         camera=not parsed.no_camera,
+        log=chosen_trackers(parsed.log, directory),
         log_level=parsed.log_level,
         log_json=parsed.log_json,
+        observer=TrainingDisplay(screen, directory.name) if live else RunObserver(),
     )
-    output = ChildOutput(directory / run_directory.OUTPUT, _print_out, _print_err)
+    output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
     stopping = stop_on_signals()
     if parsed.exit_with_parent:
         exit_with_parent(stopping)
     try:
         with output:
-            end = run_locally(run, stopping, output)
+            end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
     except RunStoppedError:
         options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
         print(f"stopped; continue with: daedalus resume {directory}{options}")
@@ -251,16 +265,3 @@ def _run(
         return error.status
     print(report(run, end.summary))
     return end.status
-
-
-def _print_out(line: str) -> None:
-    _print_line(line, sys.stdout)
-
-
-def _print_err(line: str) -> None:
-    _print_line(line, sys.stderr)
-
-
-def _print_line(line: str, stream: TextIO) -> None:
-    """Print a line in place of the line of progress that the learner rewrites on the same terminal."""
-    print(f"\r\x1b[K{line}" if stream.isatty() else line, file=stream, flush=True)

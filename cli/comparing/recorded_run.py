@@ -18,6 +18,11 @@ from daedalus.learner.run.settings import SettingsError, run_spec
 SEED, ENVIRONMENT = "training.seed", "environment.id"
 RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
 
+# Numbers that are computed with. Files of other releases, or that somebody changed, may have other values.
+_NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
+_SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
+_LARGEST = 1e300
+
 
 class RunDataError(Exception):
     """Error for a run directory that cannot be used. The message is one line."""
@@ -96,12 +101,20 @@ def find_runs(paths: Iterable[Path]) -> list[Path]:
         inside = sorted(config.parent for config in path.glob(f"*/{CONFIG}"))
         if not inside:
             raise RunDataError(
-                f"{path} is not a run directory: it has neither {CONFIG} nor {METRICS}"
+                f"{path} is not a run directory: it has neither {CONFIG} nor {METRICS}; "
+                "name a run directory, or a folder of run directories"
                 if path.exists()
                 else f"{path} does not exist: name a run directory, or a folder of run directories"
             )
         found += inside
     return list(dict.fromkeys(found))
+
+
+def one_run(directory: Path) -> Path:
+    """Return a path that is a run directory. Raises RunDataError for any other path."""
+    if find_runs([directory]) != [directory]:
+        raise RunDataError(f"{directory} is a folder of run directories: name one of them")
+    return directory
 
 
 def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
@@ -115,6 +128,20 @@ def read_run(directory: Path, columns: Sequence[str] = ()) -> RecordedRun:
         metrics=_metrics(directory, (ENV_STEPS, RETURN, *columns)),
         summary=_summary(directory / SUMMARY),
     )
+
+
+def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
+    """Return the metrics of a run, `metrics.csv`, as arrays [rows] by the names of the columns; NaN: no value.
+
+    docs/reference/metrics.md explains the columns. Rows that a resumed run repeated from its checkpoint on replace the
+    earlier ones.
+
+    Raises RunDataError if the directory has no metrics.
+    """
+    metrics = read_run(one_run(Path(directory))).metrics
+    steps = metrics[ENV_STEPS]
+    least_later = np.append(np.minimum.accumulate(steps[::-1])[::-1][1:], np.inf)
+    return {name: column[steps < least_later] for name, column in metrics.items()}
 
 
 def _settings(path: Path) -> dict[str, Any]:
@@ -134,7 +161,12 @@ def _settings(path: Path) -> dict[str, Any]:
         for section, values in settings.items()
         if isinstance(values, dict)
         for key, value in values.items()
+        if f"{section}.{key}" not in _NUMBERS or _is_number(value)
     }
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and abs(value) < _LARGEST)
 
 
 def _summary(path: Path) -> dict[str, Any]:
@@ -148,6 +180,9 @@ def _summary(path: Path) -> dict[str, Any]:
         raise RunDataError(f"{path} is damaged: it is not valid JSON") from None
     if not isinstance(content, dict):
         raise RunDataError(f"{path} is damaged: it is not a JSON object")
+    for name in _SUMMARY_NUMBERS:
+        if not _is_number(content.get(name)):
+            raise RunDataError(f"{path} is damaged: {name} is not a number")
     return content
 
 

@@ -12,34 +12,41 @@ _FEW = 5  # runs
 
 def as_text(comparison: Comparison) -> str:
     """Return the table of a comparison, with what its columns mean."""
-    header = ["group", "runs", "final return"]
-    threshold = comparison.threshold
-    if threshold is not None:
-        header += ["reached", f"env_steps to {threshold:g}", f"minutes to {threshold:g}"]
-    if len(comparison.results) > 1:
-        header.append("P(> first)")
-    rows = [_cells(result, comparison) for result in comparison.results]
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    head = header(comparison)
+    rows = [cells(result, comparison) for result in comparison.results]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in [header, *rows]
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in [head, *rows]
     ]
     lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join([*lines, "", *_notes(comparison)])
+    return "\n".join([*lines, "", *notes(comparison)])
 
 
-def _cells(result: GroupResult, comparison: Comparison) -> list[str]:
-    cells = [result.group, str(result.runs), written(result.final_return, _number)]
+def header(comparison: Comparison) -> list[str]:
+    """Return the names of the columns."""
+    names = ["group", "runs", "final return"]
+    threshold = comparison.threshold
+    if threshold is not None:
+        names += ["reached", f"env_steps to {threshold:g}", f"minutes to {threshold:g}"]
+    if len(comparison.results) > 1:
+        names.append("P(> first)")
+    return names
+
+
+def cells(result: GroupResult, comparison: Comparison) -> list[str]:
+    """Return the cells of one group, one for each name of `header`."""
+    texts = [result.group, str(result.runs), written(result.final_return, _number)]
     if result.env_steps is not None and result.minutes is not None:
-        cells.append(f"{result.reached} of {result.runs}")
-        cells += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, _number)]
+        texts.append(f"{result.reached} of {result.runs}")
+        texts += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, _number)]
     if len(comparison.results) > 1:
         improvement = result.improvement
-        cells.append("" if improvement is None else written(improvement, lambda value: f"{value:.2f}"))
-    return cells
+        texts.append("" if improvement is None else written(improvement, lambda value: f"{value:.2f}"))
+    return texts
 
 
-def _notes(comparison: Comparison) -> list[str]:
+def notes(comparison: Comparison) -> list[str]:
+    """Return what the columns mean, one line each."""
     kind = "the final evaluation" if comparison.evaluated else "the last training episodes"
     lines = [
         f"{comparison.environment or 'runs'}: interquartile mean over the runs [95 % bootstrap interval]; "

@@ -82,6 +82,7 @@ def _words(options: argparse.Namespace) -> list[str]:
     for name in ("env", "algorithm", "actors", "seed", "env_steps", "wrap"):
         value = getattr(options, name)
         words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    words += [word for tracker in options.log for word in ("--log", tracker)]
     return [*words, *(word for assignment in options.set for word in ("--set", assignment))]
 
 

@@ -17,6 +17,8 @@ from daedalus.cli.commands import (
     exporter,
     gateway,
     plot,
+    push,
+    report,
     router,
     status,
     sweep,
@@ -47,6 +49,8 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
         "evaluate": evaluate_parser(),
         "plot": plot.parser(),
         "compare": compare.parser(),
+        "report": report.parser(),
+        "push": push.parser(),
         "completion": completion.parser(),
     }
 

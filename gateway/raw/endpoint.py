@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from daedalus.gateway import messages
+from daedalus.gateway.channel import channel_of
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.raw.clients import ClientTable
 from daedalus.gateway.raw.connection import ClientConnection
@@ -53,7 +54,7 @@ class RawEndpoint:
             return
         if name is None:
             return
-        scope["extensions"]["daedalus.stream"](MAX_CHUNK_BYTES)
+        channel_of(scope).become_stream(MAX_CHUNK_BYTES)
         ours, theirs = socket.socketpair()
         only = name if self._guard.tokens is not None else None
         client = ClientConnection(theirs, self._open_transport, self._table, only)

@@ -20,14 +20,15 @@ def read_rows(path: Path) -> Iterator[dict[str, float]]:
             if "env_steps" not in columns or len(columns) > _MAX_COLUMNS:
                 raise ValueError(f"{path} has no column env_steps: it is not the metrics of a run")
             for cells in lines:
-                row = _numbers(columns, cells)
+                row = numbers(columns, cells)
                 if "env_steps" in row:
                     yield row
         except csv.Error as error:
             raise ValueError(f"{path} is damaged: {error}") from None
 
 
-def _numbers(columns: list[str], cells: list[str]) -> dict[str, float]:
+def numbers(columns: list[str], cells: list[str]) -> dict[str, float]:
+    """Return the finite numbers of a line, by column."""
     row = {}
     for name, cell in zip(columns, cells, strict=False):
         try:

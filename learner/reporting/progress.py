@@ -1,6 +1,7 @@
 """Progress of a run: one line that is rewritten on a terminal, or a log record every few seconds elsewhere."""
 
 import logging
+import os
 import shutil
 import time
 from collections import deque
@@ -22,14 +23,16 @@ class Progress:
     def __init__(self, stream: TextIO, env_steps_budget: int) -> None:
         self._stream = stream
         self._budget = env_steps_budget
-        self._terminal = stream.isatty()
+        self._terminal = is_terminal(stream)
         self._next_line = time.monotonic() + _FIRST_LINE_SECONDS
         self._rewriting = False
-        self._seen: deque[tuple[float, float]] = deque()  # seconds and env_steps of the newest rows
+        self._rate = StepRate()
 
     def show(self, row: Mapping[str, float]) -> None:
         """Show a metrics row. If the stream is not a terminal, show at most one row every few seconds."""
-        rate = self._rate(row)
+        rate = self._rate.add(row["wall_seconds"], row["env_steps"])
+        if rate is None:
+            rate = row.get("env_steps_per_second", 0.0)
         if not self._terminal:
             if time.monotonic() < self._next_line:
                 return
@@ -58,22 +61,38 @@ class Progress:
             self._stream.write(text)
             self._stream.flush()
 
-    def _rate(self, row: Mapping[str, float]) -> float:
-        """Return env_steps a second over the newest rows: slow environments make steps in few of the rows."""
-        seconds, env_steps = row["wall_seconds"], row["env_steps"]
+
+class SilentProgress(Progress):
+    """Progress of a run that another process shows."""
+
+    def show(self, row: Mapping[str, float]) -> None:
+        """Show nothing."""
+
+
+class StepRate:
+    """Rate of the env_steps over the newest seconds: slow environments make steps in few of the rows."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, float]] = deque()  # seconds and env_steps
+
+    def add(self, seconds: float, env_steps: float) -> float | None:
+        """Return the env_steps per second until now, or None if no time has passed since the first call."""
         self._seen.append((seconds, env_steps))
         while len(self._seen) > 2 and seconds - self._seen[1][0] >= _RATE_SECONDS:
             self._seen.popleft()
         first_seconds, first_env_steps = self._seen[0]
-        if seconds <= first_seconds:
-            return row.get("env_steps_per_second", 0.0)
-        return (env_steps - first_env_steps) / (seconds - first_seconds)
+        return (env_steps - first_env_steps) / (seconds - first_seconds) if seconds > first_seconds else None
+
+
+def is_terminal(stream: TextIO) -> bool:
+    """Return whether a stream is a terminal that can rewrite a line."""
+    return stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
 def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
     mean = _number(row.get("episode_return_mean"), ".1f")
-    left = _duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
+    left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",
         f"return {mean:>7}",
@@ -100,7 +119,7 @@ def _fitted(parts: list[str], width: int) -> str:
     return "  ".join(parts)[: max(width, 0)]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return a short text: 45 s, 12 min, 3.5 h."""
     if seconds < 100:
         return f"{max(seconds, 0.0):.0f} s"

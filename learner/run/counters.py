@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.protocol.messages import MAX_INFO_NAMES, Upload
+from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
 
 _SAVED = (
     "env_steps",

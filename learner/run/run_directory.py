@@ -5,7 +5,10 @@ versions.json    versions of the packages              checkpoints/  by policy v
 summary.json     result of the run                     events.*      the same metrics for TensorBoard
 learner.lock     locked by the learner that runs
 heartbeat        its age shows that the learner works (heartbeat.py)
+events.jsonl     what happened: actors that joined and left, rejections, restarts (event_file.py)
+evaluation.json  result of the final evaluation, with the return of each episode
 output.log       what actors and evaluations printed, if anything; output.log.1 is the part before it
+tracker-*.json   how far each tracker has logged the run
 """
 
 import itertools
@@ -27,7 +30,8 @@ from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
 OPERATOR_TOKEN = "operator-token"  # for the page of a run that is watched
-OUTPUT = "output.log"
+OUTPUT, EVALUATION, EVENTS = "output.log", "evaluation.json", "events.jsonl"
+TRACKER = "tracker-{}.json"  # how far a tracker such as wandb has logged the run
 _PACKAGES = (
     "daedalus-rl",
     "torch",
@@ -75,7 +79,7 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
     """
     try:
         if numbered:
-            directory = _make_numbered(directory)
+            directory = make_numbered(directory)
         check_free(directory)
         directory.mkdir(parents=True, exist_ok=True)
         lock = RunLock(directory)
@@ -92,8 +96,8 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
         raise SettingsError(f"run directory {directory}: {error.strerror}") from None
 
 
-def _make_numbered(directory: Path) -> Path:
-    """Create a new directory with this name, or with the first number that makes its name new."""
+def make_numbered(directory: Path) -> Path:
+    """Create a new directory with this name, or with the first number that makes its name new. Raises OSError."""
     for number in itertools.count(1):
         numbered = directory if number == 1 else directory.with_name(f"{directory.name}-{number}")
         with suppress(FileExistsError):
@@ -111,9 +115,11 @@ def remove_failed(directory: Path) -> None:
         VERSIONS,
         SUMMARY,
         f"{OUTPUT}*",
+        EVENTS,
         LOCK,
         HEARTBEAT,
         OPERATOR_TOKEN,
+        TRACKER.format("*"),
         "events.out.*",
         ".*.partial",
     ):

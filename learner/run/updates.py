@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from daedalus.protocol.messages import Rollout, Upload
 from daedalus.protocol.spec import TrainingSpec
+from daedalus.protocol.uploads import Rollout, Upload
 
 
 def updates_of(training: TrainingSpec, uploads: Sequence[Upload], *, memory: bool) -> int:

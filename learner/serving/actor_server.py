@@ -37,11 +37,7 @@ from daedalus.protocol.limits import (
     STATUS_REQUEST_LIMITS,
     Limits,
 )
-from daedalus.protocol.messages import (
-    Acknowledgement,
-    Refusal,
-    RunEnded,
-)
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
 from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec

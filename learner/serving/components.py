@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout
 
 _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be higher, and float32 hold the noise
 _MAX_ACTION = 1e6  # of a continuous action: beyond it squares lose all precision

@@ -28,6 +28,7 @@ class _Entry:
     key: tuple[EventKind, str, str]  # with the actor and the cause
     text: str
     count: int = 1
+    taken: int = 0  # part of the count that take_new has returned
 
 
 class EventLog:
@@ -75,10 +76,17 @@ class EventLog:
     def report(self) -> tuple[Event, ...]:
         """Return the newest events, the newest last."""
         with self._lock:
-            return tuple(
-                Event(time=each.time, kind=each.key[0], actor=each.key[1], text=each.text, count=each.count)
-                for each in self._entries
-            )
+            return tuple(_event(each, each.count) for each in self._entries)
+
+    def take_new(self) -> tuple[Event, ...]:
+        """Return the events since the last call, oldest first. A count is that of the time since then."""
+        new = []
+        with self._lock:
+            for each in self._entries:
+                if each.count > each.taken:
+                    new.append(_event(each, each.count - each.taken))
+                    each.taken = each.count
+        return tuple(new)
 
     def _take_token(self, now: float) -> bool:
         self._tokens = min(self._tokens + (now - self._tokens_at) * _PER_SECOND, _AT_ONCE)
@@ -94,3 +102,8 @@ class EventLog:
         self._entries.remove(oldest)
         if self._equal.get(oldest.key) is oldest:
             del self._equal[oldest.key]
+
+
+def _event(entry: _Entry, count: int) -> Event:
+    kind, actor, _ = entry.key
+    return Event(time=entry.time, kind=kind, actor=actor, text=entry.text, count=count)

@@ -18,8 +18,9 @@ from daedalus.learner.serving.presence import Presence
 from daedalus.learner.serving.refused_joins import RefusedJoins, bounded
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
-from daedalus.protocol.messages import Join, Refusal, RolloutIdentity
+from daedalus.protocol.messages import MAX_ENVIRONMENTS, Join, Refusal
 from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.uploads import RolloutIdentity
 
 __all__ = ["Actor", "Fleet"]
 
@@ -71,8 +72,9 @@ class Fleet:
         refusal = self._check_identity(join)
         if refusal is not None or join.spaces is None:
             return refusal
-        if not 1 <= join.environments <= 4096:
-            return Refusal(code="malformed", reason=f"environments is {join.environments}: it must be from 1 to 4096")
+        if not 1 <= join.environments <= MAX_ENVIRONMENTS:
+            reason = f"environments is {join.environments}: it must be from 1 to {MAX_ENVIRONMENTS}"
+            return Refusal(code="malformed", reason=reason)
         if self.spaces is not None and join.spaces != self.spaces:
             return Refusal(
                 code="mismatch",

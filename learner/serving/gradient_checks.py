@@ -8,7 +8,9 @@ import numpy as np
 
 from daedalus.protocol.compact import bits_of, float32
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import (
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import (
     DIAGNOSTICS,
     LARGEST_GRADIENT_NORM,
     LOSS_TERMS,
@@ -16,8 +18,6 @@ from daedalus.protocol.messages import (
     MAX_INFO_VALUES,
     Gradient,
 )
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.protocol.spec import RunSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 

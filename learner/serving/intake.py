@@ -15,9 +15,10 @@ from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.gradient_checks import Shapes, first_violation, gradient_limits, restored
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import MAX_INFO_NAMES, Acknowledgement, Gradient, Rollout, Upload
+from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import MAX_INFO_NAMES, Gradient, Rollout, Upload
 
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
 _ROW_BYTES, _INTEGER_BYTES = 24, 8
@@ -59,8 +60,6 @@ class Intake:
         self._epoch = learner_epoch
         self._fleet = fleet
         self._envs_per_actor = spec.collection.envs_per_actor
-        # A synchronous algorithm accepts only rollouts of the newest version.
-        self._max_lag = 0 if spec.algorithm.synchronous else spec.policy_lag_bound
         # Set before any actor has the program:
         self.state_size = 0  # size of the recurrent state
         self.gradient_shapes: Shapes = {}  # of the parameters that have gradients
@@ -159,12 +158,10 @@ class Intake:
             reason = f"policy version {rollout.policy_version} is newer than the learner's version {policy_version}"
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         actor.sequences.add(identity.sequence)
-        if lag > self._max_lag:
-            return Rejected(
-                verdict="rejected",
-                cause="stale",
-                reason=f"policy lag {lag}, at most {self._max_lag} is allowed",
-            )
+        # A synchronous algorithm accepts only rollouts of the newest version.
+        most = 0 if self._spec.algorithm.synchronous else self._spec.policy_lag_bound_with(len(self._fleet.live))
+        if lag > most:
+            return Rejected(verdict="rejected", cause="stale", reason=f"policy lag {lag}, at most {most} is allowed")
         return rollout
 
     def _check_identity(self, sender: str, rollout: Upload) -> Rejected | None:

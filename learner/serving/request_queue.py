@@ -1,35 +1,39 @@
-"""Queue of undecoded requests, bounded by bytes and by number. State with a lock, no threads of its own."""
+"""Queue of undecoded requests, bounded by bytes, number and waiting time. State with a lock, no threads of its own."""
 
 import queue
 import threading
-from typing import Any
+import time
+from collections import deque
 
 from daedalus.transport.interface import Request
 
-_WAKE = object()
+_OLDEST_SECONDS = 10.0  # senders take a request for lost that waits much longer, and send it again
 
 
 class RequestQueue:
     """First-in, first-out queue of requests. `offer` does not block, `take` does."""
 
     def __init__(self, max_bytes: int, max_requests: int) -> None:
-        self._max_bytes, self._max_requests = max_bytes, max_requests
-        self._bytes = self._number = 0
-        self._lock = threading.Lock()
-        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.max_requests = max_requests
+        self._max_bytes = max_bytes
+        self._bytes = 0
+        self._requests: deque[tuple[float, Request]] = deque()  # with the time of arrival, on the monotonic clock
+        self._is_closed = self._is_woken = False
+        self._changed = threading.Condition()
 
     def offer(self, request: Request) -> bool:
-        """Queue a request and return True, or return False if a bound would be exceeded.
+        """Queue a request and return True, or return False if a bound would be exceeded, or the oldest waits too long.
 
         An empty queue accepts a request of any size.
         """
-        with self._lock:
-            full = self._number >= self._max_requests or self._bytes + request.size > self._max_bytes
-            if self._number and full:
+        now = time.monotonic()
+        with self._changed:
+            full = len(self._requests) >= self.max_requests or self._bytes + request.size > self._max_bytes
+            if self._requests and (full or now - self._requests[0][0] > _OLDEST_SECONDS):
                 return False
             self._bytes += request.size
-            self._number += 1
-        self._requests.put(request)
+            self._requests.append((now, request))
+            self._changed.notify()
         return True
 
     def take(self, timeout: float | None = None) -> Request | None:
@@ -37,18 +41,22 @@ class RequestQueue:
 
         Raises queue.Empty if no request comes within `timeout` seconds, or after `wake`.
         """
-        request = self._requests.get(timeout=timeout)
-        if request is _WAKE:
-            raise queue.Empty
-        if request is not None:
-            with self._lock:
-                self._bytes -= request.size
-                self._number -= 1
-        return request
+        with self._changed:
+            self._changed.wait_for(lambda: self._requests or self._is_closed or self._is_woken, timeout)
+            if self._is_woken or not (self._requests or self._is_closed):
+                self._is_woken = False
+                raise queue.Empty
+            if not self._requests:
+                return None
+            _, request = self._requests.popleft()
+            self._bytes -= request.size
+            return request
 
     def wake(self) -> None:
         """Let `take` raise queue.Empty once."""
-        self._requests.put(_WAKE)
+        with self._changed:
+            self._is_woken = True
+            self._changed.notify()
 
     @property
     def bytes(self) -> int:
@@ -57,4 +65,6 @@ class RequestQueue:
 
     def close(self) -> None:
         """Close the queue: `take` returns the waiting requests, then None."""
-        self._requests.put(None)
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()

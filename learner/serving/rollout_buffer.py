@@ -4,12 +4,12 @@ No I/O, no threads.
 """
 
 from collections import deque
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from typing import Protocol
 
 from daedalus.learner.serving.stragglers import Stragglers
-from daedalus.protocol.messages import Upload
+from daedalus.protocol.uploads import Upload
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,9 +102,15 @@ class StreamBuffer:
     policy lag.
     """
 
-    def __init__(self, batch_rollouts: int, max_policy_lag: int) -> None:
+    def __init__(self, batch_rollouts: int, policy_lag_bound_with: Callable[[int], int]) -> None:
+        """Construct an empty buffer.
+
+        Args:
+          batch_rollouts: number of rollouts in a batch.
+          policy_lag_bound_with: function that returns the largest policy lag, in updates, by the number of live actors.
+        """
         self._batch_rollouts = batch_rollouts
-        self._max_policy_lag = max_policy_lag
+        self._policy_lag_bound_with = policy_lag_bound_with
         self._waiting: deque[Upload] = deque()
 
     def has_room_for(self, rollout: Upload) -> bool:
@@ -125,7 +131,7 @@ class StreamBuffer:
 
     def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
         """See RolloutBuffer."""
-        oldest = policy_version - self._max_policy_lag
+        oldest = policy_version - self._policy_lag_bound_with(len(live))
         stale = [rollout for rollout in self._waiting if rollout.policy_version < oldest]
         if stale:
             self._waiting = deque(rollout for rollout in self._waiting if rollout.policy_version >= oldest)

@@ -31,8 +31,9 @@ from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
-from daedalus.protocol.messages import Acknowledgement, Upload
+from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Upload
 from daedalus.transport.interface import Request
 
 HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
@@ -74,7 +75,7 @@ class RolloutIntake:
         self._version = start_version  # rollouts of this version have a policy lag of 0
         self._intake = Intake(spec, learner_epoch, fleet)
         self._buffer = _buffer(spec)
-        self._requests = _queue(spec)
+        self._requests = RequestQueue(spec.service.queue_bytes, _most_requests(spec, live=0))
         self._named: set[str] = set()  # actors that were logged as left out
         self._ending: Acknowledgement | None = None  # of all rollouts after the end
         self._held = HeldAnswers()  # of accepted rollouts, until the next batch is taken
@@ -195,7 +196,9 @@ class RolloutIntake:
             self._events.add("quarantined", text, actor=name, level=logging.WARNING)
 
     def _take(self, version: int) -> TakenRollouts:
-        taken = self._buffer.take(self._fleet.live, version, time.monotonic())
+        live = self._fleet.live
+        self._requests.max_requests = _most_requests(self._spec, len(live))
+        taken = self._buffer.take(live, version, time.monotonic())
         self._named &= self._fleet.actors.keys()
         for name in sorted(self._buffer.left_out - self._named):
             self._named.add(name)
@@ -305,16 +308,16 @@ def largest_request(spec: RunSpec) -> int:
     return max(Limits(max_bytes=spec.service.queue_bytes).message_bytes, EVALUATION_LIMITS.message_bytes)
 
 
-def _queue(spec: RunSpec) -> RequestQueue:
-    """Return a queue that holds only as many rollouts as can be trained on before they are stale.
+def _most_requests(spec: RunSpec, live: int) -> int:
+    """Return the number of rollouts that can be trained on before they are stale, with so many live actors.
 
-    Further rollouts are answered busy: in the queue they would become stale, and their senders would time out.
+    Further rollouts are answered busy: in the queue they would become stale.
     """
-    batches = spec.policy_lag_bound // spec.training.updates_per_batch + 1
-    return RequestQueue(spec.service.queue_bytes, max(batches * spec.batch_rollouts, 2 * spec.collection.actors))
+    batches = spec.policy_lag_bound_with(live) // spec.training.updates_per_batch + 1
+    return max(batches * spec.batch_rollouts, 2 * max(spec.collection.actors, live))
 
 
 def _buffer(spec: RunSpec) -> RolloutBuffer:
     if spec.algorithm.synchronous:
         return BarrierBuffer(spec.collection.actors)
-    return StreamBuffer(spec.batch_rollouts, spec.policy_lag_bound)
+    return StreamBuffer(spec.batch_rollouts, spec.policy_lag_bound_with)

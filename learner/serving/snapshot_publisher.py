@@ -106,7 +106,7 @@ class SnapshotPublisher:
         self._unpublished_rollouts += rollouts
         with self._lock:
             live = len(self._fleet.live)
-        version_due = 4 * (policy_version - self.version) >= self._spec.policy_lag_bound
+        version_due = 4 * (policy_version - self.version) >= self._spec.policy_lag_bound_with(live)
         if self._spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
             self.publish(policy_version, weights)
 

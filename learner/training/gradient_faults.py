@@ -7,7 +7,7 @@ import numpy as np
 
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.gradients import GradientComputer
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.uploads import Rollout
 
 
 def rollouts_at_fault(

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.algorithms.diagnostics import batch_metrics, diagnostics
+from daedalus.algorithms.diagnostics import FirstPass, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
+from daedalus.learner.ranks.leader import ONE_PROCESS, Distribution
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.training.errors import CheckpointMismatchError
@@ -31,20 +32,30 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.exploration import ANNEALING
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.messages import Gradient, Rollout
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Gradient, Rollout
 
 
 class Learner:
     """Owner of the parameters. Makes policy versions from batches: computes gradients, then applies them."""
 
     def __init__(
-        self, spec: TrainingSpec, policy: PolicySpec, spaces: Spaces, modules: UserModules = NO_MODULES
+        self,
+        spec: TrainingSpec,
+        policy: PolicySpec,
+        spaces: Spaces,
+        modules: UserModules = NO_MODULES,
+        distribution: Distribution = ONE_PROCESS,
     ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
 
-        `modules` may be imported for the policy.
+        Args:
+          spec: settings of the training.
+          policy: settings of the network.
+          spaces: components of observations and actions.
+          modules: may be imported for the policy.
+          distribution: gives other processes their shares of each batch.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces,
         AlgorithmError if the algorithm of the user cannot be used.
@@ -57,18 +68,20 @@ class Learner:
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
-        self._device = torch.device(spec.device)
-        self._network = ActorCritic(policy, spaces, modules, spec).to(self._device)
+        self._distribution = distribution
+        self.device = torch.device(spec.device)
+        self._network = ActorCritic(policy, spaces, modules, spec).to(self.device)
         self._gradients = GradientComputer(spec, self._network, spaces, modules)
         self._flat = self._gradients.parameters
         self._parameters = dict(self._network.named_parameters())
         self._loaded = {name: each for name, each in self._parameters.items() if name != ANNEALING}
         self._optimizer = build_optimizer(spec, self._flat.values)
-        self._assembler = BatchAssembler(spaces, self._device)
+        self._assembler = BatchAssembler(spaces, self.device)
         self._observations = ObservationStatistics(self._network.normalizer)
         self._rewards = RewardNormalizer(spec.discount_factor) if spec.normalize_rewards else None
+        self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
-        self.metrics = UpdateMetrics(spaces, self._device)
+        self.metrics = UpdateMetrics(spaces, self.device)
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
         self._anneal_exploration(0.0)
@@ -93,7 +106,7 @@ class Learner:
             self._rewards.add(rollouts)
         kept, left_out = list(rollouts), []
         while kept and not self._make_updates(kept, progress, end):
-            at_fault = rollouts_at_fault(self._gradients, self._joined, kept)
+            at_fault = rollouts_at_fault(self._gradients, lambda some: self._joined(some).to(self.device), kept)
             left_out += at_fault
             kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
         self.updates_skipped += end - self.policy_version
@@ -104,15 +117,30 @@ class Learner:
     def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
         batch = self._joined(rollouts)
-        for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
+        share = self._distribution.share(batch, self.constants, self.policy_version, end, progress)
+        if not self.learn_from(share, progress, end):
+            return False
+        self._observations.add(batch)
+        if self.first_pass is not None:
+            self.first_pass = self._distribution.collect(self.first_pass)
+            self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
+        self.metrics.add_batch(batch)
+        return True
+
+    def learn_from(self, batch: Batch, progress: float, end: int) -> bool:
+        """Make updates until policy version `end`. Return False at the first whose gradient is not finite.
+
+        Args:
+          batch: in main memory, with normalised rewards; a whole batch or a share.
+          progress: as for `step`.
+          end: policy version after the last update.
+        """
+        for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
             if not self._make_update(terms, progress):
                 return False
             if self.policy_version == end:
                 break
-        self._observations.add(batch)
-        if self._gradients.first_pass is not None:
-            self.metrics.add_batch_metrics(batch_metrics(self._gradients.first_pass))
-        self.metrics.add_batch(batch)
+        self.first_pass = self._gradients.take_first_pass()
         return True
 
     def _make_update(self, terms: Terms, progress: float) -> bool:
@@ -139,12 +167,12 @@ class Learner:
             for gradient in gradients:
                 self._rewards.moments.merge(return_moments(gradient))
         self._flat.gradients.copy_(mean_gradient(gradients, tuple(self.gradient_shapes)))
-        if self._make_update(mean_terms(gradients, self._device), progress):
+        if self._make_update(mean_terms(gradients, self.device), progress):
             components = tuple(self._observations.moments)
             self._observations.merge([observation_moments(gradient, components) for gradient in gradients])
             for gradient in gradients:
                 if (measured := batch_metrics_of(gradient)) is not None:
-                    self.metrics.add_batch_metrics(measured.to(self._device))
+                    self.metrics.add_batch_metrics(measured.to(self.device))
         else:
             self.policy_version += 1
             self.updates_skipped += 1
@@ -155,11 +183,11 @@ class Learner:
             self.metrics.add_action_counts({name: torch.from_numpy(values.copy()) for name, values in counts})
 
     def _joined(self, rollouts: Sequence[Rollout]) -> Batch:
-        """Return the batch of the rollouts, with normalised rewards, on the device."""
+        """Return the batch of the rollouts, with normalised rewards, in main memory."""
         batch = self._assembler.join(rollouts)
         if self._rewards is not None:
             self._rewards.scale(batch)
-        return batch.to(self._device)
+        return batch
 
     def learning_rate(self, progress: float) -> float:
         """Return the learning rate at a share of the budget."""
@@ -174,7 +202,7 @@ class Learner:
         if self._received_diagnostics:
             received, self._received_diagnostics = self._received_diagnostics, {}
             return received
-        first_pass = self._gradients.take_first_pass()
+        first_pass, self.first_pass = self.first_pass, None
         rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
         return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
@@ -215,6 +243,15 @@ class Learner:
     def state(self) -> dict[str, Tensor]:
         """Return the training state besides the parameters: optimiser and running statistics, random state."""
         return {"torch_random_state": torch.get_rng_state(), **self._statistics()}
+
+    @property
+    def constants(self) -> list[Tensor]:
+        """Parameters that no gradient changes, such as the statistics of observations."""
+        return [parameter for parameter in self._parameters.values() if not parameter.requires_grad]
+
+    def shared_state(self) -> list[Tensor]:
+        """Return all tensors that updates depend on, in an order that is the same in all processes of a learner."""
+        return [*self._parameters.values(), *self._statistics().values()]
 
     def _statistics(self) -> dict[str, Tensor]:
         statistics = {f"{self._spec.optimizer}/{name}": value for name, value in self._optimizer.statistics.items()}

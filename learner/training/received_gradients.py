@@ -9,7 +9,7 @@ from torch import Tensor
 from daedalus.algorithms.diagnostics import BATCH_METRICS
 from daedalus.algorithms.gradients import Terms
 from daedalus.algorithms.normalization import Moments
-from daedalus.protocol.messages import Gradient
+from daedalus.protocol.uploads import Gradient
 
 
 def weights_of(gradients: Sequence[Gradient]) -> list[float]:

@@ -53,6 +53,7 @@ class ActorCritic(nn.Module):
         self.value_head = orthogonal(nn.Linear(self.memory.features, 1)) if has_values else None
         # Whether the network has convolutions, which then take most of its time.
         self.convolutional = any(isinstance(module, nn.Conv2d) for module in self.modules())
+        self.has_user_modules = bool(spec.user_modules)
         separate = spec.separate_value_encoder and spec.memory == "none" and has_values
         self.value_encoder = build_encoder(spec, spaces.observations, modules) if separate else None
 

@@ -8,7 +8,6 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
@@ -140,6 +139,7 @@ def _flat(observations: Tensor, space: ArraySpace | DiscreteSpace) -> Tensor:
     if isinstance(space, ArraySpace):
         flat = observations.flatten(1)
         return flat if flat.dtype == torch.float32 else flat.to(torch.float32) * (1.0 / 255.0)
-    values = observations.to(torch.int64)  # [N, D]
-    hot = [functional.one_hot(values[:, index], count) for index, count in enumerate(space.counts)]
+    # Comparisons, because torch's one_hot reads the values, which a recording (algorithms/recording.py) cannot.
+    choices = (torch.arange(count, device=observations.device) for count in space.counts)
+    hot = [observations[:, index : index + 1] == each for index, each in enumerate(choices)]
     return torch.cat(hot, -1).to(torch.float32)

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -39,7 +38,7 @@ class _Layers(torch.autograd.Function):
     """All layers as one node of the graph of gradients.
 
     With few rows and units most of an update's time is the cost of an operation as such: one node instead of two for
-    each layer saves a quarter of it. numpy's tanh takes a fifth of the time of torch's.
+    each layer saves a quarter of it. A tanh by way of the sigmoid function takes a third of the time of torch's.
     """
 
     @staticmethod
@@ -47,7 +46,7 @@ class _Layers(torch.autograd.Function):
         outputs = [inputs]
         for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
             output = torch.addmm(bias, outputs[-1], weight.t())
-            outputs.append(torch.from_numpy(np.tanh(output.numpy())) if is_tanh else output.relu_())
+            outputs.append(_tanh(output) if is_tanh else output.relu_())
         ctx.is_tanh = is_tanh
         ctx.save_for_backward(*outputs, *parameters[::2])
         return outputs[-1]
@@ -68,3 +67,9 @@ class _Layers(torch.autograd.Function):
             results += [inner.sum(0), inner.t() @ outputs[layer]]
             outer = inner @ weights[layer] if layer or ctx.needs_input_grad[0] else None
         return outer, None, *reversed(results)
+
+
+def _tanh(values: Tensor) -> Tensor:
+    """Replace values by their tanh, which is 2 sigmoid(2x) - 1."""
+    half = values.add_(values).sigmoid_()  # sums, because a multiplication by a number takes longer
+    return half.add_(half).sub_(1.0)

@@ -14,8 +14,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-_MANIFEST, _SEAL = "manifest.json", "seal"
-_MAX_MANIFEST_BYTES = 16 << 20
+MANIFEST, SEAL = "manifest.json", "seal"
+MAX_MANIFEST_BYTES = 16 << 20
 
 
 class DamagedError(Exception):
@@ -39,7 +39,7 @@ def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, An
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        for name, data in {**files, _MANIFEST: manifest, _SEAL: seal}.items():
+        for name, data in {**files, MANIFEST: manifest, SEAL: seal}.items():
             _write_synced(partial / name, data)
         _sync_directory(partial)
         _move_into_place(partial, directory)
@@ -83,10 +83,10 @@ class SealedDirectory:
         """Raise DamagedError, naming the directory, if the manifest is missing or damaged."""
         self._directory = directory
         try:
-            if (directory / _MANIFEST).stat().st_size > _MAX_MANIFEST_BYTES:
+            if (directory / MANIFEST).stat().st_size > MAX_MANIFEST_BYTES:
                 raise DamagedError(f"{directory}: the manifest is too large")
-            manifest = (directory / _MANIFEST).read_bytes()
-            seal = (directory / _SEAL).read_bytes()
+            manifest = (directory / MANIFEST).read_bytes()
+            seal = (directory / SEAL).read_bytes()
         except OSError as error:
             raise DamagedError(f"{directory}: {error.strerror}: {error.filename}") from None
         if hashlib.sha256(manifest).hexdigest().encode() != seal:

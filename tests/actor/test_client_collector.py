@@ -12,7 +12,8 @@ import torch
 from allowed_modules import TEST_MODULES
 from collectors import started_collector
 
-from daedalus.actor.collecting.client_collector import _MAX_FULL_ROLLOUTS, ClientCollector
+from daedalus.actor.collecting.client_collector import ClientCollector
+from daedalus.actor.collecting.client_exchange import _MAX_FULL_ROLLOUTS
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.session.learner_queries import ActorError
@@ -20,8 +21,9 @@ from daedalus.learner.serving.intake import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 ROWS = 5
@@ -73,11 +75,11 @@ class Robot:
 def drive(client: ClientCollector, robot: Robot, steps: int) -> None:
     """Run the caller's loop; continue where the last call ended."""
     for _ in range(steps):
-        observation, reward, terminated, truncated, _ = robot.environment.step(client.act(robot.observation))
-        client.reward(float(reward) / 2)
-        client.reward(float(reward) / 2)
+        observation, reward, terminated, truncated, _ = robot.environment.step(client.agents[0].act(robot.observation))
+        client.agents[0].reward(float(reward) / 2)
+        client.agents[0].reward(float(reward) / 2)
         if terminated or truncated:
-            client.end_episode(observation, terminated=terminated)
+            client.agents[0].end_episode(observation=observation, terminated=terminated)
             observation, _ = robot.environment.reset()
         robot.observation = observation
 
@@ -112,7 +114,7 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
         expected = copy.deepcopy(collector.collect(IDENTITY))
         while not client.has_rollout():
             drive(client, robot, 1)
-            if client._loaded is not None and client._loaded.policy_version == version:
+            if client.agents[0]._loaded is not None and client.agents[0]._loaded.version == version:
                 client.load(played.snapshot(version + 1))  # for the next rollout
         found.append(take(client))
         for name in Rollout.__dataclass_fields__:
@@ -125,7 +127,7 @@ def test_client_rollouts_equal_those_of_an_environment_collector(environment: di
 def test_oldest_rollouts_are_dropped_when_nobody_takes_them() -> None:
     client, robot = begun(Played(run_spec()))
     drive(client, robot, 200)
-    assert len(client._full) == _MAX_FULL_ROLLOUTS
+    assert len(client._exchange._full) == _MAX_FULL_ROLLOUTS
     assert client.dropped > 0
 
 
@@ -144,18 +146,18 @@ def test_new_policy_acts_from_the_first_step_after_its_weights_came() -> None:
 def test_invalid_calls_raise_and_change_nothing() -> None:
     client, robot = begun(Played(run_spec()))
     with pytest.raises(ValueError, match="before any action"):
-        client.reward(1.0)
+        client.agents[0].reward(1.0)
     with pytest.raises(ValueError, match="without any action"):
-        client.end_episode(None, terminated=True)
-    client.act(robot.observation)
+        client.agents[0].end_episode(terminated=True)
+    client.agents[0].act(robot.observation)
     with pytest.raises(ValueError, match="must be finite"):
-        client.reward(float("nan"))
+        client.agents[0].reward(float("nan"))
     with pytest.raises(ValueError, match="needs its last observation"):
-        client.end_episode(None, terminated=False)
+        client.agents[0].end_episode(terminated=False)
     with pytest.raises(ValueError, match="the observation has shape"):
-        client.act(np.zeros(99, np.float32))
-    client.reward(1.0)
-    client.end_episode(None, terminated=True)
+        client.agents[0].act(np.zeros(99, np.float32))
+    client.agents[0].reward(1.0)
+    client.agents[0].end_episode(terminated=True)
     drive(client, robot, ROWS)
     rollout = take(client)
     assert rollout.terminated[0, 0]
@@ -204,10 +206,10 @@ def played_with(overrides: dict[int, int], steps: int) -> tuple[list[Rollout], l
     rollouts: list[Rollout] = []
     actions = []
     for step, observation in enumerate(observations(steps)):
-        actions.append(int(client.act(observation, override=overrides.get(step))))
-        client.reward(step)
+        actions.append(int(client.agents[0].act(observation, override=overrides.get(step))))
+        client.agents[0].reward(step)
         rollouts += [] if not client.has_rollout() else [take(client)]
-    assert client.overridden_actions == len(overrides)
+    assert client.agents[0].overridden_actions == len(overrides)
     return rollouts, actions
 
 
@@ -249,26 +251,26 @@ def guarded(played: Played, **settings: Any) -> tuple[ClientCollector, Robot]:
 def test_old_policy_does_not_act_and_nothing_is_learned_from_its_rows() -> None:
     client, robot = guarded(Played(run_spec()))
     drive(client, robot, 3)
-    assert client.safe_actions == 0
+    assert client.agents[0].safe_actions == 0
     client.confirm(time.monotonic() - 31.0)
-    assert [client.act(robot.observation) for _ in range(4 * ROWS)] == [1] * 4 * ROWS
-    assert (client.safe_actions, client.dropped) == (4 * ROWS, 1)
+    assert [client.agents[0].act(robot.observation) for _ in range(4 * ROWS)] == [1] * 4 * ROWS
+    assert (client.agents[0].safe_actions, client.dropped) == (4 * ROWS, 1)
     assert client.guard.reason == "the learner did not confirm the policy within 30 s"
     assert not client.has_rollout()
     client.confirm(time.monotonic())
     drive(client, robot, ROWS + 1)
     assert client.guard.reason == ""
-    assert client.safe_actions == 4 * ROWS
+    assert client.agents[0].safe_actions == 4 * ROWS
     assert take(client).overridden is None
 
 
 def test_untrained_policy_acts_only_if_asked_for() -> None:
     client, robot = guarded(Played(run_spec()), version=0)
-    assert [client.act(robot.observation) for _ in range(20)] == [1] * 20
+    assert [client.agents[0].act(robot.observation) for _ in range(20)] == [1] * 20
     assert "no update has changed the policy yet" in client.guard.reason
     client, robot = guarded(Played(run_spec()), version=0, untrained=True)
     drive(client, robot, 20)
-    assert client.safe_actions == 0
+    assert client.agents[0].safe_actions == 0
 
 
 def test_another_learner_with_an_untrained_policy_does_not_drive() -> None:
@@ -277,16 +279,16 @@ def test_another_learner_with_an_untrained_policy_does_not_drive() -> None:
     drive(client, robot, 3)
     client.begin(played.runtime(), played.spec, 4)
     client.load(played.snapshot(0))
-    assert [client.act(robot.observation) for _ in range(20)] == [1] * 20
+    assert [client.agents[0].act(robot.observation) for _ in range(20)] == [1] * 20
     client.load(played.snapshot(1))
     drive(client, robot, 1)
-    assert client.safe_actions == 20
+    assert client.agents[0].safe_actions == 20
 
 
 def test_override_has_precedence_over_the_safe_action() -> None:
     client, robot = guarded(Played(run_spec()), version=0)
-    assert client.act(robot.observation, override=0) == 0
-    assert (client.overridden_actions, client.safe_actions) == (1, 0)
+    assert client.agents[0].act(robot.observation, override=0) == 0
+    assert (client.agents[0].overridden_actions, client.agents[0].safe_actions) == (1, 0)
 
 
 def test_safe_action_may_depend_on_the_observation() -> None:
@@ -310,12 +312,12 @@ def test_settings_of_the_safe_action_are_checked(arguments: tuple[Any, float | N
 
 def test_reward_may_come_after_the_end_of_its_episode() -> None:
     client, robot = begun(Played(run_spec()))
-    client.act(robot.observation)
-    client.end_episode(None, terminated=True)
-    client.reward(2.0)
-    client.reward(3.0)
+    client.agents[0].act(robot.observation)
+    client.agents[0].end_episode(terminated=True)
+    client.agents[0].reward(2.0)
+    client.agents[0].reward(3.0)
     with pytest.raises(ValueError, match="without any action"):
-        client.end_episode(None, terminated=True)
+        client.agents[0].end_episode(terminated=True)
     drive(client, robot, ROWS)
     rollout = take(client)
     assert rollout.rewards[:2, 0].tolist() == [5.0, 0.0]
@@ -326,10 +328,10 @@ def test_reward_may_come_after_the_end_of_its_episode() -> None:
 def test_terminated_episode_needs_its_last_observation_where_terminations_are_bootstrapped() -> None:
     """Without that observation the value of the one before it would be learned from."""
     client, robot = begun(Played(run_spec(bootstrap_terminations=True)))
-    client.act(robot.observation)
+    client.agents[0].act(robot.observation)
     with pytest.raises(ValueError, match=r"bootstraps terminated episodes.*pass the last observation"):
-        client.end_episode(None, terminated=True)
-    client.end_episode(robot.observation, terminated=True)
+        client.agents[0].end_episode(terminated=True)
+    client.agents[0].end_episode(observation=robot.observation, terminated=True)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.frames import stack_rows
-from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 ROWS = 5
 SPEC = RunSpec.model_validate(

@@ -14,8 +14,8 @@ from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.uploads import Rollout
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 ROWS = 4

@@ -15,8 +15,8 @@ from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.interface import Observed, Step
 from daedalus.policy.acting.noise import Noise
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
+from daedalus.protocol.uploads import Rollout
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 

@@ -86,11 +86,11 @@ def test_evaluator_does_not_join_as_an_actor(learner: ScriptedLearner, evaluator
 
 
 def test_failure_of_an_evaluator_is_reported_to_its_learner(network: MemoryNetwork) -> None:
-    learner = ScriptedLearner(network, run_spec(id="corridor:Corridor-v0"))
+    learner = ScriptedLearner(network, run_spec(id="absent_environment:Absent-v0"))
     evaluator = RunningEvaluator(network)
     evaluator.join()
     *_, failed = learner.joins.queue
-    assert "corridor" in failed.failure
+    assert "absent_environment" in failed.failure
     assert failed == replace(JOIN, failure=str(evaluator.error))
 
 

@@ -13,8 +13,9 @@ from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 EPSILON = 0.25
@@ -75,7 +76,7 @@ def test_actor_that_owns_no_loop() -> None:
     client.load(Snapshot(learner_epoch=1, policy_version=0, program="", weights=weights))
     random = np.random.default_rng(1)
     for _ in range(33):
-        client.act(random.standard_normal(4).astype(np.float32))
+        client.agents[0].act(random.standard_normal(4).astype(np.float32))
     rollout = client.collect(RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1))
     assert rollout is not None
     assert_explores(rollout)

@@ -19,7 +19,7 @@ from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import Choice
 from daedalus.policy.user_modules import NO_MODULES
-from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
 SPEC = EnvironmentSpec(id="Any-v0")
@@ -84,6 +84,30 @@ def test_masks_accompany_their_observations(convention: str) -> None:
         assert legal == [[0], [1], [2], [0], [0], [1], [2], [0]]
     finally:
         environments.close()
+
+
+def test_map_of_masks_arrives_with_every_step() -> None:
+    environments = make_environments(EnvironmentSpec(id="nested_environment:NestedMasked-v0"), 2, modules=TEST_MODULES)
+    try:
+        sizes = environments.spaces.masks
+        assert sizes
+        observed = environments.reset(1)
+        for _ in range(5):
+            assert {name: mask.shape for name, mask in observed.masks.items()} == {
+                name: (2, size) for name, size in sizes.items()
+            }
+            legal = {name: mask.argmax(1)[:, None] for name, mask in observed.masks.items()}
+            observed, *_ = environments.step(first_actions(environments.spaces) | legal)
+    finally:
+        environments.close()
+
+
+def first_actions(spaces: Spaces) -> dict[str, np.ndarray]:
+    """Return the first choice, or 0, of every component for two environments."""
+    return {
+        name: np.zeros((2, space.size), np.int64 if isinstance(space, DiscreteSpace) else np.float32)
+        for name, space in spaces.actions.items()
+    }
 
 
 class LegalPolicy(PlainPolicy):

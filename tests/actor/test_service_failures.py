@@ -13,12 +13,7 @@ from daedalus.actor.session import learner_queries, service, session_monitor
 from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
-from daedalus.protocol.messages import (
-    Acknowledgement,
-    Refusal,
-    RunEnded,
-    Welcome,
-)
+from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome
 from daedalus.transport.interface import RefusedError, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -102,13 +97,13 @@ def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
 
 
 def test_failure_of_an_actor_is_reported_to_its_learner(network: MemoryNetwork) -> None:
-    environment = SPEC.environment.model_copy(update={"id": "corridor:Corridor-v0"})
+    environment = SPEC.environment.model_copy(update={"id": "absent_environment:Absent-v0"})
     learner = ScriptedLearner(network, SPEC.model_copy(update={"environment": environment}))
     actor = RunningActor(network)
     actor.join()
     *_, failed = learner.joins.queue
     assert failed.failure == str(actor.error)
-    assert "corridor" in failed.failure
+    assert "absent_environment" in failed.failure
     assert (failed.actor, failed.spaces, failed.origin.host) == ("a", None, socket.gethostname())
     assert failed.origin.software.startswith("daedalus-rl ")
 

@@ -15,12 +15,8 @@ from daedalus.actor.session.service import LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import (
-    Message,
-    Rollout,
-    RolloutIdentity,
-    Snapshot,
-)
+from daedalus.protocol.messages import Message, Snapshot
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Inbox
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 

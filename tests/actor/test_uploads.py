@@ -17,8 +17,8 @@ from daedalus.algorithms.gradient_inputs import GradientInputs, packed
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Gradient
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Gradient
 from daedalus.transport.memory import MemoryNetwork
 
 

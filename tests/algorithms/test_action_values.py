@@ -20,9 +20,9 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 METHODS = ["one_step_q", "one_step_sarsa", "n_step_q"]
 MASKED = SPACES.model_copy(update={"actions": {"action": DiscreteSpace(counts=(4,), masked=True)}})

@@ -9,8 +9,8 @@ from building import ENVIRONMENTS, ROWS, SPACES, identity, join, make_rollout
 from plain import ACTION, NAME, array_space, plain_spaces
 
 from daedalus.algorithms.batch import Batch, BatchAssembler
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.uploads import Rollout
 
 CPU = torch.device("cpu")
 COPIED = ("behaviour_log_probs", "rewards", "terminated", "truncated", "valid")

@@ -33,7 +33,7 @@ class Numbered:
             assert torch.equal(minibatch.observations[NAME][row, column], self.batch.observations[NAME][t, b])
             assert torch.equal(minibatch.actions[ACTION][row, column], self.batch.actions[ACTION][t, b])
             assert torch.equal(minibatch.starts[row, column], self.batch.starts[t, b])
-            assert bool(minibatch.shares[row, column] > 0.0) == bool(self.batch.valid[t, b])
+            assert self.batch.valid[t, b] or minibatch.shares[row, column] == 0.0
             assert torch.equal(minibatch.targets[row, column], self.targets[t, b])
             assert torch.equal(minibatch.factors[row, column], self.factors[t, b])
         counted = minibatch.shares[minibatch.shares > 0.0]
@@ -57,9 +57,10 @@ def test_pass_without_memory_contains_each_valid_row_once(count: int) -> None:
     parts = made.pass_of(count)
     assert len(parts) == min(count, int(made.batch.valid.sum()))
     assert all(minibatch.shares.numel() for minibatch in parts)
-    sizes = [minibatch.shares.numel() for minibatch in parts]
+    assert {minibatch.shares.numel() for minibatch in parts} == {-(-ROWS * WIDTH // len(parts))}
+    sizes = [int((minibatch.shares > 0.0).sum()) for minibatch in parts]
     assert max(sizes) - min(sizes) <= 1
-    taken = torch.cat([minibatch.log_probs.flatten() for minibatch in parts])
+    taken = torch.cat([minibatch.log_probs[minibatch.shares > 0.0] for minibatch in parts])
     expected = made.numbers[made.batch.valid == 1.0]
     assert torch.equal(taken.sort().values, expected)
     for minibatch in parts:
@@ -81,6 +82,7 @@ def test_pass_with_memory_contains_each_environment_once_with_all_rows(count: in
     assert torch.equal(taken, made.numbers[:, columns])
     for minibatch in parts:
         made.assert_holds(minibatch)
+        assert torch.equal(minibatch.shares > 0.0, made.batch.valid[:, minibatch.log_probs[0].long()] == 1.0)
         assert torch.equal(minibatch.initial_state, made.batch.initial_state[minibatch.log_probs[0].long()])
 
 

@@ -16,11 +16,11 @@ from torch import Tensor
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 ROWS, ENVIRONMENTS = 12, 5
-GAMMA, LAMBDA, RHO, C = 0.9, 0.8, 1.25, 0.75
+GAMMA, LAMBDA, RHO, C, CLIP = 0.9, 0.8, 1.25, 0.75, 0.3
 ENTROPY_BONUS = 0.03
 
 
@@ -35,8 +35,9 @@ def rollout_with_overrides(state_size: int) -> Rollout:
 
 def spec_of(algorithm: str) -> TrainingSpec:
     settings = {"discount_factor": GAMMA, "trace_lambda": LAMBDA, "rho_clip": RHO, "trace_clip": C}
-    once = {"passes": 1, "minibatches": 1} if algorithm == "appo" else {}
-    return TrainingSpec.model_validate({"algorithm": algorithm, "normalize_advantages": False, **settings, **once})
+    if algorithm == "appo":
+        settings |= {"passes": 1, "minibatches": 1, "clip_range": CLIP, "proximal_policy": "behaviour"}
+    return TrainingSpec.model_validate({"algorithm": algorithm, "normalize_advantages": False, **settings})
 
 
 def pieces(rollout: Rollout, environment: int) -> Iterator[range]:
@@ -69,16 +70,18 @@ def expected_loss(spec: TrainingSpec, network: ActorCritic, rollout: Rollout) ->
             )
             for s in stream.rows:
                 t = rows[s]
-                if spec.algorithm in ("impala", "appo"):
+                if spec.algorithm == "impala":
                     target = vtrace(stream, GAMMA, LAMBDA, RHO, C, s)
                     factor = vtrace_advantage(stream, GAMMA, LAMBDA, RHO, C, s) * min(RHO, np.exp(log_ratios[t, e]))
                 else:
                     target = lambda_return(stream, GAMMA, LAMBDA, s)
                     factor = target - stream.V[s]
                 value_loss = (values[t, e] - target) ** 2
-                terms.append(
-                    -log_probs[t, e] * factor + spec.value_coefficient * value_loss - ENTROPY_BONUS * entropies[t, e]
-                )
+                gain = log_probs[t, e] * factor
+                if spec.algorithm == "appo":
+                    ratio = (log_probs[t, e] - float(rollout.behaviour_log_probs[t, e])).exp()
+                    gain = torch.minimum(ratio * factor, ratio.clip(1 - CLIP, 1 + CLIP) * factor)
+                terms.append(-gain + spec.value_coefficient * value_loss - ENTROPY_BONUS * entropies[t, e])
     assert len(terms) == rollout.env_steps
     return torch.stack(terms).mean()
 

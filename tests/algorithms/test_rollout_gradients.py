@@ -17,8 +17,8 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, bits_of, float32
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import DIAGNOSTICS, LARGEST_GRADIENT_NORM, LOSS_TERMS, Gradient, Rollout
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import DIAGNOSTICS, LARGEST_GRADIENT_NORM, LOSS_TERMS, Gradient, Rollout
 
 NORMALISED: dict[str, Any] = {"normalize_rewards": True, "normalize_advantages": True}
 ANNEALED: dict[str, Any] = {"entropy_bonus": 0.1, "entropy_bonus_final": 0.0}

@@ -6,7 +6,7 @@ from oracles import Stream, lambda_return, vtrace, vtrace_advantage
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
-from daedalus.algorithms.targets import uncorrected_targets, vtrace_corrected_targets
+from daedalus.algorithms.targets import lambda_targets, vtrace_corrected_targets
 from daedalus.protocol.spec import TrainingSpec
 
 SPEC = TrainingSpec(discount_factor=0.9, trace_lambda=0.8, rho_clip=1.25, trace_clip=0.75)
@@ -54,7 +54,7 @@ def test_targets_are_those_of_the_papers(random: torch.Generator) -> None:
         valid=VALID,
     )
     assert max(stream.log_ratios) > 0.3 > -0.3 > min(stream.log_ratios)  # the clips bind in some rows only
-    uncorrected = uncorrected_targets(SPEC, batch, target, values)
+    uncorrected = lambda_targets(SPEC, batch, target, values)
     corrected = vtrace_corrected_targets(SPEC, batch, target, values)
     for t in stream.rows:
         expected = lambda_return(stream, 0.9, 0.8, t)

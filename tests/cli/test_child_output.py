@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
 
 from daedalus.cli import child_output
-from daedalus.cli.child_output import ChildOutput, OutputLog, RateLimit
+from daedalus.cli.child_output import STREAMS, ChildOutput, OutputLog, RateLimit
 
 
 class Screen:
@@ -19,8 +20,8 @@ class Screen:
         self.log = folder / "output.log"
         self.output = ChildOutput(self.log, self.out.append, self.err.append)
 
-    def run(self, name: str, program: str, **options: bool) -> None:
-        with self.output.pipes(name, **options) as streams:
+    def run(self, name: str, program: str, shown: Collection[str] = STREAMS) -> None:
+        with self.output.pipes(name, shown=shown) as streams:
             process = subprocess.Popen(
                 [sys.executable, "-S", "-c", program], stdout=streams.stdout, stderr=streams.stderr
             )
@@ -62,7 +63,7 @@ def test_few_lines_are_all_shown_and_nothing_makes_no_log(screen: Screen) -> Non
 
 def test_error_lines_that_were_not_shown_are_kept(screen: Screen) -> None:
     print_errors = "import sys\nfor n in range(100): print('error', n, file=sys.stderr)"
-    screen.run("evaluation-1", print_errors, shown=False)
+    screen.run("evaluation-1", print_errors, shown=())
     assert screen.output.unshown("evaluation-1") == [f"error {n}" for n in range(60, 100)]
     screen.run("actor-0", print_errors)
     assert screen.output.unshown("actor-0")[-1] == "error 99"
@@ -81,9 +82,9 @@ def test_unlimited_output_is_shown_and_not_logged(screen: Screen) -> None:
 
 def test_a_line_without_end_does_not_fill_the_memory(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_output, "_LONGEST_LINE", 1000)
-    screen.run("a", "import os; os.write(1, b'x' * 30_000)")
+    screen.run("a", "import os; os.write(1, b''.join(b'%5d' % n for n in range(6000)))")
     screen.output.close()
-    assert "".join(screen.out[:31]) == "x" * 30_000
+    assert "".join(screen.out[:31]) == "".join(f"{n:5d}" for n in range(6000))
     assert max(map(len, screen.out[:31])) < 2000
 
 
@@ -117,3 +118,12 @@ def test_the_rate_limit_recovers_slowly() -> None:
     assert limit.take(100, 1.0) == 0
     assert limit.take(100, 11.0) == 2
     assert limit.take(100, 1e6) == child_output._SHOWN_AT_ONCE
+
+
+def test_a_warning_of_every_environment_is_shown_once(screen: Screen) -> None:
+    warn = "import sys\nfor n in range(20): print('old attribute\\n', file=sys.stderr)\nprint('other', file=sys.stderr)"
+    screen.run("actor-0", warn)
+    screen.output.close()
+    assert screen.err == ["old attribute", "", "other"]
+    assert screen.out == []  # what was shown before does not count as withheld
+    assert len(screen.log.read_text().splitlines()) == 41

@@ -11,7 +11,7 @@ from processes import LIMIT, until
 
 from daedalus.cli import supervisor
 from daedalus.cli.local_run import watch
-from daedalus.cli.processes import STOPPED
+from daedalus.cli.processes import RANK_LOST, STOPPED
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import RunSpec
 
@@ -116,3 +116,14 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
         assert any(continued in message for message in caplog.messages) == continues
     finally:
         stop([each.process for each in processes])
+
+
+def test_a_learner_that_has_lost_one_of_its_processes_is_restarted_and_has_not_failed() -> None:
+    process = supervised(f"import sys; sys.argv[1] == 'True' and sys.exit({RANK_LOST}); {SLEEP}")
+    try:
+        process.process.wait(LIMIT)
+        assert not process.failed_at_once
+        assert message(process) == "worker lost one of its processes; started again"
+        assert (process.restarts, process.failures) == (1, 0)
+    finally:
+        stop([process.process])

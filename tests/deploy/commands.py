@@ -6,7 +6,7 @@ import pytest
 
 from daedalus.cli import settings_arguments as learner_options
 from daedalus.cli.commands import actor_arguments as actor_options
-from daedalus.cli.commands import certs, exporter, router, status
+from daedalus.cli.commands import certs, exporter, router, status, train
 from daedalus.learner.run.settings import SettingsError
 from daedalus.transport.addresses import AddressError, check_listening
 
@@ -17,6 +17,7 @@ PARSERS = {
     "learner": learner_options.learner_parser,
     "router": router.parser,
     "status": status.parser,
+    "train": train.train_parser,
 }
 
 
@@ -26,7 +27,7 @@ def check(words: Sequence[str]) -> str:
     assert command in PARSERS, f"`daedalus {command}` is not a command for deployments"
     try:
         parsed = PARSERS[command]().parse_args(arguments)
-        if command == "learner":
+        if command in ("learner", "train"):
             learner_options.resolve(parsed)
         if command == "actor":
             actor_options.config(parsed, None)

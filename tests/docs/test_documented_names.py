@@ -15,7 +15,7 @@ FOLDERS = (
     "actor|algorithms|benchmarks|cli|daedalus|deploy|docs|examples|gateway|learner|policy|protocol|tests|transport"
 )
 ZENOH_SETTINGS = ("transport/link/", "transport/unicast/")
-FILE_ENDINGS = {"py", "ts", "md", "toml"}
+FILE_ENDINGS = {"py", "ts", "md", "toml", "json"}
 
 
 def anchor(heading: str) -> str:

@@ -12,19 +12,24 @@ from learner_status import actor_status, env_steps, learner_status
 from processes import Running, until
 
 Start = Callable[..., Running]
+LOGGED = ("--log", "wandb")
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 
-def test_an_actor_that_starts_before_the_learner_waits_for_it(start: Start, address: str) -> None:
+def test_an_actor_that_starts_before_the_learner_waits_for_it(
+    start: Start, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
     actor = start("actor", "--connect", address, "--name", "early")
     actor.expect("waiting for it")
-    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000)
+    learner = start("learner", "cartpole", "--listen", address, "--run-dir", "run", "--env-steps", 30000, *LOGGED)
     actor.expect("joined run 'run' as 'early': 128 x CartPole-v1")
     assert learner.wait() == 3, learner.output
     assert actor.wait() == 0, actor.output
     actor.expect("the run is over")
     time = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
     for line in learner.lines:
+        line = re.sub(r" tracker run=run: (?=wandb: recorded offline; )", " learner run=run: ", line)
         assert re.match(rf"{time} (info|warning) learner run=run( epoch=[0-9a-f]+)?( actor=early)?: ", line), line
     for line in actor.lines:
         assert re.match(rf"{time} (info|warning) actor actor=early( run=run epoch=[0-9a-f]+)?: ", line), line

@@ -22,7 +22,9 @@ from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
+from daedalus.cli.comparing.recorded_run import read_run
 from daedalus.cli.local_run import LocalRun, evaluate_run
+from daedalus.cli.reports.run_record import read_record
 from daedalus.cli.run_report import report as report_of
 from daedalus.cli.select_best import EvaluationFailedError
 from daedalus.learner.run.run_directory import create, read_json, write_json
@@ -331,10 +333,20 @@ def test_the_final_evaluation_uses_the_best_checkpoint_and_the_final_backend(
     assert (evaluation["policy_version"], evaluation["best_checkpoint"]) == (4, True)
     assert (evaluation["backend"], evaluation["episodes"], evaluation["actions"]) == ("envpool", 3, "greedy")
     assert evaluation["select_best"] == []
+    episodes = read_json(run / "evaluation.json")
+    assert len(episodes["returns"]) == len(episodes["lengths"]) == 3
+    recorded = read_record(read_run(_with_metrics(run))).evaluation
+    assert recorded is not None
+    assert (recorded.returns, recorded.policy_version) == (tuple(episodes["returns"]), 4)
     assert result["evaluation_return_mean"] == evaluation["return_mean"]
     assert result == summary
     report = report_of(local_run, summary)
     assert " over 3 greedy episodes of the best checkpoint on envpool's CartPole-v1\n" in report
+
+
+def _with_metrics(run: Path) -> Path:
+    (run / "metrics.csv").write_text("env_steps,episode_return_mean\n1,1\n")
+    return run
 
 
 def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evaluation(
@@ -360,10 +372,10 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
 
 def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path, output: ChildOutput) -> None:
     training = {"target_return": 20.0, "target_episodes": 40}
-    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 3}, training=training)
+    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 10}, training=training)
     score(run, 77.0, 4)
     spec = read_policy(run / "checkpoints" / "0000000005").spec
-    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 20.5}
+    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 1000.5}
     write_json(run / "summary.json", solved)
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
     summary = evaluate_run(local_run, threading.Event(), output)
@@ -380,7 +392,30 @@ def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path,
     )
     report = report_of(local_run, summary)
     assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
-    assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 20.5")
+    assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 1000.5")
+    assert "sampled_evaluation" not in summary  # the confirmation has sampled episodes already
+
+
+@pytest.mark.parametrize(("training_mean", "plays_again"), [(1000.0, True), (1.0, False), (None, False)])
+def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_sampled_actions(
+    tmp_path: Path, output: ChildOutput, training_mean: float | None, plays_again: bool
+) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 5, evaluation={"final_episodes": 10})
+    spec = read_policy(run / "checkpoints" / "0000000005").spec
+    trained = {"solved": False, "env_steps": 9, "updates": 5, "episode_return_mean": training_mean}
+    write_json(run / "summary.json", trained)
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    summary = evaluate_run(local_run, threading.Event(), output)
+    assert summary["evaluation"]["actions"] == "greedy"
+    assert summary["evaluation_return_mean"] == summary["evaluation"]["return_mean"]
+    assert ("sampled_evaluation" in summary) == plays_again
+    assert ("sampled actions: return" in report_of(local_run, summary)) == plays_again
+    if plays_again:
+        sampled = read_json(run / "summary.json")["sampled_evaluation"]
+        assert (sampled["actions"], sampled["episodes"], sampled["policy_version"]) == ("sampled", 10, 5)
+        assert sampled["seed"] == summary["evaluation"]["seed"]
+        (note,) = read_json(run / "evaluation.json")["notes"]
+        assert note.startswith(f"sampled actions: return {sampled['return_mean']:.1f} +- ")
 
 
 def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:

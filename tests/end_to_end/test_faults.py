@@ -352,7 +352,7 @@ def test_training_continues_with_a_warning_while_no_checkpoint_can_be_saved(
     serving.expect("checkpoints are saved again")
     until(lambda: newest_checkpoint(tmp_path / "run") > newest)
     assert serving.output.count("checkpoint not saved") == 1
-    assert status()["problems"] == []
+    until(lambda: status()["problems"] == [])
 
 
 def test_status_reports_a_learner_without_actors_as_unhealthy(

@@ -15,7 +15,7 @@ def study(folder: Path) -> tuple[list[dict[str, str]], str]:
     settings = ["--variants", "a3c rollouts", "a3c gradients", "--lags", "0", str(LAG), "--seeds", "1"]
     budget = ["--tasks", "cartpole", "--env-steps", str(5 * ROLLOUT)]
     output = subprocess.run(
-        [sys.executable, "-m", "benchmarks.study.lag", "--folder", str(folder), *settings, *budget],
+        [sys.executable, "-m", "benchmarks.study.lag", "--file", str(folder / "lag.csv"), *settings, *budget],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -1,5 +1,6 @@
-"""examples/own_loop.py against a real learner."""
+"""examples/own_loop.py and examples/several_agents.py against a real learner."""
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -7,15 +8,16 @@ from pathlib import Path
 import pytest
 from processes import Running
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "own_loop.py"
+_EXAMPLES = Path(__file__).parents[2] / "examples"
+OWN_LOOP, AGENTS = _EXAMPLES / "own_loop.py", _EXAMPLES / "several_agents.py"
 
 
 @pytest.fixture
 def example(tmp_path: Path, address: str) -> Iterator[Callable[..., Running]]:
     running: list[Running] = []
 
-    def start_one(*arguments: str) -> Running:
-        running.append(Running([sys.executable, str(EXAMPLE), address, *arguments], tmp_path))
+    def start_one(*arguments: str, script: Path = OWN_LOOP) -> Running:
+        running.append(Running([sys.executable, str(script), address, *arguments], tmp_path))
         return running[-1]
 
     yield start_one
@@ -45,3 +47,35 @@ def test_a_client_takes_part_in_a_synchronous_run(
     assert learner.wait() == 3, learner.output  # the budget ended without the target
     assert loop.wait() == 0, loop.output
     loop.expect("the run is over")
+
+
+@pytest.mark.parametrize(("algorithm", "environments"), [("appo", 1), ("a2c", 3)])
+def test_the_agents_of_one_loop_are_one_actor(
+    start: Callable[..., Running],
+    address: str,
+    example: Callable[..., Running],
+    tmp_path: Path,
+    algorithm: str,
+    environments: int,
+) -> None:
+    words = (
+        "--algorithm",
+        algorithm,
+        "--set",
+        "collection.rollout_length=64",
+        "--env-steps",
+        6_000,
+        "--actors",
+        1,
+        "--run-dir",
+        "run",
+    )
+    learner = start("learner", "cartpole", *words, "--listen", address)
+    loop = example("--name", "robots", "--agents", "3", script=AGENTS)
+    loop.expect(f"joined run 'run' as 'robots': {environments} x CartPole-v1")
+    assert learner.wait() == 3, learner.output  # the budget ended without the target
+    assert loop.wait() == 0, loop.output
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["env_steps"] >= 6_000
+    assert summary["episodes"] > 50
+    assert summary["rollouts_rejected"].keys() <= {"stale"}

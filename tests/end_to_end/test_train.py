@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from processes import Running, listening_ports, processes_mentioning, starting, until
+from trackers import wandb_run
 
+from daedalus.learner.run.event_file import read_events
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
 Start = Callable[..., Running]
@@ -94,8 +96,10 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
         "versions.json",
         "metrics.csv",
         "events",
+        "events.jsonl",
         "checkpoints",
         "summary.json",
+        "evaluation.json",
     }
     rows = metrics(directory)
     assert int(rows[-1]["env_steps"]) == summary(directory)["env_steps"]
@@ -121,10 +125,16 @@ def test_plot_draws_a_picture(solved: tuple[Path, str], start: Start, tmp_path: 
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_resume_has_nothing_to_do_or_continues_with_new_settings(start: Start, tmp_path: Path) -> None:
-    small = ("--actors", 1, "--set", "evaluation.final_episodes=2")
+def test_resume_has_nothing_to_do_or_continues_with_new_settings_and_its_trackers(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    small = ("--actors", 1, "--set", "evaluation.final_episodes=2", "--log", "wandb")
     first = start("train", "cartpole", "--env-steps", 20000, "--run-dir", "run", *small)
     assert first.wait() == 3, first.output  # the budget ended without the target
+    first.expect("wandb: recorded offline; upload the run with: wandb sync .*/run/wandb/offline-run-")
+    tracked = wandb_run(tmp_path / "run")
+    assert tracked["summary"]["summary/evaluation.episodes"] == 2
     before = newest_checkpoint(tmp_path / "run")
     rows, end = metrics(tmp_path / "run"), summary(tmp_path / "run")
 
@@ -146,6 +156,11 @@ def test_resume_has_nothing_to_do_or_continues_with_new_settings(start: Start, t
     rows = metrics(tmp_path / "run")
     assert [int(row["env_steps"]) for row in rows] == sorted(int(row["env_steps"]) for row in rows)
     assert float(rows[-1]["learning_rate"]) == 0.0001
+    again = wandb_run(tmp_path / "run")
+    assert again["id"] == tracked["id"]
+    assert again["config"]["training"]["learning_rate_final"] == 0.0001
+    assert max(again["history"]) == result["env_steps"] > max(tracked["history"])
+    assert again["summary"]["summary/evaluation.episodes"] == 3
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -187,6 +202,10 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
     running.expect("actor-1 was killed by signal 9; started again")
     assert running.wait() in (0, 3), running.output
     assert summary(tmp_path / "run")["env_steps"] >= 1_000_000
+    recorded = [(event.kind, event.actor) for event in read_events(tmp_path / "run")]
+    assert recorded[0] == ("started", "")
+    assert {("joined", "actor-0"), ("joined", "actor-1"), ("left", "actor-1"), ("restarted", "")} <= {*recorded}
+    assert ("ended", "") in recorded
 
 
 def test_an_environment_of_the_user_may_print(start: Start, tmp_path: Path) -> None:
@@ -215,9 +234,7 @@ def test_train_with_log_json_writes_each_log_record_as_one_json_object(start: St
     assert running.wait() in (0, 3), running.output
     records = [json.loads(line) for line in running.lines if line.startswith("{")]
     assert all({"time", "level", "logger", "message"} <= record.keys() for record in records)
-    assert {"daedalus.cli.local_run", "daedalus.learner.serving.evaluation_server"} <= {
-        record["logger"] for record in records
-    }
+    assert {"daedalus.cli.local_run", "daedalus.learner.serving.events"} <= {record["logger"] for record in records}
     plain = [line for line in running.lines if not line.startswith("{")]
     assert not {record["message"] for record in records} & set(plain)
     *progress, outcome, evaluation, folder = plain

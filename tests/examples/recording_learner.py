@@ -13,8 +13,9 @@ from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Program, Refusal, Rollout, RunEnded, Snapshot, Welcome
+from daedalus.protocol.messages import Acknowledgement, Join, Program, Refusal, RunEnded, Snapshot, Welcome
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, PolicySpec, RunSpec
+from daedalus.protocol.uploads import Rollout
 from daedalus.transport.interface import Request
 from daedalus.transport.memory import MemoryTransport
 

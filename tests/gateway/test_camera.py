@@ -5,6 +5,7 @@ import json
 import os
 import struct
 import sys
+from ctypes.util import find_library
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from processes import LIMIT
-from scripted_learner import POLICY, SPEC
+from scripted_learner import POLICY, SPEC, Policy
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
@@ -92,6 +93,24 @@ def test_an_episode_is_played_with_pictures() -> None:
     assert sum(shares) == pytest.approx(1.0, abs=1e-3)
     assert sum(taken for _, _, taken in moments[0].actions[0]["choices"]) == 1
     assert jpeg(moments[0].picture)[:3] == b"\xff\xd8\xff"
+
+
+@pytest.mark.skipif(find_library("EGL") is None, reason="libEGL is not installed")
+def test_mujoco_is_rendered_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mujoco")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"id": "InvertedPendulum-v5"})})
+    camera = EpisodeCamera(spec, NO_MODULES)
+    try:
+        policy = Policy.of(spec.policy, camera.spaces)
+        acting = OnnxRuntime(policy.model)
+        acting.load({name: value.detach().numpy() for name, value in policy.network.named_parameters()})
+        moment = next(camera.play(acting))
+    finally:
+        camera.close()
+    assert moment.picture.std() > 1.0, "a picture, not one colour"
+    assert len(moment.actions[0]["numbers"]) == 1
 
 
 def test_large_pictures_are_made_smaller() -> None:

@@ -9,11 +9,11 @@ import msgpack
 import numpy as np
 import pytest
 from gateways import CARTPOLE, JsonClient, RunningGateway
-from processes import until
+from processes import LIMIT, until
 from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.gateway import connection
+from daedalus.gateway import connection, policy_versions
 from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.messages import Act
@@ -109,7 +109,10 @@ def test_clients_that_wait_are_chosen_for_in_one_call(
 
     async def act_together(inner: Gateway) -> list[Any]:
         actors = [seat.actor for seat in inner._seats.values()]
-        return await asyncio.gather(*(inner.act(actor, Act([1, 2, 3, 4], None, 0.0)) for actor in actors))
+        actions: list[asyncio.Future[Any]] = [gateway.loop.create_future() for _ in actors]
+        for actor, action in zip(actors, actions, strict=True):
+            inner.act(actor, Act([1, 2, 3, 4], None, 0.0), action.set_result)
+        return await asyncio.gather(*actions)
 
     together = asyncio.run_coroutine_threadsafe(act_together(gateway.gateway), gateway.loop)
     assert set(together.result(30)) <= {0, 1}
@@ -180,8 +183,8 @@ def test_disconnected_client_is_absent_and_may_continue_its_rollout(
 def test_silent_client_holds_up_nobody_and_loses_its_version_when_memory_is_needed(
     learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gateway_module, "_MIN_VERSIONS", 2)
-    monkeypatch.setattr(gateway_module, "_VERSION_BYTES", 0)
+    monkeypatch.setattr(policy_versions, "_MIN_VERSIONS", 2)
+    monkeypatch.setattr(policy_versions, "_VERSION_BYTES", 0)
     monkeypatch.setattr(gateway_module, "_SLOW_SECONDS", 0.5)
     silent, busy = connect(), connect()
     silent.hello("silent")
@@ -278,13 +281,55 @@ def test_refusal_of_the_learner_reaches_the_client(learner: ScriptedLearner, con
     assert ended(client) == 1008
 
 
-def test_synchronous_run_refuses_clients(network: MemoryNetwork, connect: Connect) -> None:
+def test_clients_of_a_synchronous_run_go_on_between_updates_and_those_rows_are_not_sent(
+    network: MemoryNetwork, connect: Connect
+) -> None:
     training = SPEC.training.model_copy(update={"algorithm": "a2c"})
     learner = ScriptedLearner(network, SPEC.model_copy(update={"training": training}))
+    learner.publish(0)
     try:
-        assert "clients of a gateway do not: use another algorithm" in connect().hello("arm-1")["reason"]
+        client = connect()
+        client.hello("arm-1")
+        fill_rollout(client)
+        first, request = learner.receive()
+        acknowledge(request, "accepted")
+        for step in range(2 * ROWS):
+            assert client.act([100.0 + step, 0.0, 0.0, 0.0])["action"] in (0, 1)
+        learner.publish(1)
+        step = 200.0
+        while learner.rollouts.empty():  # until the gateway has the new version, and a rollout is full
+            client.act([step, 0.0, 0.0, 0.0], reward=1.0)
+            step += 1.0
+        second, _ = learner.receive()
+        assert [rollout.policy_version for rollout in (first, second)] == [0, 1]
+        assert second.identity.sequence == 1
+        begin = second.frames["observation"][0, 0, 0]
+        assert begin >= 200.0
+        assert second.frames["observation"][:, 0, 0].tolist() == [begin + row for row in range(ROWS + 1)]
+        assert second.rewards.tolist() == [[1.0]] * ROWS
     finally:
         learner.transport.close()
+
+
+def test_override_is_the_action_and_its_row_is_marked(learner: ScriptedLearner, connect: Connect) -> None:
+    client, message = connect(), {"reward": 1.0}
+    client.hello("arm-1")
+    assert client.act([0.0, 0.0, 0.0, 0.0], override=1)["action"] == 1, "no rollout begins with it"
+    client.act([1.0, 0.0, 0.0, 0.0], **message)
+    for action in (0, 1):
+        assert client.act([2.0 + action, 0.0, 0.0, 0.0], **message, override=action)["action"] == action
+    assert "outside its space" in client.act([9.0, 0.0, 0.0, 0.0], **message, override=2)["reason"]
+    client.act([4.0, 0.0, 0.0, 0.0], **message)
+    client.act([5.0, 0.0, 0.0, 0.0], **message)
+    rollout, request = learner.receive()
+    acknowledge(request, "accepted")
+    assert rollout.frames["observation"][:, 0, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert rollout.overridden is not None
+    assert rollout.overridden[:, 0].tolist() == [False, True, True, False]
+    assert rollout.rewards.tolist() == [[1.0]] * ROWS
+    while (report := learner.reports.get(timeout=LIMIT)).overridden_actions < 3:
+        pass
+    assert report.actor == "arm-1"
 
 
 def test_name_belongs_to_one_client_at_a_time(learner: ScriptedLearner, connect: Connect) -> None:
@@ -304,7 +349,7 @@ def test_name_that_is_no_part_of_a_key_is_refused(learner: ScriptedLearner, conn
     [
         ({"type": "act", "observation": [1, 2, 3]}, "the observation has 3 values, but its space is float32 array"),
         ({"type": "act", "observation": ["a"] * 4}, "not an array of numbers"),
-        ({"type": "act", "observation": [1e300, 0, 0, 0]}, "not finite"),
+        ({"type": "act", "observation": [1e300, 0, 0, 0]}, "a value beyond"),
         ({"type": "act", "observation": [[1, 2], 3]}, "not an array of numbers"),
         ({"type": "act"}, "act lacks the field 'observation'"),
         ({"type": "act", "observation": [0] * 4, "action_mask": [1, 1]}, "no action is masked in the hello"),

@@ -1,6 +1,7 @@
 """Clients with composite spaces and masks: what the policy sees and what the rollouts hold, compared with a Client."""
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,8 +15,8 @@ from scripted_learner import Policy, ScriptedLearner
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.errors import ClientError
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, RunSpec
+from daedalus.protocol.uploads import Rollout
 from daedalus.transport.memory import MemoryNetwork
 
 STATED: dict[str, Any] = {
@@ -168,7 +169,9 @@ def test_wrong_spaces_are_named(observations: Any, actions: Any, text: str) -> N
         ({**OBSERVATION, "camera.image": b"12345"}, "has 5 bytes"),
         ({**OBSERVATION, "sensors.level": [10**400, 0]}, "not an array of numbers"),
         ({**OBSERVATION, "sensors.level": [1e16, 0]}, "beyond"),
-        ({**OBSERVATION, "sensors.level": [1e300, 0]}, "not finite"),
+        ({**OBSERVATION, "sensors.level": [1e300, 0]}, "beyond"),
+        ({**OBSERVATION, "sensors.level": [float("nan"), 0]}, "not finite"),
+        ({**OBSERVATION, "sensors.level": [-(2**63), 0]}, "beyond"),
         ({**OBSERVATION, "more": 1}, "must be a map with"),
         ([1, 2], "must be a map with"),
     ],
@@ -199,3 +202,29 @@ def test_largest_legal_message_fits_the_limit() -> None:
     worst = {**OBSERVATION, "sensors.level": [-1.2345678901234567e-300] * 2, "camera.image": [[255] * 3] * 2}
     message = json.dumps({"type": "act", "observation": worst, "action_mask": {"gear": [False] * 4}}, indent=4)
     assert len(message) <= spaces.max_message_bytes < 10_000
+
+
+@pytest.mark.parametrize("value", [1, [1]])
+def test_override_is_an_action_of_the_space(value: Any) -> None:
+    ClientSpaces({"observation": PLAIN}, {"action": CHOICE}).check_action(value)
+
+
+@pytest.mark.parametrize(
+    ("action", "value", "text"),
+    [
+        (CHOICE, True, "must have 1 integers"),
+        (CHOICE, 1.0, "must have 1 integers"),
+        (CHOICE, [0, 1], "must have 1 integers"),
+        (CHOICE, -1, "outside its space"),
+        (CHOICE, {"action": 99}, "action of the override is outside its space"),
+        (CHOICE, {"more": 1}, "the override must be a map with action"),
+        (CHOICE, 10**400, "must have 1 integers"),
+        (CHOICE, [[1], [1, 2]], "must have 1 integers"),
+        ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5], "must have 2 numbers"),
+        ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [1.5, 0], "outside its space"),
+        ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5, math.inf], "outside its space"),
+    ],
+)
+def test_wrong_override_is_named(action: Any, value: Any, text: str) -> None:
+    with pytest.raises(ClientError, match=text):
+        ClientSpaces({"observation": PLAIN}, {"action": action}).check_action(value)

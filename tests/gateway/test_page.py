@@ -11,9 +11,10 @@ import pytest
 from browser import Visit, chromium
 from gateways import RunningGateway
 from processes import LIMIT, Running, starting, until
-from scripted_learner import SPEC, ScriptedLearner
+from scripted_learner import SPEC, ScriptedLearner, acknowledge
 from watched import HOSTILE, actor_status, observed, run_status
 
+from daedalus.cli.commands.certs import certs
 from daedalus.cli.status_query import ask
 from daedalus.protocol.status import Event
 from daedalus.transport.connecting import connect
@@ -197,6 +198,30 @@ def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwo
     finally:
         running.close()
         learner.transport.close()
+
+
+def test_play_beyond_loopback_needs_the_token_of_its_name(
+    network: MemoryNetwork, learner: ScriptedLearner, visit: Open, tmp_path: Path
+) -> None:
+    folder = tmp_path / "certs"
+    for words in (["init", str(folder)], ["issue", "gateway"], ["issue", "client", "phone"]):
+        assert certs(words if words[0] == "init" else [*words, "--directory", str(folder)]) == 0
+    running = RunningGateway(network, folder / "gateway")
+    try:
+        # The test does not install the CA in the browser, as the visitor of a phone would.
+        page = visit(f"https://127.0.0.1:{running.port}/play", ignore_https_errors=True).page
+        page.wait_for_selector("#status:has-text('Not playing: the token is not one of this name')")
+        page.locator("#name").fill("phone")
+        page.locator("#token").fill((folder / "client-phone" / "token").read_text().strip())
+        page.get_by_role("button", name="Play").click()
+        page.wait_for_selector("#status:has-text('Playing as phone')", timeout=MILLISECONDS)
+        rollout, request = learner.receive()
+        acknowledge(request, "accepted")
+        assert rollout.identity.actor == "phone"
+        assert rollout.rewards.tolist() == [[1.0]] * len(rollout.rewards)
+        page.close()  # it would try to connect to a gateway that is closed, which its console reports
+    finally:
+        running.close()
 
 
 def test_a_thousand_actors_are_aggregated_filtered_and_sorted_by_keyboard(gateway: RunningGateway, visit: Open) -> None:

@@ -1,5 +1,6 @@
 """Who may use a gateway: tokens, TLS, origins and hosts; and the limits of one client."""
 
+import contextlib
 import json
 import socket
 import ssl
@@ -179,3 +180,18 @@ def test_connection_without_a_request_is_closed(
     with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as silent:
         silent.sendall(b"GET /actor HTTP/1.1\r\nHost:")
         assert silent.recv(1) == b""
+
+
+def test_gateway_that_stops_ends_connections_whose_clients_do_not_answer(network: MemoryNetwork, folder: Path) -> None:
+    running = RunningGateway(network, folder / "gateway", follows=False)
+    with socket.create_connection(("127.0.0.1", running.port), LIMIT) as connection:
+        trusting = ssl.create_default_context(cafile=folder / "client-phone" / "ca.pem")
+        encrypted = trusting.wrap_socket(connection, server_hostname="127.0.0.1")
+        encrypted.sendall(f"GET /protocol.json HTTP/1.1\r\nHost: 127.0.0.1:{running.port}\r\n\r\n".encode())
+        assert encrypted.recv(1) == b"H"
+        with socket.socket(fileno=encrypted.detach()) as silent:  # it does not say that it ends its side of TLS
+            running.close()
+            silent.settimeout(LIMIT)
+            with contextlib.suppress(ConnectionResetError):
+                while silent.recv(4096):
+                    pass

@@ -22,7 +22,7 @@ class PlainLearner:
 
     def __init__(self, spec: TrainingSpec, policy: PolicySpec, start: dict[str, np.ndarray]) -> None:
         self.spec = spec
-        self.network = ActorCritic(policy, SPACES)
+        self.network = ActorCritic(policy, SPACES, training=spec)
         self.network.load_state_dict({name: torch.from_numpy(array) for name, array in start.items()})
         self.parameters = list(self.network.parameters())
         self.adam = torch.optim.Adam(self.parameters, eps=spec.optimizer_epsilon)
@@ -34,6 +34,8 @@ class PlainLearner:
             before, _, values = self._play_back(batch)
         streams = [self._stream(batch, b, before, values) for b in range(batch.rewards.shape[1])]
         targets = {(t, b): self._targets(streams[b], t) for t, b in batch.valid.nonzero().tolist()}
+        if self.spec.proximal_policy == "behaviour" and not self.spec.explores:
+            before = {cell: batch.behaviour_log_probs[cell] for cell in targets}
         first = self._first_pass_metrics(list(targets), targets, values)
         measured = [first | self._update(batch, cells, targets, before, rate, bonus) for cells in self._parts(batch)]
         return {name: float(np.mean([each[name] for each in measured])) for name in measured[0]}
@@ -137,7 +139,7 @@ class PlainLearner:
         """The value target, the advantage, and the weight of the row in the policy gradient."""
         spec = self.spec
         gamma, lam = spec.discount_factor, spec.trace_lambda
-        if spec.algorithm in ("impala", "appo"):
+        if spec.algorithm == "impala":
             clips = (spec.rho_clip, spec.trace_clip)
             return (
                 vtrace(x, gamma, lam, *clips, t),
@@ -145,7 +147,7 @@ class PlainLearner:
                 rho(x, t, spec.rho_clip),
             )
         goal = lambda_return(x, gamma, lam, t)
-        return goal, goal - x.V[t], 1.0
+        return goal, goal - x.V[t], rho(x, t, spec.rho_clip) if spec.explores else 1.0
 
     def _descend(self, rate: float) -> None:
         if self.spec.optimizer == "adam":

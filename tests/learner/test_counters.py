@@ -8,7 +8,7 @@ import pytest
 from building import make_rollout
 
 from daedalus.learner.run.counters import RunCounters
-from daedalus.protocol.messages import Rollout
+from daedalus.protocol.uploads import Rollout
 
 
 def rollout(version: int = 0, returns: tuple[float, ...] = (), seed: int = 0) -> Rollout:

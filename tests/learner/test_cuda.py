@@ -13,9 +13,9 @@ from plain import NAME, act, array_space
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 

@@ -14,7 +14,13 @@ from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, EvaluationReport, EvaluationRequest, Refusal, Snapshot
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    EvaluationReport,
+    EvaluationRequest,
+    Refusal,
+    Snapshot,
+)
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 

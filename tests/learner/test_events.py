@@ -102,3 +102,20 @@ def test_long_texts_are_cut(clock: Clock) -> None:
     log.add("refused", "x" * 5000, actor="a" * 5000)
     (event,) = log.report()
     assert (len(event.actor), len(event.text)) == (64, 300)
+
+
+def test_new_events_are_taken_once_and_the_counts_of_equal_ones_add_up(clock: Clock) -> None:
+    log = EventLog()
+
+    def taken() -> list[tuple[str, int]]:
+        return [(event.text, event.count) for event in log.take_new()]
+
+    for _ in range(3):
+        log.add("rejected", "stale", actor="arm")
+    log.add("started", "started")
+    assert taken() == [("stale", 3), ("started", 1)]
+    assert taken() == []
+    for _ in range(2):
+        log.add("rejected", "stale", actor="arm")
+    assert taken() == [("stale", 2)]
+    assert [event.count for event in log.report()] == [5, 1]

@@ -24,8 +24,8 @@ from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor
 from daedalus.learner.serving.rollout_intake import RolloutIntake
 from daedalus.learner.training.learner import Learner
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 RELU = PolicySpec(hidden=(8,), activation="relu")
 HUGE_REWARDS: dict[str, Any] = {"rewards": np.full((ROWS, ENVIRONMENTS), 1e30, np.float32)}

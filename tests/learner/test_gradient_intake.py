@@ -12,8 +12,9 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.intake import Intake, Rejected
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Gradient, Message, Upload
+from daedalus.protocol.messages import Message
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Gradient, Upload
 
 VERSION, MAX_LAG = 10, 4
 

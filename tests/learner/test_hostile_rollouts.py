@@ -25,8 +25,8 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.intake import Intake, Rejected
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 CELLS = (ROWS, ENVIRONMENTS)
 NORMALIZED = PolicySpec(hidden=(8,), activation="relu", normalize_observations=True)

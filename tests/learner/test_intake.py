@@ -15,8 +15,9 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Join, Rollout, RunEnded, Snapshot, Upload
+from daedalus.protocol.messages import Join, RunEnded, Snapshot
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout, Upload
 
 VERSION, MAX_LAG = 10, 4
 FENCED = ("epoch", "unknown_actor")  # the causes for which an actor joins again
@@ -476,6 +477,18 @@ def test_a2c_rejects_older_versions_regardless_of_max_policy_lag() -> None:
     assert isinstance(late, Rejected)
     assert late.cause == "stale"
     assert isinstance(harness.receive(encode(good(rollout_identity=identity(sequence=1)))), Rollout)
+
+
+def test_the_lag_bound_has_room_for_all_rollouts_in_flight_of_a_fleet_larger_than_expected() -> None:
+    """Otherwise all rollouts of many actors would be rejected as too old, for as long as the learner is slower."""
+    spec = run_spec(max_policy_lag=None)
+    version = 200 * spec.collection.window // spec.batch_rollouts * spec.training.updates_per_batch
+    assert version > spec.policy_lag_bound
+    rollout = encode(make_rollout(identity(actor="actor-7"), version=0))
+    for names, accepted in ((["actor-7"], False), ([f"actor-{number}" for number in range(200)], True)):
+        intake = Intake(spec, EPOCH, joined_fleet(*names))
+        verdict = intake.judge("actor-7", intake.read("actor-7", rollout), version, 1.0)
+        assert isinstance(verdict, Rollout) == accepted
 
 
 # ------------------------------------------------------------------------------------------- quarantine

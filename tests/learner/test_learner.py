@@ -19,9 +19,9 @@ from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS, UpdateMetrics
 from daedalus.policy.network.actor_critic import ActorCritic
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
+from daedalus.protocol.uploads import Rollout
 
 STEPS = 5
 NORMALIZED = PolicySpec(hidden=(8,), normalize_observations=True)
@@ -60,7 +60,14 @@ KINDS = {
         "value_loss": "huber",
         "normalize_advantages": True,
     },
-    "appo": {"algorithm": "appo", "trace_lambda": 0.95, "rho_clip": 1.5, "clip_range": 0.05},
+    "appo": {"algorithm": "appo", "trace_lambda": 0.95, "clip_range": 0.05},
+    "appo, behaviour": {"algorithm": "appo", "proximal_policy": "behaviour", "trace_lambda": 0.95},
+    "appo, exploring": {
+        "algorithm": "appo",
+        "proximal_policy": "behaviour",  # has no effect
+        "rho_clip": 1.5,
+        "exploration": (0.1,),
+    },
     "appo, one update": {"algorithm": "appo", "passes": 1, "minibatches": 1},
     "appo, all": {
         "algorithm": "appo",
@@ -151,12 +158,27 @@ def test_first_gradient_is_equal_for_all_algorithms_on_policy(policy: PolicySpec
 
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
-def test_first_gradient_of_appo_equals_impala_off_policy(policy: PolicySpec) -> None:
-    """Ratios of appo are relative to the policy before the batch; V-trace corrects for the behaviour policy."""
-    common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1}
-    impala, appo = (make_learner(policy, algorithm=name, **common) for name in ("impala", "appo"))
+def test_first_gradient_of_appo_equals_a2c_where_actors_explore(policy: PolicySpec) -> None:
+    """Its ratios are then relative to the policy before the batch; the weights correct for the behaviour policy."""
+    common = {"max_gradient_norm": 1e9, "passes": 1, "minibatches": 1, "exploration": (0.1,), "rho_clip": 1.5}
+    a2c, appo = (make_learner(policy, algorithm=name, **common) for name in ("a2c", "appo"))
     rollouts = make_rollouts(1, state_size=appo.state_size)
-    assert_close(first_gradient(appo, rollouts), first_gradient(impala, rollouts), rtol=1e-4, atol=1e-6)
+    assert_close(first_gradient(appo, rollouts), first_gradient(a2c, rollouts), rtol=1e-4, atol=1e-6)
+
+
+def test_appo_stays_near_the_behaviour_policy() -> None:
+    """A good action that the updates since have made likely enough is not learned from any more."""
+    settings = {"passes": 1, "minibatches": 1, "clip_range": 0.2, "value_coefficient": 0.0, "entropy_bonus": 0.0}
+    settings["proximal_policy"] = "behaviour"
+    for ratio, clipped in ((1.0, 0.0), (1.1, 0.0), (1.3, 1.0)):
+        learner = make_learner(algorithm="appo", **settings)
+        before = weights(learner)
+        (rollout, *_) = on_policy(POLICY, before, make_rollouts(1, state_size=learner.state_size))
+        older = rollout.behaviour_log_probs - np.float32(np.log(ratio))
+        learner.step([replace(rollout, behaviour_log_probs=older, rewards=rollout.rewards + 100.0)], 0.0)
+        assert learner.metrics.take_means()["clipped_fraction"] == pytest.approx(clipped)
+        changed = any(not np.array_equal(array, learner.weights()[name]) for name, array in before.items())
+        assert changed == (clipped == 0.0)
 
 
 @pytest.mark.parametrize("policy", [POLICY, RECURRENT], ids=["mlp", "gru"])
@@ -496,7 +518,7 @@ def test_diagnostics_are_those_of_the_newest_batch_before_its_first_update(kind:
     assert measured["rho_effective_share"] == pytest.approx(
         ratios.sum() ** 2 / (len(ratios) * (ratios**2).sum()), rel=1e-4
     )
-    assert measured.get("rho_clipped_fraction") == (None if kind == "a2c" else pytest.approx((ratios > 1.25).mean()))
+    assert measured.get("rho_clipped_fraction") == (pytest.approx((ratios > 1.25).mean()) if kind == "impala" else None)
     assert measured["value_error_p05"] < measured["value_error_p50"] < measured["value_error_p95"]
     assert learner.take_diagnostics() == {}
 

@@ -12,8 +12,8 @@ from daedalus.algorithms import normalization
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
-from daedalus.protocol.messages import Rollout
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.uploads import Rollout
 
 DISCOUNT = 0.9
 ACTIONS: dict[str, ActionSpace] = {"action": DiscreteSpace(counts=(4,))}

@@ -17,9 +17,9 @@ from daedalus.policy.acting.torch_runtime import TorchRuntime
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 POLICIES = {

@@ -14,7 +14,16 @@ from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import PROTOCOL_VERSION, decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Join, Message, Origin, Program, Refusal, RunEnded, Welcome
+from daedalus.protocol.messages import (
+    Acknowledgement,
+    Join,
+    Message,
+    Origin,
+    Program,
+    Refusal,
+    RunEnded,
+    Welcome,
+)
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 

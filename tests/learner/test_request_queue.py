@@ -1,4 +1,4 @@
-"""learner/serving/request_queue.py: first in, first out, bounded by bytes and by number."""
+"""learner/serving/request_queue.py: first in, first out, bounded by bytes, number and waiting time."""
 
 import queue
 import threading
@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daedalus.learner.serving import request_queue
 from daedalus.learner.serving.request_queue import RequestQueue
 
 
@@ -43,6 +44,17 @@ def test_request_above_the_number_limit_is_refused_until_one_is_taken() -> None:
     assert queue.offer(UnansweredRequest(0))
     assert queue.offer(UnansweredRequest(1))
     assert not queue.offer(UnansweredRequest(1))
+    queue.take()
+    assert queue.offer(UnansweredRequest(1))
+
+
+def test_requests_are_refused_while_the_oldest_has_waited_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = RequestQueue(100, 100)
+    assert queue.offer(UnansweredRequest(1))
+    assert queue.offer(UnansweredRequest(1))
+    monkeypatch.setattr(request_queue, "_OLDEST_SECONDS", -1.0)  # each waiting request has waited too long
+    assert not queue.offer(UnansweredRequest(1))
+    queue.take()
     queue.take()
     assert queue.offer(UnansweredRequest(1))
 

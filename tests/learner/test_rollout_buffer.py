@@ -6,7 +6,7 @@ import pytest
 from building import identity, make_rollout
 
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, StreamBuffer, TakenRollouts
-from daedalus.protocol.messages import Rollout, Upload
+from daedalus.protocol.uploads import Rollout, Upload
 
 
 def rollout(actor: str, sequence: int = 0, version: int = 0) -> Rollout:
@@ -92,7 +92,7 @@ def test_empty_barrier_returns_no_batch() -> None:
 
 
 def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
-    buffer = StreamBuffer(2, 0)
+    buffer = StreamBuffer(2, lambda _live: 0)
     for sequence in range(3):
         buffer.add(rollout("a" if sequence % 2 else "b", sequence))
     assert sequences(buffer.take({"a", "b", "c"}, 0, 0.0).rollouts) == [0, 1]
@@ -102,7 +102,7 @@ def test_stream_returns_rollouts_of_all_actors_in_order_of_arrival() -> None:
 
 
 def test_stream_returns_stale_rollouts_separately() -> None:
-    buffer = StreamBuffer(2, 3)
+    buffer = StreamBuffer(2, lambda _live: 3)
     for sequence, version in enumerate((0, 1, 5, 1, 4)):
         buffer.add(rollout("a", sequence, version))
     taken = buffer.take({"a"}, 5, 0.0)
@@ -112,13 +112,13 @@ def test_stream_returns_stale_rollouts_separately() -> None:
 
 
 def test_stream_returns_a_rollout_with_policy_lag_at_the_bound() -> None:
-    buffer = StreamBuffer(1, 3)
+    buffer = StreamBuffer(1, lambda _live: 3)
     buffer.add(rollout("a", version=2))
     assert sequences(buffer.take(set(), 5, 0.0).rollouts) == [0]
 
 
 def test_stream_returns_stale_rollouts_when_no_batch_is_complete() -> None:
-    buffer = StreamBuffer(2, 0)
+    buffer = StreamBuffer(2, lambda _live: 0)
     buffer.add(rollout("a", 0, version=0))
     buffer.add(rollout("a", 1, version=1))
     taken = buffer.take(set(), 1, 0.0)
@@ -129,7 +129,7 @@ def test_stream_returns_stale_rollouts_when_no_batch_is_complete() -> None:
 
 @pytest.mark.parametrize(("batch", "room"), [(1, 2), (2, 2), (3, 3)])
 def test_stream_has_room_for_a_batch_and_at_least_two_rollouts(batch: int, room: int) -> None:
-    buffer = StreamBuffer(batch, 0)
+    buffer = StreamBuffer(batch, lambda _live: 0)
     for sequence in range(room):
         assert buffer.has_room_for(rollout("a", sequence))
         buffer.add(rollout("a", sequence))

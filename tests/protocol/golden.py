@@ -20,14 +20,11 @@ from daedalus.protocol.messages import (
     EvaluationRequest,
     EventsReport,
     EventsRequest,
-    Gradient,
     Join,
     Message,
     Origin,
     Program,
     Refusal,
-    Rollout,
-    RolloutIdentity,
     RunEnded,
     Snapshot,
     SnapshotPart,
@@ -40,6 +37,7 @@ from daedalus.protocol.orders import OrderRequest
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
+from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
 FOLDER = Path(__file__).parent / "golden"
 _T, _E, _K = 3, 2, 4

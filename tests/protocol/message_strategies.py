@@ -16,13 +16,10 @@ from daedalus.protocol.messages import (
     EvaluationRequest,
     EventsReport,
     EventsRequest,
-    Gradient,
     Join,
     Origin,
     Program,
     Refusal,
-    Rollout,
-    RolloutIdentity,
     RunEnded,
     Snapshot,
     SnapshotPart,
@@ -43,6 +40,7 @@ from daedalus.protocol.spec import (
     TrainingSpec,
 )
 from daedalus.protocol.status import ActorsPage, ActorStatus, Event, EventsPage, RefusedJoin, RunStatus
+from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
 text = st.text(max_size=20)
 counters = st.integers(0, 2**63 - 1)

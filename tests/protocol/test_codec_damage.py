@@ -9,9 +9,7 @@ from message_strategies import messages, text
 from wire_format import DTYPES, LIMITS, SAMPLES, decoded_or_refused, repeatable, unwire, wire, wire_header
 
 from daedalus.protocol.codec import ProtocolError, decode, encode
-from daedalus.protocol.messages import (
-    Message,
-)
+from daedalus.protocol.messages import Message
 
 
 @pytest.mark.parametrize("name", SAMPLES)

@@ -19,13 +19,7 @@ from wire_format import (
 )
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, VersionMismatchError, decode, encode
-from daedalus.protocol.messages import (
-    Join,
-    Message,
-    Refusal,
-    RunEnded,
-    Snapshot,
-)
+from daedalus.protocol.messages import Join, Message, Refusal, RunEnded, Snapshot
 
 Edit = Callable[[dict[str, Any]], object]
 SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {

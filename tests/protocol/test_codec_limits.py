@@ -23,11 +23,7 @@ from wire_format import (
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import (
-    Program,
-    RunEnded,
-    Snapshot,
-)
+from daedalus.protocol.messages import Program, RunEnded, Snapshot
 
 
 def peak_bytes(data: bytes, limits: Limits) -> int:

@@ -19,9 +19,9 @@ from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.frames import FrameStack, stack_rows
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Rollout, RolloutIdentity
 from daedalus.protocol.spaces import ArraySpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
 

@@ -3,7 +3,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daedalus.protocol.messages import EvaluationReport, Rollout, RolloutIdentity
+from daedalus.protocol.messages import EvaluationReport
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 T, E, K = 3, 2, 1
 

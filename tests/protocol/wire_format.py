@@ -12,15 +12,9 @@ from plain import vector_spaces
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import (
-    Join,
-    Message,
-    Rollout,
-    RolloutIdentity,
-    Snapshot,
-    Welcome,
-)
+from daedalus.protocol.messages import Join, Message, Snapshot, Welcome
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 LIMITS = Limits()
 PREFIX = struct.Struct("<4sHHI")

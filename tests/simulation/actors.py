@@ -9,9 +9,10 @@ import numpy as np
 from daedalus.actor.session.learner_queries import ActorError, NameInUseError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.messages import Rollout, RolloutIdentity, Snapshot
+from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 from .kernel import Kernel
 from .ledger import Ledger

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.intake import Rejected
 from daedalus.learner.serving.rollout_buffer import TakenRollouts
-from daedalus.protocol.messages import Acknowledgement, Rollout, RolloutIdentity, Snapshot, Upload
+from daedalus.protocol.messages import Acknowledgement, Snapshot
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity, Upload
 
 from .kernel import Kernel
 

@@ -15,7 +15,8 @@ from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.intake import Intake
 from daedalus.learner.serving.sequence_window import SequenceWindow
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import Acknowledgement
+from daedalus.protocol.uploads import Rollout
 
 from .settings import draw
 from .simulate import services, simulate

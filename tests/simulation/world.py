@@ -1,7 +1,8 @@
 """The processes of one simulation, and a supervisor that restarts those that end."""
 
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Acknowledgement, Rollout
+from daedalus.protocol.messages import Acknowledgement
+from daedalus.protocol.uploads import Rollout
 
 from . import codec
 from .actors import ActorProcess

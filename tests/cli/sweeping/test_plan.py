@@ -21,12 +21,13 @@ def as_trained(run: PlannedRun) -> argparse.Namespace:
 
 
 def test_the_command_line_of_a_run_gives_the_settings_that_are_planned(tmp_path: Path) -> None:
-    options = ["--env-steps", "5000", "--set", "policy.hidden=[32]"]
+    options = ["--env-steps", "5000", "--set", "policy.hidden=[32]", "--log", "wandb", "--log", "mlflow"]
     point = {"collection.rollout_length": "5", "training.learning_rate": "1e-3"}
     first, second = planner(tmp_path, *options).runs("n", point, [3, 4])
     assert [run.directory for run in (first, second)] == [tmp_path / "n_seed-3", tmp_path / "n_seed-4"]
     parsed = as_trained(second)
     assert parsed.run_dir == second.directory
+    assert parsed.log == ["wandb", "mlflow"]
     assert resolve_spec(parsed) == second.spec
     assert second.spec.training.seed == 4
     assert second.spec.training.env_steps == 5000

@@ -1,0 +1,141 @@
+"""What a client's two threads hand to each other: policies to the caller's loop, rollouts to the service."""
+
+import math
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+from daedalus.actor.collecting.client_rows import ClientRows
+from daedalus.actor.collecting.side_by_side import side_by_side
+from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.protocol.uploads import Rollout
+
+_MAX_FULL_ROLLOUTS = 8  # of each agent, that the service has not taken yet; beyond that the oldest is dropped
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedPolicy:
+    """One version of the policy, ready to act."""
+
+    version: int
+    runtime: OnnxRuntime
+
+
+class ClientExchange:
+    """The state that both threads use. No call waits for the other thread."""
+
+    def __init__(self, agents: int) -> None:
+        """`agents` is the number of agents in the caller's loop."""
+        self._agents = agents
+        self._lock = threading.Lock()  # guards everything below
+        self._dropped = 0
+        self._together = False  # the agents' rollouts are sent as one
+        self._next_rows: list[ClientRows | None] = [None] * agents  # of a policy that has begun, and does not act yet
+        self._newest: LoadedPolicy | None = None
+        self._confirmed_at = -math.inf  # the monotonic time at which the newest policy was the learner's newest
+        self._may_begin = [True] * agents  # whether the agent's next row may begin a rollout
+        self._parts: dict[int, Rollout] = {}  # full rollouts by agent, while they wait for those of the others
+        self._full: deque[Rollout] = deque()
+
+    @property
+    def dropped(self) -> int:
+        """Number of rollouts, finished or not, that the service never took."""
+        return self._dropped
+
+    # -------------------------------------------------------------------------------- for the service's thread
+
+    def begin(self, rows: list[ClientRows], *, together: bool) -> None:
+        """Offer the rows of each agent under another policy. Drop the full rollouts of the previous one.
+
+        With `together`, one rollout of each agent makes one of the client, and the agents begin the next ones when the
+        service has asked for it.
+        """
+        with self._lock:
+            self._next_rows[:] = rows
+            self._newest, self._together = None, together
+            self._may_begin = [not together] * self._agents
+            self._dropped += len(self._full) + len(self._parts)
+            self._full.clear()
+            self._parts.clear()
+
+    def offer(self, policy: LoadedPolicy) -> None:
+        """Let newer weights act."""
+        with self._lock:
+            self._newest = policy
+
+    def confirm(self, at: float) -> None:
+        """Note that the newest policy was the learner's newest at a monotonic time, in seconds."""
+        with self._lock:
+            self._confirmed_at = at
+
+    def has_rollout(self) -> bool:
+        """Return whether `take` would return a rollout now. Safe from any thread."""
+        return bool(self._full)
+
+    def take(self) -> Rollout | None:
+        """Return the oldest full rollout; where there is none, the agents may begin rollouts."""
+        with self._lock:
+            if self._full:
+                return self._full.popleft()
+            self._may_begin = [agent not in self._parts for agent in range(self._agents)]
+            return None
+
+    # --------------------------------------------------------------------------------- for the caller's thread
+
+    def next_rows(self, agent: int) -> ClientRows | None:
+        """Return, once, the agent's rows under a policy that has begun meanwhile, if it can act by now."""
+        with self._lock:
+            if self._newest is None:
+                return None
+            rows, self._next_rows[agent] = self._next_rows[agent], None
+            return rows
+
+    def newest_policy(self, agent: int) -> LoadedPolicy | None:
+        """Return the newest weights; None if they are of a policy that begins, and not for the rows in use."""
+        with self._lock:
+            return None if self._next_rows[agent] is not None else self._newest
+
+    def policy_age(self) -> float:
+        """Return the seconds since the newest policy was last known to be the learner's newest."""
+        with self._lock:
+            return time.monotonic() - self._confirmed_at
+
+    def may_begin(self, agent: int) -> bool:
+        """Return whether the agent's next row may begin a rollout."""
+        with self._lock:
+            return self._may_begin[agent]
+
+    def drop(self) -> None:
+        """Count an unfinished rollout that is dropped."""
+        with self._lock:
+            self._dropped += 1
+
+    def keep(self, agent: int, rollout: Rollout) -> None:
+        """Keep a full rollout of an agent for the service, unless its policy is that of a previous learner."""
+        with self._lock:
+            if self._next_rows[agent] is not None:
+                self._dropped += 1
+            elif self._together:
+                self._keep_part(agent, rollout)
+            else:
+                self._append(rollout)
+
+    def _keep_part(self, agent: int, rollout: Rollout) -> None:
+        """Keep a rollout until every agent has one of the same policy version."""
+        self._may_begin[agent] = False
+        self._parts[agent] = rollout
+        newest = max(part.policy_version for part in self._parts.values())
+        for other in [each for each, part in self._parts.items() if part.policy_version < newest]:
+            del self._parts[other]
+            self._dropped += 1
+            self._may_begin[other] = True
+        if len(self._parts) == self._agents:
+            self._append(side_by_side([self._parts[each] for each in range(self._agents)]))
+            self._parts.clear()
+
+    def _append(self, rollout: Rollout) -> None:
+        self._full.append(rollout)
+        if len(self._full) > _MAX_FULL_ROLLOUTS * self._agents:
+            self._full.popleft()
+            self._dropped += 1

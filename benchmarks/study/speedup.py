@@ -1,0 +1,192 @@
+"""Measure how much sooner more actors reach a reference score: table 2 of Mnih et al. (2016).
+
+    python -m benchmarks.study.speedup --file build/speedup.csv
+    python -m benchmarks.study.speedup --file build/speedup.csv --tasks catch --methods a3c --seeds 1 2
+    python -m benchmarks.study.speedup --file build/speedup.csv --table
+
+1 to 16 actors with one environment each, all on this machine. A step of an environment takes 5 ms, most of it waiting
+(--milliseconds), as with robots and slow simulators: 16 actors of fast environments would only wait for the two cores.
+Runs with few actors are made side by side, with at most 16 actors at a time. The seconds of a run count from the first
+rollouts, without the start of the processes. The score is the mean return of the last 50 training episodes; to be
+comparable, all actors of the methods with action values explore with epsilon 0.05 in the end.
+
+Each run adds a line to the file; the same command again makes only those that are missing.
+"""
+
+import argparse
+import csv
+import itertools
+import json
+import math
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.recorded_runs import RecordedRuns
+from benchmarks.running import COMMAND, machine, table
+from daedalus.cli.comparing.comparison import estimate
+from daedalus.cli.comparing.tables import written
+
+_IDENTITY = ("task", "method", "actors", "seed", "milliseconds")
+_RESULTS = ("seconds", "env_steps")  # until the score was reached; blank if it was not
+_ACTORS_AT_ONCE = 16
+_MODULE = "benchmarks.study.waiting"
+_VALUES = ("training.exploration=[0.05]", "training.exploration_env_steps=20000", "training.target_period=50")
+
+
+class Task(NamedTuple):
+    """An environment with its reference score."""
+
+    id: str
+    score: float
+    env_steps: int  # budget
+    settings: Sequence[str]
+
+
+TASKS = {
+    "cartpole": Task("CartPole-v1", 150.0, 400_000, ("environment.reward_scale=0.05",)),
+    "catch": Task("Catch-v0", 0.5, 400_000, ("policy.encoder=small",)),
+    "frozen_lake": Task("FrozenLake-v1", 0.8, 200_000, ("environment.kwargs.is_slippery=false",)),
+}
+# By name: algorithm and settings.
+METHODS: dict[str, tuple[str, Sequence[str]]] = {
+    "a3c": ("a3c", ()),
+    "a3c, gradients": ("a3c", ("collection.upload=gradients",)),
+    "one_step_q": ("one_step_q", _VALUES),
+    "one_step_sarsa": ("one_step_sarsa", _VALUES),
+    "n_step_q": ("n_step_q", _VALUES),
+}
+
+
+def train(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Make a run; return its results."""
+    task, (algorithm, settings) = TASKS[run["task"]], METHODS[run["method"]]
+    changes = (
+        f'environment.kwargs.of="{task.id}"',
+        f"environment.kwargs.milliseconds={run['milliseconds']}",
+        f"collection.actors={run['actors']}",
+        "collection.envs_per_actor=1",
+        "collection.rollout_length=20",
+        "training.learning_rate=1e-3",
+        f"training.target_return={task.score}",
+        "training.target_episodes=50",
+        "service.log_seconds=0.5",
+        "evaluation.seconds=100000",
+        "evaluation.final_episodes=1",
+        *task.settings,
+        *settings,
+    )
+    words = [word for change in changes for word in ("--set", change)]
+    words += ["--algorithm", algorithm, "--seed", run["seed"], "--env-steps", task.env_steps]
+    with tempfile.TemporaryDirectory() as folder:
+        directory = Path(folder) / "run"
+        command = [*COMMAND, "train", "--env", f"{_MODULE}:Waiting-v0", *words, "--run-dir", directory]
+        finished = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+        if finished.returncode not in (0, 3):
+            raise SystemExit(f"a run failed: {run}\n{finished.stdout}{finished.stderr}")
+        summary = json.loads((directory / "summary.json").read_text())
+        with open(directory / "metrics.csv", newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    if not summary["solved"]:
+        return {"seconds": "", "env_steps": ""}
+    first = next(row for row in rows if float(row["env_steps"]) > 0)
+    before = float(first["wall_seconds"]) - float(first["env_steps"]) / float(first["env_steps_per_second"])
+    return {"seconds": f"{summary['seconds_to_target'] - before:.2f}", "env_steps": summary["env_steps"]}
+
+
+class Places:
+    """Bound on the number of actors that play at a time."""
+
+    def __init__(self, count: int) -> None:
+        self._free = count
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, count: int) -> Iterator[None]:
+        """Wait until so many places are free, and take them."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= count)
+            self._free -= count
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += count
+                self._changed.notify_all()
+
+
+def make(wanted: Sequence[Mapping[str, Any]], runs: RecordedRuns) -> None:
+    """Make runs side by side, and add the line of each to the file when it has ended."""
+    places, lock = Places(_ACTORS_AT_ONCE), threading.Lock()
+
+    def one(run: Mapping[str, Any]) -> None:
+        with places.taken(run["actors"]):
+            line = {**run, **train(run)}
+        with lock:
+            runs.add(line)
+            print(", ".join(str(value) for value in line.values()), flush=True)
+
+    with ThreadPoolExecutor(_ACTORS_AT_ONCE) as pool:
+        for future in [pool.submit(one, run) for run in wanted]:
+            future.result()
+
+
+def results(lines: Sequence[Mapping[str, str]]) -> str:
+    """Return a table for each task: how many times sooner than one actor, and with which share of its env_steps."""
+    texts = []
+    for task in dict.fromkeys(line["task"] for line in lines):
+        rows = []
+        for method in METHODS:
+            chosen = [line for line in lines if (line["task"], line["method"]) == (task, method)]
+            counts = sorted({int(line["actors"]) for line in chosen})
+            if 1 not in counts:
+                continue
+            alone = {name: _values(chosen, 1, name) for name in _RESULTS}
+            for count in counts:
+                seconds, env_steps = (_values(chosen, count, name) for name in _RESULTS)
+                sooner = np.median(alone["seconds"]) / np.median(seconds)
+                share = np.median(env_steps) / np.median(alone["env_steps"])
+                reached = f"{np.isfinite(seconds).sum()} of {len(seconds)}"
+                interval = written(estimate([seconds]), "{:.1f}".format)
+                rows.append((method, count, reached, interval, f"{sooner:.1f}", f"{share:.2f}"))
+        header = ("method", "actors", "reached", "seconds", "times sooner", "env_steps, relative")
+        texts.append(f"{task}, mean return {TASKS[task].score:g}\n\n{table(header, rows)}")
+    return "\n\n".join([*texts, "Times sooner and env_steps: of the medians, relative to one actor."])
+
+
+def _values(lines: Sequence[Mapping[str, str]], actors: int, name: str) -> np.ndarray:
+    """Return a result of the runs with so many actors, [runs], by seed; infinite if the score was not reached."""
+    chosen = sorted((line for line in lines if int(line["actors"]) == actors), key=lambda line: int(line["seed"]))
+    return np.array([float(line[name] or math.inf) for line in chosen])
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--file", type=Path, required=True, help="CSV file of the runs")
+    options.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    options.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    options.add_argument("--actors", nargs="+", type=int, default=[16, 8, 4, 2, 1])
+    options.add_argument("--seeds", nargs="+", type=int, default=list(range(11, 21)))
+    options.add_argument("--milliseconds", type=float, default=5.0, help="duration of an environment step")
+    options.add_argument("--table", action="store_true", help="only print the tables of the runs so far")
+    parsed = options.parse_args()
+    runs = RecordedRuns(parsed.file, _IDENTITY, _RESULTS)
+    wanted: list[Mapping[str, Any]] = [
+        dict(zip(_IDENTITY, (task, method, actors, seed, parsed.milliseconds), strict=True))
+        for seed, actors, task, method in itertools.product(parsed.seeds, parsed.actors, parsed.tasks, parsed.methods)
+    ]
+    if not parsed.table:
+        make(runs.missing(wanted), runs)
+    print(machine())
+    print(results(runs.read()))
+
+
+if __name__ == "__main__":
+    main()

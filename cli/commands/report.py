@@ -1,0 +1,93 @@
+"""`daedalus report`: write one HTML file about one or more runs."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from daedalus.cli.arguments import command_parser
+from daedalus.cli.commands.compare import parse_groups
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
+from daedalus.cli.comparing.selection import select
+from daedalus.cli.reports.page import comparison_page, run_page
+from daedalus.cli.reports.run_record import read_record
+
+_DESCRIPTION = """\
+Writes one HTML file about a run: settings, curves, statistics and a histogram of the evaluation, a video if there is
+one in the run directory, versions, and what failed meanwhile. Of several runs, the file shows a table and the curves
+together: runs with equal settings apart from the seed are one curve; or you name the runs of each curve, with `--`
+between them. A folder of run directories stands for all of them. The file loads nothing from other hosts and runs no
+script: you can send it to others."""
+
+_EXAMPLES = """\
+examples:
+  daedalus report runs/cartpole-impala-s1-20261121-101500
+  daedalus report runs --output algorithms.html --by minutes
+  daedalus report --output change.html runs/old-* -- runs/new-*
+
+A video for the report: daedalus evaluate RUN_DIR --video RUN_DIR/replay.mp4
+
+exit status: 0 done, 1 failed, 2 bad usage"""
+
+_NAME = "report.html"
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of `daedalus report`."""
+    options = command_parser("report", _DESCRIPTION, _EXAMPLES)
+    options.usage = (
+        "daedalus report [-h] [--output FILE] [--by env_steps|minutes] [--threshold RETURN] RUN_DIR... [-- RUN_DIR...]"
+    )
+    options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to report")
+    options.add_argument(
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help=f"file to write (default: {_NAME} in the directory of the run, or here for several runs)",
+    )
+    options.add_argument(
+        "--by", choices=(ENV_STEPS, "minutes"), default=ENV_STEPS, help="horizontal axis (default: %(default)s)"
+    )
+    options.add_argument(
+        "--threshold",
+        type=float,
+        metavar="RETURN",
+        help="mean return to reach, for several runs (default: training.target_return, if all runs have the same)",
+    )
+    return options
+
+
+def report(arguments: list[str]) -> int:
+    """Run `daedalus report` and return its exit status: 0 done, 1 failed."""
+    parsed, parts = parse_groups(parser(), arguments)
+    try:
+        groups, problems = select(parts, finished=False, columns=[SECONDS])
+        for problem in problems:
+            print(f"daedalus report: {problem}", file=sys.stderr)
+        records = {run.directory: read_record(run) for group in groups for run in group.runs}
+    except RunDataError as error:
+        print(f"daedalus report: {error}", file=sys.stderr)
+        return 1
+    if len(records) == 1 and not problems:
+        ((directory, record),) = records.items()
+        page, output = run_page(record, groups[0], parsed.by), parsed.output or directory / _NAME
+    else:
+        page = comparison_page(groups, records, parsed.by, threshold=parsed.threshold, left_out=problems)
+        output = parsed.output or Path(_NAME)
+    try:
+        _write(output, page)
+    except OSError as error:
+        print(f"daedalus report: {output}: {error.strerror}; choose another file with --output", file=sys.stderr)
+        return 1
+    print(f"wrote {output}")
+    return 0
+
+
+def _write(output: Path, page: str) -> None:
+    """Write the file at once: nobody reads half of it. Raises OSError."""
+    beside = output.with_name(f".{output.name}.{os.getpid()}.partial")
+    try:
+        beside.write_text(page, "utf-8")
+        os.replace(beside, output)
+    finally:
+        beside.unlink(missing_ok=True)

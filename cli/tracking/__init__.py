@@ -1,0 +1,1 @@
+"""Processes that log a run to experiment trackers."""

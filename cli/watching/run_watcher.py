@@ -1,0 +1,78 @@
+"""Queries for what a live display shows."""
+
+import threading
+from collections.abc import Callable, Iterator
+
+from daedalus.cli.run_source import LearnerSource
+from daedalus.cli.status_query import ask
+from daedalus.cli.watching.watched_run import WatchedRun
+from daedalus.protocol import keys
+from daedalus.protocol.codec import ProtocolError
+from daedalus.transport.interface import RefusedError, Transport, TransportError
+
+MAX_ACTORS = 50  # of each run that are queried; a terminal has no lines for more
+_MOST_PAGES = 8  # of the metrics for one look
+
+
+class RunWatcher:
+    """Watcher of the learners that answer at an address."""
+
+    def __init__(self, transport: Transport, run: str = keys.ANY_RUN) -> None:
+        """Construct the watcher. `run` is the name of the run, or `*` for all runs."""
+        self._transport, self._run = transport, run
+        self._source = LearnerSource(transport, run)
+        self._runs: dict[int, WatchedRun] = {}  # by learner epoch
+
+    def look(self) -> list[WatchedRun]:
+        """Return the runs whose learners answer. Raises TransportError or ProtocolError."""
+        runs: dict[int, WatchedRun] = {}
+        for status in ask(self._transport, self._run, max_actors=MAX_ACTORS):
+            run = runs[status.learner_epoch] = self._runs.get(status.learner_epoch) or WatchedRun(status)
+            run.add_status(status)
+            for _ in range(_MOST_PAGES):
+                report = self._source.metrics(status, run.next_row)
+                if report is None or not len(report.numbers):
+                    break
+                run.add_rows(report)
+        self._runs = runs
+        return sorted(runs.values(), key=lambda run: run.status.run)
+
+
+def looks(
+    connect: Callable[[], Transport], run: str, stop: threading.Event, seconds: float
+) -> Iterator[list[WatchedRun]]:
+    """Yield the runs that answer, every few seconds; an empty list while none does. Reconnect if the network fails.
+
+    Args:
+      connect: opens the transport. Raises TransportError.
+      run: name of the run, or `*` for all runs.
+      stop: ends the iteration.
+      seconds: from one look to the next.
+
+    Raises RefusedError.
+    """
+    while not stop.is_set():
+        try:
+            transport = connect()
+        except RefusedError:
+            raise
+        except TransportError:
+            yield []
+            stop.wait(seconds)
+            continue
+        try:
+            watcher = RunWatcher(transport, run)
+            while not stop.is_set() and (runs := watcher.look()):
+                yield runs
+                stop.wait(seconds)
+        except ProtocolError as error:
+            raise TransportError(f"the answer of the learner is damaged: {error}") from None
+        except RefusedError:
+            raise
+        except TransportError:
+            pass  # connect again
+        finally:
+            transport.close()
+        if not stop.is_set():
+            yield []
+            stop.wait(seconds)

@@ -1,0 +1,100 @@
+"""The full rollouts of one client on their way to the learner. For the gateway's event loop; never waits."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+from daedalus.actor.session.client_reports import ClientReports
+from daedalus.actor.session.upload_session import UploadSession
+from daedalus.protocol.client_report import ClientReport
+from daedalus.protocol.codec import encode
+from daedalus.protocol.messages import Join, Welcome
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
+from daedalus.transport.interface import Transport
+
+_MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
+
+
+class ClientUploads:
+    """What one client sends, to one learner epoch after the other."""
+
+    def __init__(
+        self, join: Join, transport: Transport, uploads: UploadSession, on_rollout: Callable[["ClientUploads"], None]
+    ) -> None:
+        """Construct the uploads.
+
+        Args:
+          join: names the actor and its incarnation.
+          transport: the network.
+          uploads: sends the rollouts, until they are acknowledged.
+          on_rollout: called when a rollout can be sent, by `send_one`.
+        """
+        self._join, self._uploads, self._on_rollout = join, uploads, on_rollout
+        self._reports = ClientReports(transport, self._report)
+        self._session: Welcome | None = None
+        self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
+        self._sequence = 0  # of the next rollout
+        self._dropped = 0  # rollouts that were never sent
+        self.overridden_actions = 0  # for the status
+
+    def begin(self, session: Welcome) -> None:
+        """Send to a learner epoch that has no rollouts of this client; those for an earlier one are dropped."""
+        self._uploads.begin(session.run, session.spec.collection.window)
+        self._session, self._sequence = session, 0
+        self._full.clear()
+        self._reports.begin()
+
+    def resume(self) -> None:
+        """Go on with the same learner epoch after the network failed."""
+        self._uploads.resume()
+
+    def keep(self, rollout: Rollout) -> None:
+        """Send a rollout once there is room in the window."""
+        self._dropped += len(self._full) == _MAX_FULL_ROLLOUTS
+        self._full.append(rollout)
+        if self.can_send:
+            self._on_rollout(self)
+
+    @property
+    def can_send(self) -> bool:
+        """Whether there is a rollout, and room for it in the window."""
+        return bool(self._full) and self._uploads.in_flight.has_room
+
+    def send_one(self) -> None:
+        """Encode and send the oldest full rollout, if it can be sent."""
+        session = self._session
+        if session is None or not self.can_send:
+            return
+        identity = RolloutIdentity(
+            actor=self._join.actor,
+            incarnation=self._join.incarnation,
+            sequence=self._sequence,
+            learner_epoch=session.learner_epoch,
+        )
+        self._uploads.send(self._sequence, encode(replace(self._full.popleft(), identity=identity)))
+        self._sequence += 1
+
+    def send_due(self) -> None:
+        """Send again what is due, and report what the status shows of the client."""
+        if self._uploads.in_flight.rollouts:
+            self._uploads.send_due()
+        if self._session is not None and (self.overridden_actions or self._dropped):
+            self._reports.send_if_due(self._session.run)
+
+    def _report(self) -> ClientReport:
+        return ClientReport(
+            actor=self._join.actor,
+            incarnation=self._join.incarnation,
+            overridden_actions=self.overridden_actions,
+            rollouts_dropped=self._dropped,
+        )
+
+    @property
+    def newest_version(self) -> int:
+        """The newest policy version that an acknowledgement mentioned."""
+        return self._uploads.in_flight.newest_version
+
+    @property
+    def ended_by(self) -> tuple[str, str]:
+        """The verdict that ended the session, and the reason; both empty while it goes on."""
+        return self._uploads.in_flight.ended_by, self._uploads.in_flight.reason

@@ -1,0 +1,96 @@
+"""Lets clients take part in the run: requests to join its learner. For the gateway's event loop, with threads."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from daedalus.actor.session.learner_queries import ActorError, NameInUseError
+from daedalus.actor.session.run_end import RunOverError
+from daedalus.gateway.client_actor import ClientActor
+from daedalus.gateway.errors import ClientError
+from daedalus.gateway.followed_run import FollowedRun
+from daedalus.gateway.learner_link import LearnerLink
+from daedalus.protocol import keys
+from daedalus.protocol.messages import Welcome
+from daedalus.transport.interface import Declaration, Transport, TransportError
+
+_THREADS = 16  # requests at the same time, which may wait
+_RETRY_SECONDS = 0.2  # between requests of one client
+_NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier gateway is dead
+
+
+@dataclass(slots=True)
+class Seat:
+    """An actor of the gateway, while its client is connected."""
+
+    actor: ClientActor
+    on_end: Callable[[ClientError | str], None]  # ends its connection, with an error or how the run ended
+    presence: Declaration | None = None
+    is_joining: bool = False
+    since: float = field(default_factory=time.monotonic)  # when it began to join
+
+    def is_in(self, session: Welcome | None) -> bool:
+        """Return whether the actor takes part in a session."""
+        return session is not None and self.actor.epoch == session.learner_epoch
+
+    def leave(self) -> None:
+        """Stop to be present in the run."""
+        if self.presence is not None:
+            self.presence.close()
+            self.presence = None
+
+
+class Joining:
+    """Requests to join the learner that is followed."""
+
+    def __init__(self, transport: Transport, link: LearnerLink, run: FollowedRun) -> None:
+        self._transport, self._link, self._run = transport, link, run
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="join")
+
+    def close(self) -> None:
+        """Begin no further requests."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def join(self, seat: Seat) -> None:
+        """Join the newest learner, once there is one. Raises ClientError if the client cannot take part."""
+        seat.is_joining = True
+        try:
+            while (session := self._run.session) is None or not await self._ask(seat, session):
+                if session is self._run.session:
+                    await (self._run.change() if session is None else asyncio.sleep(_RETRY_SECONDS))
+        finally:
+            seat.is_joining = False
+
+    async def rejoin(self, seat: Seat) -> None:
+        """Join a learner that has restarted, or that the network had lost; end the connection if that fails."""
+        seat.since = time.monotonic()
+        try:
+            await self.join(seat)
+        except ClientError as error:
+            seat.on_end(error)
+
+    async def _ask(self, seat: Seat, session: Welcome) -> bool:
+        """Ask to join a learner; return whether the client now takes part in the newest session."""
+        join, transforms = seat.actor.prepare(session.spec)
+        if seat.presence is None:
+            key = keys.presence(session.run, join.actor, join.incarnation)
+            seat.presence = self._transport.declare_presence(key)
+        began = time.monotonic()
+        request = self._link.queries.request_join
+        try:
+            welcome = await asyncio.get_running_loop().run_in_executor(self._threads, request, session.run, join)
+        except NameInUseError as error:
+            if began > seat.since + _NAME_IN_USE_SECONDS:
+                raise ClientError("refused", str(error)) from None
+            return False
+        except (ActorError, RunOverError, TransportError) as error:
+            raise ClientError("refused", str(error)) from None
+        if welcome is None or session is not self._run.session:
+            return False
+        if welcome.learner_epoch != session.learner_epoch:
+            self._link.look_again()
+            return False
+        seat.actor.joined(welcome, transforms)  # with the client's own epsilon
+        return True

@@ -1,0 +1,152 @@
+"""Logging of a run to one tracker, in a process of its own that only reads the run directory.
+
+metrics.csv is the queue between the learner and the tracker: the learner never waits, and a row is not lost while the
+tracker does not answer.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from daedalus.learner.reporting.metrics import GROUPS, Details
+from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
+from daedalus.learner.reporting.trackers.tracker import OpenTracker, TrackedRun, Tracker, flat
+from daedalus.learner.reporting.trackers.tracking_state import TrackingState
+from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, read_json
+from daedalus.learner.run.settings import SettingsError, read_file
+
+_POLL_SECONDS = 1.0
+_RETRY_SECONDS = 60.0  # after the tracker failed
+_SLOW_SECONDS = 60.0  # for one call, before the user is warned
+_ROWS_A_SAVE = 100  # of the state, when many rows are new
+_LONGEST_FAULT = 300  # characters
+
+_logger = logging.getLogger(__name__)
+
+
+class Tracking:
+    """Logger of the rows of a run, in order and at most once, and of its summary at the end.
+
+    A resumed run makes some env_steps again, from its checkpoint on. Trackers require increasing steps, so these rows
+    are left out; an evaluation in them is logged with the next row.
+    """
+
+    def __init__(self, name: str, directory: Path, open_tracker: OpenTracker, finish: threading.Event) -> None:
+        """Construct the logger.
+
+        Args:
+          name: of the tracker.
+          directory: the run directory.
+          open_tracker: called with the run; again after the tracker failed.
+          finish: set when the run has ended and its files are complete.
+        """
+        self._name, self._directory, self._open, self._finish = name, directory, open_tracker, finish
+        self._state = TrackingState.load(directory, name)
+        self._rows = MetricsFollower(directory / METRICS, self._state.rows)
+        self._tracker: Tracker | None = None
+        self._evaluation: dict[str, float] = {}  # of rows that were left out
+        self._warned = False
+        self._call_began: float | None = None
+
+    def run(self) -> bool:
+        """Log until the run has ended. Return whether everything was logged."""
+        threading.Thread(target=self._watch, name="slow-tracker", daemon=True).start()
+        retry_at = time.monotonic()
+        while True:
+            last = self._finish.wait(_POLL_SECONDS)
+            if not last and time.monotonic() < retry_at:
+                continue
+            try:
+                with self._timed():
+                    self._log(last=last)
+            except Exception as error:  # of a package that is not ours
+                fault = f"{type(error).__name__}: {' '.join(str(error).split())[:_LONGEST_FAULT]}"
+                self._warn(f"{fault}; it is tried again every {_RETRY_SECONDS:.0f} s")
+                self._drop_tracker()
+                retry_at = time.monotonic() + _RETRY_SECONDS
+                if last:
+                    return False
+            if last:
+                return True
+
+    def _log(self, *, last: bool) -> None:
+        """Log what is new in the run directory."""
+        if not (last or self._rows.exist):
+            return  # the import of the tracker's package would compete with the start of the run
+        if self._tracker is None:
+            self._tracker = self._opened()
+        try:
+            for row in self._rows.rows():
+                self._log_row(self._tracker, row)
+                if self._rows.taken >= self._state.rows + _ROWS_A_SAVE:
+                    self._save()
+        finally:
+            if self._rows.taken != self._state.rows:
+                self._save()
+        if last:
+            self._tracker.summarize(_summary(self._directory))
+            self._tracker.close()
+
+    def _log_row(self, tracker: Tracker, row: dict[str, float]) -> None:
+        """Log a row, unless the tracker has received later ones."""
+        if row and row["env_steps"] >= self._state.env_steps:
+            tracker.write({**self._evaluation, **row}, Details())
+            self._state.env_steps, self._evaluation = int(row["env_steps"]), {}
+            self._call_began = time.monotonic()  # each row has its time
+        else:
+            self._evaluation |= {name: row[name] for name in GROUPS["evaluation"] if name in row}
+
+    def _opened(self) -> Tracker:
+        settings = read_file(self._directory / CONFIG)
+        tracker = self._open(TrackedRun(directory=self._directory.resolve(), settings=settings, id=self._state.id))
+        self._state.id = tracker.id
+        self._save()
+        _logger.info("%s: %s", self._name, tracker.place)
+        return tracker
+
+    def _save(self) -> None:
+        self._state.rows = self._rows.taken
+        with suppress(OSError):  # the learner reports a full disk
+            self._state.save(self._directory, self._name)
+
+    def _drop_tracker(self) -> None:
+        if self._tracker is not None:
+            with suppress(Exception):
+                self._tracker.close()
+            self._tracker = None
+            self._rows = MetricsFollower(self._directory / METRICS, self._rows.taken)
+
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        self._call_began = time.monotonic()
+        try:
+            yield
+        finally:
+            self._call_began = None
+
+    def _watch(self) -> None:
+        """Warn if a call takes long. The call itself cannot be ended; the end of the process ends it."""
+        while not self._warned:
+            time.sleep(_POLL_SECONDS)
+            began = self._call_began
+            if began is not None and time.monotonic() - began > _SLOW_SECONDS:
+                self._warn(f"no answer for {_SLOW_SECONDS:.0f} s")
+
+    def _warn(self, fault: str) -> None:
+        """Warn once."""
+        if not self._warned:
+            self._warned = True
+            _logger.warning("%s: %s; training continues, and its metrics are in metrics.csv", self._name, fault)
+
+
+def _summary(directory: Path) -> dict[str, Any]:
+    """Return the numbers and texts of summary.json; empty if the run has none."""
+    try:
+        summary = read_json(directory / SUMMARY)
+    except SettingsError:
+        return {}
+    return {name: value for name, value in flat(summary) if isinstance(value, int | float | str)}

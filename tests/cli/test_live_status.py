@@ -1,0 +1,206 @@
+"""cli/watching: a live display queries the learner again and again, and outlasts its restarts."""
+
+import io
+import json
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from log_lines import LINES
+from processes import LIMIT, until
+from statuses import actor_status, run_status
+from terminal import Terminal
+
+from daedalus.cli.commands import status as status_module
+from daedalus.cli.commands.status import status as status_command
+from daedalus.cli.watching import status_watch, training_display
+from daedalus.cli.watching.run_watcher import looks
+from daedalus.cli.watching.screen import Screen
+from daedalus.cli.watching.training_display import TrainingDisplay
+from daedalus.protocol import keys
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.protocol.messages import StatusReport
+from daedalus.protocol.metrics import MetricsPage, MetricsReport, MetricsRequest
+from daedalus.protocol.status import RunStatus
+from daedalus.transport.interface import Request, Transport, TransportError
+from daedalus.transport.memory import MemoryNetwork, MemoryTransport
+
+
+class Learner:
+    """Learner that reports `status`, and as many rows of metrics as `returns` has."""
+
+    def __init__(self, **changes: Any) -> None:
+        self.network = MemoryNetwork()
+        self.status: RunStatus = run_status(actors=(actor_status("arm-1"),), **changes)
+        self.returns = [1.0, 2.0, 3.0]
+        self.asked: list[int] = []  # first rows
+        self.transport = MemoryTransport(self.network)
+        self.transport.serve(keys.status(self.status.run), self._answer)
+
+    def _answer(self, request: Request) -> None:
+        asked = decode(request.payload, LEARNER_LIMITS) if request.size else None
+        if not isinstance(asked, MetricsRequest):
+            request.reply(encode(StatusReport(status=self.status)))
+            return
+        self.asked.append(asked.first)
+        page = MetricsPage(
+            run=self.status.run, learner_epoch=self.status.learner_epoch, columns=("episode_return_mean",)
+        )
+        values = np.array(self.returns[asked.first :], np.float64).reshape(-1, 1)
+        numbers = np.arange(asked.first, len(self.returns))
+        request.reply(encode(MetricsReport(page=page, numbers=numbers, values=values)))
+
+    def connect(self, *_: object) -> Transport:
+        return MemoryTransport(self.network)
+
+
+class Tty(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def tty(monkeypatch: pytest.MonkeyPatch) -> Tty:
+    for name, value in {"COLUMNS": "100", "LINES": "20", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(training_display, "_LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(training_display, "_FIRST_SECONDS", 0.0)
+    return Tty()
+
+
+def seen(stream: io.StringIO) -> str:
+    terminal = Terminal(100)
+    terminal.feed(stream.getvalue().replace("\n", "\r\n"))
+    return "\n".join(terminal.lines)
+
+
+def test_each_row_is_queried_once_and_a_restarted_learner_from_the_first() -> None:
+    learner, stop = Learner(), threading.Event()
+    watching: Iterator[Any] = looks(learner.connect, "mine", stop, 0.0)
+    (run,) = next(watching)
+    assert run.returns == [1.0, 2.0, 3.0]
+    learner.returns.append(4.0)
+    (run,) = next(watching)
+    assert run.returns == [1.0, 2.0, 3.0, 4.0]
+    assert learner.asked == [0, 3, 3, 4]
+    learner.status = learner.status.model_copy(update={"learner_epoch": 2})
+    (run,) = next(watching)
+    assert learner.asked[4:] == [0, 4]
+    stop.set()
+    assert not list(watching)
+
+
+def test_looks_are_empty_until_a_learner_answers_and_after_it_has_gone() -> None:
+    learner, stop = Learner(), threading.Event()
+    faults = [TransportError("nobody there")] * 2
+
+    def connect() -> Transport:
+        if faults:
+            raise faults.pop()
+        return learner.connect()
+
+    watching = looks(connect, keys.ANY_RUN, stop, 0.0)
+    assert [len(next(watching)) for _ in range(4)] == [0, 0, 1, 1]
+    learner.transport.close()
+    assert [len(next(watching)) for _ in range(3)] == [0, 0, 0]
+    stop.set()
+
+
+def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, frames = Learner(), []
+
+    class Interrupted(Screen):
+        def show(self, runs: Any) -> None:
+            super().show(runs)
+            frames.append(runs)
+            if len(frames) == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(status_watch, "_FRAME_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "connect", learner.connect)
+    monkeypatch.setattr(status_module, "Screen", lambda: Interrupted(tty, tty))
+    assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch"]) == 0
+    shown = seen(tty)
+    assert shown.count("run mine") == 1
+    assert "return     20.0  ▁▅█" in shown
+    assert "arm-1" in shown
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_status_watch_prints_lines_elsewhere(
+    options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learner, looked = Learner(), []
+
+    def connect(*_: object) -> Transport:
+        looked.append(1)
+        if len(looked) <= 2:
+            raise TransportError("nobody there")
+        if len(looked) > 3:
+            raise KeyboardInterrupt
+        return learner.connect()
+
+    def interrupted(status: RunStatus) -> str:
+        learner.transport.close()
+        return original(status)
+
+    name = "_json" if options else "_text"
+    original: Callable[[RunStatus], str] = getattr(status_module, name)
+    monkeypatch.setattr(status_module, name, interrupted)
+    monkeypatch.setattr(status_watch, "_TEXT_SECONDS", 0.0)
+    monkeypatch.setattr(status_module, "connect", connect)
+    assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", *options]) == 0
+    printed = capsys.readouterr()
+    assert (
+        printed.err.splitlines()
+        == ["daedalus status: no learner answers at this address; waiting for one (Ctrl-C ends)"] * 2
+    )  # before and after
+    if options:
+        assert json.loads(printed.out)["run"] == "mine"
+    else:
+        assert printed.out.startswith("run mine: CartPole-v1")
+    assert "\x1b" not in printed.out
+
+
+@pytest.mark.parametrize("option", ["--events", "--quiet"])
+def test_watch_shows_nothing_but_the_state(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", option])
+    assert "leave out" in capsys.readouterr().err
+
+
+@pytest.fixture
+def display(tty: Tty) -> TrainingDisplay:
+    return TrainingDisplay(Screen(tty, tty), "mine")
+
+
+def test_train_shows_its_run_and_at_the_end_a_short_frame(
+    display: TrainingDisplay, tty: Tty, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = Learner()
+    monkeypatch.setattr("daedalus.transport.connecting.connect", learner.connect)
+    display.begin("unixsock-stream//nowhere")
+    assert not display.poll(None)  # type: ignore[arg-type]
+    until(lambda: "arm-1" in tty.getvalue())
+    learner.status = learner.status.model_copy(update={"env_steps": 777})
+    until(lambda: "777" in tty.getvalue())
+    display.end()
+    assert "env_steps 777" in seen(tty)
+    assert "arm-1" not in seen(tty)
+
+
+def test_a_fault_of_the_display_does_not_disturb_training(
+    display: TrainingDisplay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = Learner()
+    monkeypatch.setattr("daedalus.transport.connecting.connect", learner.connect)
+    monkeypatch.setattr("daedalus.cli.watching.frame._head", lambda *_: 1 / 0)
+    display.begin("unixsock-stream//nowhere")
+    display.poll(None)  # type: ignore[arg-type]
+    assert display._thread is not None
+    display._thread.join(LIMIT)
+    display.end()
+    assert LINES == ["the display has ended: ZeroDivisionError: division by zero; training continues"]

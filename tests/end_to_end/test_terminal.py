@@ -1,0 +1,132 @@
+"""Test of `daedalus train` on a terminal, as a person sees it: a pseudo-terminal of 40 columns, and Ctrl-C."""
+
+import fcntl
+import os
+import pty
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes import DAEDALUS, LIMIT, processes_mentioning, until
+from terminal import Terminal
+
+COLUMNS, LINES = 40, 20
+# The program becomes the one that Ctrl-C of this terminal reaches.
+AT_TERMINAL = (
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+)
+
+
+class AtTerminal:
+    """Process at a pseudo-terminal, and what the terminal shows."""
+
+    def __init__(self, words: list[str], directory: Path, environment: dict[str, str]) -> None:
+        self._master, slave = pty.openpty()
+        outer = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}  # of another
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", LINES, COLUMNS, 0, 0))
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", AT_TERMINAL, *words],
+            cwd=directory,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+            env={**outer, "TERM": "xterm-256color", **environment},
+        )
+        os.close(slave)
+        self.terminal = Terminal(COLUMNS)
+        self.raw = b""
+        self.fault: Exception | None = None
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        try:
+            while True:
+                data = os.read(self._master, 1 << 16)
+                self.raw += data
+                self.terminal.feed(data.decode())
+        except OSError:  # the process has closed the terminal
+            return
+        except Exception as error:
+            self.fault = error
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.terminal.lines)
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def wait(self) -> int:
+        status = self.process.wait(LIMIT)
+        self._reader.join(LIMIT)
+        return status
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait(LIMIT)
+        self._reader.join(LIMIT)
+        os.close(self._master)
+
+
+@pytest.fixture
+def at_terminal(tmp_path: Path) -> Iterator[Callable[..., AtTerminal]]:
+    started: list[AtTerminal] = []
+
+    def start(*arguments: str, **environment: str) -> AtTerminal:
+        started.append(AtTerminal([*DAEDALUS, *arguments], tmp_path, environment))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.end()
+
+
+def child_of(parent: int, text: str) -> int:
+    """Return the id of the child process of `parent` whose command line contains `text`."""
+    (child,) = (
+        pid
+        for pid in processes_mentioning(text)
+        if int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) == parent
+    )
+    return child
+
+
+ENDLESS = ("train", "cartpole", "--set", "training.stop_when_solved=false", "--env-steps", "1000000000")
+
+
+def test_train_on_a_terminal_shows_its_actors_and_ctrl_c_leaves_a_clean_screen(
+    at_terminal: Callable[..., AtTerminal], tmp_path: Path
+) -> None:
+    running = at_terminal(*ENDLESS, "--run-dir", "shown-run")
+    until(lambda: running.fault or (re.search(r"return +\d", running.text) and "actor-1  alive" in running.text))
+    os.kill(child_of(running.process.pid, "actor-1"), signal.SIGKILL)
+    until(lambda: running.fault or "actor-1 was killed by signal 9" in running.text)  # above the frame
+    running.type(b"\x03")
+    assert running.wait() == 1, running.text
+    assert running.fault is None
+    assert running.terminal.cursor_shown
+    assert running.text.count("CartPole-v1, impala") == 1, running.text
+    assert "actor-0" not in running.text
+    frame = next(number for number, line in enumerate(running.terminal.lines) if line.startswith("CartPole-v1, impala"))
+    assert running.terminal.lines[frame + 2].startswith("return ")
+    assert "stopped; checkpoint saved at" in "".join(running.terminal.lines[:frame])  # a long line goes on below
+    assert "".join(running.terminal.lines[frame + 5 :]) == "stopped; continue with: daedalus resume shown-run"
+    assert not processes_mentioning("shown-run")
+
+
+def test_train_on_a_dumb_terminal_prints_plain_lines(at_terminal: Callable[..., AtTerminal]) -> None:
+    running = at_terminal(*ENDLESS, "--run-dir", "plain-run", TERM="dumb")
+    until(lambda: b"updates" in running.raw and b"actors 2" in running.raw)
+    running.type(b"\x03")
+    assert running.wait() == 1
+    assert b"\x1b[1A" not in running.raw
+    assert b"\x1b[?25" not in running.raw
