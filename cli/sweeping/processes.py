@@ -1,8 +1,11 @@
 """The processes of the runs of a sweep: `daedalus train` and `daedalus resume`, a few at a time."""
 
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +18,8 @@ from daedalus.learner.run.run_directory import remove_failed
 FINISHED = {0, 3}  # exit statuses of `daedalus train`: target reached or all steps done, budget used up
 _DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 _GRACE_SECONDS = 4.6  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
+_GROUP_SECONDS = 2.0  # for killed processes to disappear
+_POLL_SECONDS = 0.01
 _TAIL_BYTES = 1 << 14
 _LONGEST_REASON = 300  # characters
 
@@ -80,9 +85,28 @@ class RunProcesses:
         return [(running.run, running.process.returncode) for running in ended]
 
     def stop(self) -> None:
-        """End all processes: at once those that obey SIGTERM, and the others after a few seconds."""
-        stop([running.process for running in self._running], _GRACE_SECONDS)
+        """End all processes and their children: those that obey SIGTERM, and the others after a few seconds."""
+        processes = [running.process for running in self._running]
+        stop(processes, _GRACE_SECONDS)
+        _end_groups([process.pid for process in processes])
         self.collect()
+
+
+def _end_groups(groups: Sequence[int]) -> None:
+    """Kill what is left of process groups whose leaders have ended, and wait until nothing is left.
+
+    The learner of a run that had to be killed would hold the lock of the run for a few seconds more.
+    """
+    deadline = time.monotonic() + _GROUP_SECONDS
+    left = set(groups) if hasattr(os, "killpg") else set()  # Windows has no process groups
+    while left and time.monotonic() < deadline:
+        for group in sorted(left):
+            try:
+                os.killpg(group, signal.SIGKILL)
+            except (ProcessLookupError, PermissionError):  # macOS refuses it where only zombies are left
+                left.remove(group)
+        if left:
+            time.sleep(_POLL_SECONDS)
 
 
 def reason(log: Path, status: int) -> str:

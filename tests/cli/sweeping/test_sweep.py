@@ -12,7 +12,7 @@ from typing import IO
 
 import pytest
 from planning import finish, planner
-from processes import LIMIT, until
+from processes import LIMIT, processes_mentioning, until
 
 from daedalus.cli.sweeping import processes
 from daedalus.cli.sweeping.axes import Choices
@@ -44,7 +44,11 @@ class Programs:
             shutil.rmtree(run.directory, ignore_errors=True)
             finish(run, evaluation=float(run.spec.collection.rollout_length))
         process = subprocess.Popen(
-            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
+            [sys.executable, "-c", program],
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
         )
         self._alive = [other for other in self._alive if other.poll() is None] + [process]
         self.most = max(self.most, len(self._alive))
@@ -124,10 +128,12 @@ def test_a_run_that_ends_without_a_result_has_failed(tmp_path: Path) -> None:
 
 
 def test_no_process_is_left_after_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One obeys SIGTERM, and one does not: it is killed."""
+    """One obeys SIGTERM, and one does not: it is killed with its child."""
     monkeypatch.setattr(processes, "_GRACE_SECONDS", 0.5)
+    child = f"import time; time.sleep(999)  # of {tmp_path}"
     stubborn = (
-        "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True)\n"
+        "import signal, subprocess, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        f"subprocess.Popen([sys.executable, '-c', {child!r}]); print('ready', flush=True)\n"
         "while True: signal.pause()"
     )
     programs = Programs(
@@ -143,6 +149,7 @@ def test_no_process_is_left_after_a_stop(tmp_path: Path, monkeypatch: pytest.Mon
     assert not thread.is_alive()
     assert ends[0].stopped
     assert [process.poll() for process in programs._alive] == [-9, -15]
+    assert processes_mentioning(child) == []
 
 
 def test_the_results_are_tables_and_a_picture(tmp_path: Path) -> None:
