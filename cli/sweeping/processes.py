@@ -17,8 +17,8 @@ from daedalus.learner.run.run_directory import remove_failed
 
 FINISHED = {0, 3}  # exit statuses of `daedalus train`: target reached or all steps done, budget used up
 _DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
-_GRACE_SECONDS = 4.6  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
-_GROUP_SECONDS = 2.0  # for killed processes to disappear
+_GRACE_SECONDS = 4.4  # from SIGTERM to SIGKILL; a run needs up to 4 s to end its own processes
+_GROUP_SECONDS = 0.4  # for killed processes to disappear; both together stay below 5 s
 _POLL_SECONDS = 0.01
 _TAIL_BYTES = 1 << 14
 _LONGEST_REASON = 300  # characters
@@ -93,7 +93,7 @@ class RunProcesses:
 
 
 def _end_groups(groups: Sequence[int]) -> None:
-    """Kill what is left of process groups whose leaders have ended, and wait until nothing is left.
+    """Kill what is left of process groups whose leaders have ended, and wait a moment until nothing is left.
 
     The learner of a run that had to be killed would hold the lock of the run for a few seconds more.
     """

@@ -27,7 +27,8 @@ def test_a_sweep_that_is_stopped_continues(tmp_path: Path) -> None:
         first.process.send_signal(signal.SIGTERM)
         assert first.wait() == 1, first.output
         assert "of 2 runs have ended; continue with: daedalus sweep cartpole --over collection" in first.lines[-1]
-        assert processes_mentioning("rollout_length-8_seed-1") == processes_mentioning("rollout_length-16_seed-1") == []
+        for name in ("rollout_length-8_seed-1", "rollout_length-16_seed-1"):
+            until(lambda name=name: not processes_mentioning(name))
         second = start(*words, *SETTINGS, *LAST)
         assert second.wait() == 0, second.output
         assert any(line.endswith(": continues") for line in second.lines), second.output

@@ -149,7 +149,7 @@ def test_no_process_is_left_after_a_stop(tmp_path: Path, monkeypatch: pytest.Mon
     assert not thread.is_alive()
     assert ends[0].stopped
     assert [process.poll() for process in programs._alive] == [-9, -15]
-    assert processes_mentioning(child) == []
+    until(lambda: not processes_mentioning(child))
 
 
 def test_the_results_are_tables_and_a_picture(tmp_path: Path) -> None:
