@@ -30,7 +30,13 @@ def _rounded(name: str, array: np.ndarray) -> np.ndarray:
 
 def float32(bits: Bits) -> dict[str, np.ndarray]:
     """Return the float32 value of each bfloat16."""
-    return {name: (array.astype(np.uint32) << 16).view(np.float32) for name, array in bits.items()}
+    return {name: _widened(array) for name, array in bits.items()}
+
+
+def _widened(bits: np.ndarray) -> np.ndarray:
+    widened = bits.astype(np.uint32)
+    widened <<= 16  # in place: a learner does this for each gradient that it receives
+    return widened.view(np.float32)
 
 
 def planes(bits: Bits, base: Bits | None) -> dict[str, np.ndarray]:
@@ -70,4 +76,7 @@ def _split(bits: np.ndarray) -> np.ndarray:
 def _joined(name: str, planes: np.ndarray) -> np.ndarray:
     if planes.dtype != np.uint8 or planes.ndim < 1 or len(planes) != 2:
         raise ValueError(f"weight {name!r} must be uint8 [2, ...], not {planes.dtype} {planes.shape}")
-    return planes[0].astype(np.uint16) << 8 | planes[1]
+    joined = planes[0].astype(np.uint16)
+    joined <<= 8
+    joined |= planes[1]
+    return joined
