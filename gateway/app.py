@@ -43,7 +43,7 @@ def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Gua
         """The WebSocket of one page."""
 
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-            await ViewerConnection(data, guard, receive, send).serve()
+            await ViewerConnection(data, guard, scope, receive, send).serve()
 
     assets = read_assets()
 

@@ -21,6 +21,20 @@ _NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of every
 _Component = ArraySpace | DiscreteSpace | ContinuousSpace
 
 
+class _UniformBox(gym.Box):
+    """A Box with two bounds for all its numbers, held once: gymnasium's takes ten bytes for each number.
+
+    Any client can state a large space, and the learner refuses it only later.
+    """
+
+    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: type[np.uint8 | np.float32]) -> None:
+        super().__init__(low, high, (), dtype)
+        self._shape = shape
+        self.low, self.high = np.broadcast_to(self.low, shape), np.broadcast_to(self.high, shape)
+        self.bounded_below = np.broadcast_to(self.bounded_below, shape)
+        self.bounded_above = np.broadcast_to(self.bounded_above, shape)
+
+
 class ClientSpaces:
     """The spaces of one client."""
 
@@ -97,9 +111,9 @@ def _first_fault(fault: ValidationError | RecursionError) -> str:
 def _gym(space: _Component) -> gymnasium.Space:
     match space:
         case ArraySpace(dtype="uint8"):
-            return gym.Box(0, 255, space.shape, np.uint8)
+            return _UniformBox(0, 255, space.shape, np.uint8)
         case ArraySpace():
-            return gym.Box(-np.inf, np.inf, space.shape, np.float32)
+            return _UniformBox(-np.inf, np.inf, space.shape, np.float32)
         case DiscreteSpace(counts=(count,)):
             return gym.Discrete(count)
         case DiscreteSpace():

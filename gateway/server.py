@@ -9,6 +9,7 @@ from asyncio.transports import BaseTransport
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
+import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -30,13 +31,29 @@ _REQUEST_SECONDS = 10.0  # from the connection to a complete request
 class PromptHttp(H11Protocol):
     """HTTP for clients that send a request soon."""
 
+    _deadline: asyncio.TimerHandle | None = None  # it keeps the connection, with all that was received
+
     def connection_made(self, transport: BaseTransport) -> None:
         """Close the connection if no request comes."""
         super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
-        self.loop.call_later(_REQUEST_SECONDS, self._close_if_silent)
+        self._deadline = self.loop.call_later(_REQUEST_SECONDS, self._close_if_silent)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Free the memory of the connection."""
+        super().connection_lost(exc)
+        self._end_deadline()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Let the WebSocket have its own deadlines."""
+        self._end_deadline()
+        super().handle_websocket_upgrade(event)
+
+    def _end_deadline(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
 
     def _close_if_silent(self) -> None:
-        if self.cycle is None and self.transport.get_protocol() is self:
+        if self.cycle is None:
             self.transport.close()
 
 

@@ -31,7 +31,7 @@ _HELLO = {
 }
 _SECONDS = 12.0
 _IDLE_CONNECTIONS = 500
-_MOST_SECONDS, _MOST_MEGABYTES = 5.0, 200.0  # for the honest client's slowest step, and of growth
+_MOST_SECONDS, _MOST_MEGABYTES = 5.0, 64.0  # for the honest client's slowest step, and of growth
 _HUGE = {"observation": {"kind": "array", "shape": [4096, 4096], "dtype": "float32"}}
 
 

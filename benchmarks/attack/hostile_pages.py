@@ -24,7 +24,7 @@ from benchmarks.chaos.scene import ENDLESS, Scene, scene
 
 _SECONDS = 15.0
 _READERS_THAT_STALL = 10
-_MOST_SECONDS, _MOST_MEGABYTES = 6.0, 200.0  # of the honest page without news, and of growth
+_MOST_SECONDS, _MOST_MEGABYTES = 6.0, 64.0  # of the honest page without news, and of growth
 _HELLO = json.dumps({"type": "hello", "token": ""})
 _FILES = (
     b"/etc/passwd",

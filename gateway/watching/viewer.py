@@ -7,6 +7,7 @@ import logging
 import time
 from typing import Any
 
+from daedalus.gateway.channel import channel_of
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.rate_limit import RateLimit
 from daedalus.gateway.security import Guard
@@ -27,8 +28,9 @@ _FAULT, _TRY_LATER = 1008, 1013  # codes of RFC 6455
 class ViewerConnection:
     """The conversation with one page. It receives what has changed, and no more than it can take."""
 
-    def __init__(self, data: PageData, guard: Guard, receive: Any, send: Any) -> None:
+    def __init__(self, data: PageData, guard: Guard, scope: Any, receive: Any, send: Any) -> None:
         self._data, self._guard, self._receive, self._send_event = data, guard, receive, send
+        self._channel = channel_of(scope)
         self._rate = RateLimit(_RATE, _BURST)
         self._sent = Observation()
         self._has_rows = False
@@ -37,6 +39,7 @@ class ViewerConnection:
     async def serve(self) -> None:
         """Serve the page until it is closed."""
         await self._receive()  # the request to connect
+        self._channel.limit(viewer_messages.MAX_BYTES)
         await self._send_event({"type": "websocket.accept"})
         try:
             await self._greet()

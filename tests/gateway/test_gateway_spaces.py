@@ -2,6 +2,7 @@
 
 import json
 import math
+import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -195,6 +196,21 @@ def test_wrong_observations_are_named(value: Any, text: str) -> None:
 def test_wrong_masks_are_named(mask: Any, text: str) -> None:
     with pytest.raises(ClientError, match=text):
         ClientSpaces(STATED["observations"], STATED["actions"]).action_mask(mask)
+
+
+@pytest.mark.parametrize(("dtype", "shape"), [("float32", [4096, 4096]), ("uint8", [4096, 4096, 3])])
+def test_spaces_that_no_learner_has_accepted_take_no_memory(dtype: str, shape: list[int]) -> None:
+    observations = {"observation": {"kind": "array", "shape": shape, "dtype": dtype}}
+    environment = run_spec().environment
+    tracemalloc.start()
+    try:
+        spaces = ClientSpaces(observations, {"action": {"kind": "discrete", "counts": [2]}})
+        transforms = Transforms(environment, spaces.observation_space, spaces.action_space)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert transforms.spaces.observations == spaces.stated.observations
+    assert peak < 1 << 20
 
 
 def test_largest_legal_message_fits_the_limit() -> None:

@@ -1,17 +1,20 @@
 """Who may use a gateway: tokens, TLS, origins and hosts; and the limits of one client."""
 
 import contextlib
+import gc
 import json
 import socket
 import ssl
 import urllib.error
 import urllib.request
+import weakref
+from asyncio.transports import BaseTransport
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from gateways import JsonClient, RunningGateway
-from processes import LIMIT
+from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
 from websockets.exceptions import InvalidStatus
 
@@ -180,6 +183,32 @@ def test_connection_without_a_request_is_closed(
     with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as silent:
         silent.sendall(b"GET /actor HTTP/1.1\r\nHost:")
         assert silent.recv(1) == b""
+
+
+def test_ended_connections_are_forgotten(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
+    made: list[weakref.ref[server.PromptHttp]] = []
+    connection_made = server.PromptHttp.connection_made
+
+    def noted(connection: server.PromptHttp, transport: BaseTransport) -> None:
+        made.append(weakref.ref(connection))
+        connection_made(connection, transport)
+
+    monkeypatch.setattr(server.PromptHttp, "connection_made", noted)
+    for request in (b"", b"GET / HTTP/1.1\r\nX: " + b"x" * 200_000, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as connection:
+            connection.sendall(request)
+    client = connect()
+    client.hello("phone")
+    client.close()
+
+    def forgotten() -> bool:
+        gc.collect()
+        return len(made) == 4 and not any(reference() for reference in made)
+
+    until(forgotten)
 
 
 def test_gateway_that_stops_ends_connections_whose_clients_do_not_answer(network: MemoryNetwork, folder: Path) -> None:

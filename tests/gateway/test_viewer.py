@@ -180,7 +180,6 @@ def test_an_order_that_the_learner_does_not_take_is_answered(gateway: RunningGat
         '{"type": "order", "order": ["stop"], "token": ""}',
         '{"type": "camera", "on": 1}',
         '{"type": "hello", "token": ""}',
-        '{"type": "hello", "token": "' + "x" * 5000 + '"}',
         "[" * 4000,
         b"\x00\x01",
     ],
@@ -193,6 +192,13 @@ def test_bad_messages_are_answered_and_at_last_end_the_connection(watch: Watch, 
     viewer.socket.send(message)
     assert viewer.receive("error")["code"] in ("malformed", "out_of_turn")
     assert viewer.closed() == 1008
+
+
+@pytest.mark.parametrize("message", ['{"type": "hello", "token": "' + "x" * 5000 + '"}', b" " * 5000])
+def test_large_message_ends_the_connection(watch: Watch, message: str | bytes) -> None:
+    viewer = watch()
+    viewer.socket.send(message)
+    assert viewer.closed() == 1009
 
 
 def test_first_message_must_be_a_hello(gateway: RunningGateway) -> None:
