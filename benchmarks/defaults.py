@@ -5,10 +5,11 @@
     python -m benchmarks.defaults --file build/defaults.csv --only LunarLander-v3 Pendulum-v1 --seeds 11 12 13
     python -m benchmarks.defaults --file benchmarks/measured/defaults.csv --table
 
-Ours is `daedalus train --env ID`, theirs PPO with all defaults and 8 environments in one process (MultiInputPolicy for
-Dict observations, CnnPolicy for images). Both get the same env_steps and the same seeds. The score of a run is the mean
-return of its last 100 training episodes, with sampled actions; its seconds are those of training alone, its CPU seconds
-those of all its processes. Each run adds a line to the file; the same command again makes only those that are missing.
+Ours is `daedalus train --env ID` (MemoryS7 with `policy.memory=gru`), theirs PPO with all defaults and 8 environments
+in one process (MultiInputPolicy for Dict observations, CnnPolicy for images; it has no memory). Both get the same
+env_steps and the same seeds. The score of a run is the mean return of its last 100 training episodes, with sampled
+actions; its seconds are those of training alone, its CPU seconds those of all its processes. Each run adds a line to
+the file; the same command again makes only those that are missing.
 
 The table gives interquartile means over the seeds with 95 % bootstrap intervals, and the probability that a run of ours
 is better than one of theirs.
@@ -43,6 +44,7 @@ class Task:
     id: str
     env_steps: int
     kwargs: tuple[tuple[str, Any], ...] = ()  # of gymnasium.make
+    settings: tuple[str, ...] = ()  # of ours, where the task cannot be learnt without them
 
     @property
     def name(self) -> str:
@@ -67,14 +69,16 @@ BASKET = (
     Task(id="HalfCheetah-v5", env_steps=500_000),
     Task(id="Ant-v5", env_steps=500_000),
     Task(id="minigrid:MiniGrid-DoorKey-5x5-v0", env_steps=200_000),
+    Task(id="minigrid:MiniGrid-MemoryS7-v0", env_steps=1_000_000, settings=("policy.memory=gru",)),
+    Task(id="ALE/Pong-v5", env_steps=200_000),
 )
 
 
 def ours(task: Task, seed: int) -> tuple[float, float]:
     """Train with `daedalus train --env`, as a user would; return score and seconds."""
     kwargs = [word for key, value in task.kwargs for word in ("--set", f"environment.kwargs.{key}={json.dumps(value)}")]
-    few = ("--set", "evaluation.final_episodes=1")
-    summary = train("--env", task.id, "--seed", seed, "--env-steps", task.env_steps, *kwargs, *few)
+    settings = [word for setting in (*task.settings, "evaluation.final_episodes=1") for word in ("--set", setting)]
+    summary = train("--env", task.id, "--seed", seed, "--env-steps", task.env_steps, *kwargs, *settings)
     return summary["episode_return_mean"], summary["wall_seconds"]
 
 

@@ -1,6 +1,7 @@
 """Default settings of an environment without a preset, chosen by its spaces and by nothing else about it."""
 
 import importlib.resources
+import math
 import tomllib
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 Kind = Literal["vectors_discrete", "vectors_continuous", "images", "large_images"]
 _UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not known
 _LARGE = 128  # pixels of the longer side
+_FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
 def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> dict[str, Any]:
@@ -24,6 +26,8 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> di
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and not all(map(_has_colours, _images(spaces))):
         del settings["environment"]["grey"]
+    if kind == "vectors_continuous" and spaces is not None:
+        settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings
@@ -37,6 +41,15 @@ def kind_of(spaces: Spaces) -> Kind:
     if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
         return "vectors_continuous"
     return "vectors_discrete"
+
+
+def _noise_scale(spaces: Spaces) -> float:
+    """Return the factor of the noise with which the norm over all numbers of an action is that of two at most.
+
+    A robot with many joints falls over when all of them move at random (docs/results.md, default settings).
+    """
+    numbers = sum(space.size for space in spaces.actions.values() if isinstance(space, ContinuousSpace))
+    return min(1.0, math.sqrt(_FULL_NOISE / numbers))
 
 
 def _images(spaces: Spaces) -> list[ArraySpace]:

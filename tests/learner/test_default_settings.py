@@ -63,6 +63,16 @@ def test_only_images_with_colours_are_made_grey(shape: tuple[int, ...], grey: bo
     assert environment["resize"] == [84, 84]
 
 
+@pytest.mark.parametrize(
+    ("arms", "numbers", "std"), [(1, 1, 1.0), (1, 2, 1.0), (1, 3, 0.82), (1, 8, 0.5), (2, 4, 0.5)]
+)
+def test_noise_of_all_numbers_of_an_action_together_is_bounded(arms: int, numbers: int, std: float) -> None:
+    arm = ContinuousSpace(low=(None,) * numbers, high=(None,) * numbers)
+    actions: dict[str, ActionSpace] = {f"arm_{index}": arm for index in range(arms)}
+    where = Spaces(observations={"o": VECTOR}, actions={**actions, "gripper": CHOICES})
+    assert default_settings(where)["policy"]["initial_std"] == std
+
+
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))
