@@ -63,9 +63,7 @@ def test_only_images_with_colours_are_made_grey(shape: tuple[int, ...], grey: bo
     assert environment["resize"] == [84, 84]
 
 
-@pytest.mark.parametrize(
-    ("arms", "numbers", "std"), [(1, 1, 1.0), (1, 2, 1.0), (1, 3, 0.82), (1, 8, 0.5), (2, 4, 0.5)]
-)
+@pytest.mark.parametrize(("arms", "numbers", "std"), [(1, 1, 1.0), (1, 2, 1.0), (1, 3, 0.82), (1, 8, 0.5), (2, 4, 0.5)])
 def test_noise_of_all_numbers_of_an_action_together_is_bounded(arms: int, numbers: int, std: float) -> None:
     arm = ContinuousSpace(low=(None,) * numbers, high=(None,) * numbers)
     actions: dict[str, ActionSpace] = {f"arm_{index}": arm for index in range(arms)}
