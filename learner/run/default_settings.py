@@ -46,7 +46,7 @@ def kind_of(spaces: Spaces) -> Kind:
 def _noise_scale(spaces: Spaces) -> float:
     """Return the factor of the noise with which the norm over all numbers of an action is that of two at most.
 
-    With the noise that MountainCarContinuous needs in its only number, Ant hardly learns with its eight (docs/results.md).
+    With the noise that MountainCarContinuous needs in its one number, Ant hardly learns with eight (docs/results.md).
     """
     numbers = sum(space.size for space in spaces.actions.values() if isinstance(space, ContinuousSpace))
     return min(1.0, math.sqrt(_FULL_NOISE / numbers))
