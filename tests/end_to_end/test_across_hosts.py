@@ -91,7 +91,9 @@ def test_actors_on_three_hosts_solve_cartpole_over_tls(tmp_path: Path, network: 
     for actor in actors:
         actor.expect("nothing answers .* waiting for it")  # all actors take part from the start of the run
     everywhere = ("--listen", f"tls/0.0.0.0:{PORT}", "--tls", folder / "learner")
-    learner = central.start("learner", "cartpole", *everywhere, "--run-dir", "run")
+    # How many env_steps three actors need depends on their timing: 325,000 to 1,060,000 in nine runs, of 1,500,000.
+    budget = ("--env-steps", 5_000_000)
+    learner = central.start("learner", "cartpole", *everywhere, "--run-dir", "run", *budget)
     for host, actor in zip(players, actors, strict=True):
         actor.expect(rf"joined run 'run' as '{host.name}\.\d+'")
     assert learner.wait() == 0, learner.output
