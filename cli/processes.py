@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TextIO
 
 _logger = logging.getLogger(__name__)
@@ -20,6 +20,7 @@ ORDERED = 4  # exit status of a supervised learner that an operator stopped
 RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
+_STUCK_POLL_SECONDS = 0.05
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
@@ -46,17 +47,18 @@ def raise_descriptor_limit() -> None:
 def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
-    The signal handlers only set the event, so that the process closes its resources before it ends. A thread sets it
-    too: Python calls no handler while the main thread runs native code, such as a simulator or a policy.
+    The process can so close its resources before it ends. A thread sets the event, not the signal handlers. Python
+    calls no handler while the main thread runs native code, such as a simulator or a policy. And a handler may
+    interrupt the main thread, or another handler, inside the event: it would wait for ever for the event's lock.
 
     With `exit_if_stuck`, the process ends with status 1 if the main thread does not return from native code within
     `_STUCK_SECONDS` of the event, or does not end within `_END_SECONDS` more.
     """
-    stop, responded = threading.Event(), threading.Event()
+    stop = threading.Event()
+    handled: list[int] = []  # the signals that the main thread has responded to
 
-    def handle(_number: int, _frame: object) -> None:
-        stop.set()
-        responded.set()
+    def handle(number: int, _frame: object) -> None:
+        handled.append(number)
 
     def watch() -> None:
         while number := os.read(reader, 1):
@@ -73,19 +75,22 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
         os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
-        threading.Thread(target=_exit_if_stuck, args=(stop, responded), name="stuck-watch", daemon=True).start()
+        threading.Thread(target=_exit_if_stuck, args=(stop, handled), name="stuck-watch", daemon=True).start()
     return stop
 
 
-def _exit_if_stuck(stop: threading.Event, responded: threading.Event) -> None:
-    """Wait for `stop`, and end the process unless it ends by itself; `responded` is set by the signal handler."""
+def _exit_if_stuck(stop: threading.Event, handled: Sequence[int]) -> None:
+    """Wait for `stop`, and end the process unless it ends by itself; the signal handler adds to `handled`."""
     stop.wait()
     # Another part of the process may have set `stop`.
     if hasattr(signal, "pthread_kill"):
         os.kill(os.getpid(), signal.SIGTERM)
     else:  # Windows, where os.kill would end the process at once
         signal.raise_signal(signal.SIGTERM)
-    if responded.wait(_STUCK_SECONDS):
+    deadline = time.monotonic() + _STUCK_SECONDS
+    while not handled and time.monotonic() < deadline:
+        time.sleep(_STUCK_POLL_SECONDS)
+    if handled:
         time.sleep(_END_SECONDS)
     try:
         _logger.error("the process was asked to stop, but a call of native code does not return: it ends now")

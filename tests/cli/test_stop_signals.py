@@ -1,4 +1,4 @@
-"""SIGTERM ends a process whose main thread runs native code, in which Python calls no signal handler."""
+"""SIGTERM ends a process, also one whose main thread runs native code, in which Python calls no signal handler."""
 
 import signal
 import subprocess
@@ -42,6 +42,17 @@ SEEN_BY_A_THREAD = """
     while True:
         libc.pthread_mutex_lock(mutex)
 """
+MANY = """
+    import signal
+    stop = processes.stop_on_signals()
+    storm = threading.Thread(target=lambda: [os.kill(os.getpid(), signal.SIGTERM) for _ in range(20_000)])
+    print("ready", flush=True)
+    stop.wait()
+    storm.start()
+    while storm.is_alive():
+        stop.wait(0.001)
+    os._exit(9)
+"""
 CHILD = """
     import signal, time
     stop = processes.stop_on_signals()
@@ -60,8 +71,15 @@ CHILD = """
 
 @pytest.mark.parametrize(
     ("program", "by_signal", "status"),
-    [(STUCK, True, 1), (SLOW_END, True, 8), (SLOW_END, False, 8), (SEEN_BY_A_THREAD, True, 7), (CHILD, True, 0)],
-    ids=["stuck", "slow end", "slow end after the parent", "seen by a thread", "child"],
+    [
+        (STUCK, True, 1),
+        (SLOW_END, True, 8),
+        (SLOW_END, False, 8),
+        (SEEN_BY_A_THREAD, True, 7),
+        (MANY, True, 9),
+        (CHILD, True, 0),
+    ],
+    ids=["stuck", "slow end", "slow end after the parent", "seen by a thread", "many signals", "child"],
 )
 def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:
     command = [sys.executable, "-c", textwrap.dedent(PREAMBLE) + textwrap.dedent(program)]
