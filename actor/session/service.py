@@ -164,7 +164,7 @@ class ActorService:
         if self._config.link == "wan" and not welcome.spec.algorithm.synchronous:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
-        runtime = self._make_runtime(confirmed, spaces)
+        runtime = self._make_runtime(confirmed, spaces, count)
         self._collector.begin(runtime, confirmed.spec, confirmed.seed, confirmed.epsilon)
         self._contents = make_uploads(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
@@ -178,12 +178,13 @@ class ActorService:
         self._transport.watch_presence(keys.learner(run), self._presence.on_presence)
         self._transport.declare_presence(keys.presence(run, self._config.name, self._config.incarnation))
 
-    def _make_runtime(self, welcome: Welcome, spaces: Spaces) -> PolicyRuntime:
+    def _make_runtime(self, welcome: Welcome, spaces: Spaces, environments: int) -> PolicyRuntime:
         if self._config.runtime == "torch":
             from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
 
             return TorchRuntime(welcome.spec.policy, spaces, welcome.spec.training)
-        return OnnxRuntime(self._await_program(welcome), self._stop)
+        rows = environments * welcome.spec.collection.rollout_length  # a rollout is played with one snapshot
+        return OnnxRuntime(self._await_program(welcome), self._stop, rows)
 
     def _await_program(self, welcome: Welcome) -> bytes:
         """Return the program once the learner has it; measure the link by the time that it takes."""

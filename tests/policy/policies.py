@@ -48,8 +48,9 @@ class Policy(NamedTuple):
     def states(self, count: int, seed: int = 2) -> np.ndarray:
         return np.random.default_rng(seed).uniform(-1, 1, (count, self.network.state_size)).astype(np.float32)
 
-    def runtimes(self) -> tuple[PolicyRuntime, PolicyRuntime]:
-        return OnnxRuntime(self.program), TorchRuntime(self.spec, self.spaces)
+    def runtimes(self) -> tuple[PolicyRuntime, PolicyRuntime, PolicyRuntime]:
+        few_rows = OnnxRuntime(self.program, rows=1)  # differs for programs with convolutions
+        return OnnxRuntime(self.program), TorchRuntime(self.spec, self.spaces), few_rows
 
 
 def observations(space: ArraySpace, leading: tuple[int, ...], seed: int = 1) -> np.ndarray:
