@@ -45,7 +45,7 @@ def make_environments(
         _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
     bare, rest = make_bare(spec, count, modules, render_mode, camera, for_evaluation)
     try:
-        return TransformedEnvironment(bare, rest)
+        return TransformedEnvironment(bare, rest, for_evaluation=for_evaluation)
     except EnvironmentSetupError:
         bare.close()
         raise

@@ -123,9 +123,16 @@ class Transforms:
 class TransformedEnvironment:
     """A VectorEnvironment: a backend's environments with the specification's transforms."""
 
-    def __init__(self, environments: BackendEnvironments, spec: EnvironmentSpec) -> None:
-        """Raises EnvironmentSetupError if the specification does not fit the environments."""
+    def __init__(
+        self, environments: BackendEnvironments, spec: EnvironmentSpec, *, for_evaluation: bool = False
+    ) -> None:
+        """Raises EnvironmentSetupError if the specification does not fit the environments.
+
+        For `for_evaluation` see make_environments.
+        """
         self._environments = environments
+        self._one_episode = for_evaluation
+        self._over = np.zeros(environments.count, np.bool_)  # [E] whether the only episode of each has ended
         self._transforms = Transforms(
             spec, environments.observation_space, environments.action_space, environments.action_mask
         )
@@ -143,12 +150,16 @@ class TransformedEnvironment:
     def reset(self, seed: int) -> Observed:
         """See VectorEnvironment."""
         observations = self._environments.reset(seed)
+        self._over[:] = False
         return self._transforms.observe(observations, self._environments.action_mask, np.ones(self.count, np.bool_))
 
     def step(self, actions: dict[str, np.ndarray]) -> Step:
         """See VectorEnvironment."""
         observations, rewards, terminated, truncated = self._environments.step(self._transforms.env_actions(actions))
-        needed = ~(terminated | truncated)  # after an episode's end the next step only resets
+        ended = terminated | truncated
+        if self._one_episode:
+            ended = self._over = self._over | ended
+        needed = ~ended  # after an episode's end the next step only resets, or the environment stands still
         observed = self._transforms.observe(observations, self._environments.action_mask, needed)
         return observed, rewards, terminated, truncated
 

@@ -98,18 +98,24 @@ class OneEpisode(gymnasium.Wrapper):
 
     _over = False
     _last: Any = None  # the last observation of the episode
+    _mask: Any = None  # its last action mask; None if it has none
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode if a seed is given, else return the last observation."""
         if seed is None:
-            return self._last, {}
+            return self._last, self._still()
         self._over = False
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """See gymnasium.Env. After the episode, return the last observation and no reward."""
         if self._over:
-            return self._last, 0.0, False, False, {}
+            return self._last, 0.0, False, False, self._still()
         self._last, reward, terminated, truncated, info = self.env.step(action)
         self._over = terminated or truncated
+        self._mask = info.get(MASK_KEY, self._mask)
         return self._last, reward, terminated, truncated, info
+
+    def _still(self) -> dict[str, Any]:
+        """Return the `info` after the episode: masks of a batch that lacks one cannot always be put together."""
+        return {} if self._mask is None else {MASK_KEY: self._mask}

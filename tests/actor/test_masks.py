@@ -16,6 +16,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.acting.runtime import Choice
 from daedalus.policy.user_modules import NO_MODULES
@@ -62,11 +63,32 @@ class Narrowing(gymnasium.Env):
         return seen, {"action_mask": self.mask().astype(np.int8)} if self._convention == "info" else {}
 
 
+class Uneven(Narrowing):
+    """Episodes of different lengths, after which no choice is legal."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        self._length = 1 + (seed or 0) % 5
+        return super().reset(seed=seed)
+
+    def mask(self) -> np.ndarray:
+        return super().mask() & (self._step < self._length)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        seen, reward, _, _, info = super().step(action)
+        return seen, reward, self._step == self._length, False, info
+
+    def _shown(self) -> tuple[Any, dict]:
+        seen, info = super()._shown()
+        return seen, {"action_mask": list(self.mask())} if self._convention == "list" else info
+
+
 @pytest.fixture(autouse=True)
 def _registered() -> Any:
     gymnasium.register("Narrowing-v0", lambda **kwargs: Narrowing(**kwargs))
+    gymnasium.register("Uneven-v0", lambda **kwargs: Uneven(**kwargs))
     yield
     del gymnasium.registry["Narrowing-v0"]
+    del gymnasium.registry["Uneven-v0"]
 
 
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])
@@ -240,6 +262,18 @@ def test_masks_of_an_environment_may_be_lists(monkeypatch: pytest.MonkeyPatch, m
         observed, *_ = environments.step({"action": observed.masks["action"].argmax(1)[:, None]})
     assert observed.masks["action"].tolist() == [[True, False, False]] * 2
     environments.close()
+
+
+@pytest.mark.parametrize("convention", ["info", "method", "observation", "list"])
+def test_environments_that_have_ended_need_no_legal_choice_in_an_evaluation(convention: str) -> None:
+    spec = EnvironmentSpec(id="Uneven-v0", kwargs={"convention": convention})
+    environments = make_environments(spec, 8, for_evaluation=True)
+    try:
+        evaluation = play_episodes(LegalPolicy(), environments, 20, seed=1, sampled=False)
+    finally:
+        environments.close()
+    assert set(evaluation.lengths.tolist()) == {1, 2, 3, 4, 5}
+    assert evaluation.returns.tolist() == evaluation.lengths.tolist()
 
 
 def narrowing_notes(convention: str) -> tuple[str, ...]:
