@@ -5,6 +5,7 @@ several components takes a map of them.
 """
 
 import math
+from itertools import accumulate, chain
 
 import torch
 from torch import Tensor, nn
@@ -33,9 +34,14 @@ class FlatEncoder(nn.Module):
         self._spaces = spaces
         self.layers = Perceptron(sum(_width(space) for space in spaces.values()), spec.hidden, spec.activation)
         self.features = self.layers.features
+        self._first_columns = _first_columns(spaces)
 
     def forward(self, observations: Observations) -> Tensor:
         """Encode observations."""
+        if self._first_columns is not None:
+            choices = torch.cat([observations[name] for name in self._spaces], -1)
+            if self.layers.learns_fast(choices):
+                return self.layers.of_choices(choices + self._first_columns)
         parts = [_flat(observations[name], space) for name, space in self._spaces.items()]
         return self.layers(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
 
@@ -132,6 +138,14 @@ def _image_encoder(name: str, space: ArraySpace) -> ImageEncoder:
 
 def _width(space: ArraySpace | DiscreteSpace) -> int:
     return space.choices if isinstance(space, DiscreteSpace) else math.prod(space.stacked_shape)
+
+
+def _first_columns(spaces: ObservationSpaces) -> Tensor | None:
+    """Return the first one-hot column of each variable [K] int64; None if a component is not discrete."""
+    counts = [space.counts for space in spaces.values() if isinstance(space, DiscreteSpace)]
+    if len(counts) < len(spaces):
+        return None
+    return torch.tensor([0, *accumulate(chain.from_iterable(counts))][:-1])
 
 
 def _flat(observations: Tensor, space: ArraySpace | DiscreteSpace) -> Tensor:

@@ -27,11 +27,23 @@ class Perceptron(nn.Sequential):
 
     def forward(self, input: Tensor) -> Tensor:
         """Compute the features of N rows."""
+        return self._in_few_operations(input) if self.learns_fast(input) else super().forward(input)
+
+    def of_choices(self, columns: Tensor) -> Tensor:
+        """Compute the features of N rows, of which each has the input 1 in a few columns [N, K] int64, and else 0.
+
+        Only where `learns_fast` says so. With 500 columns an update takes a third less time than with one-hot inputs.
+        """
+        return self._in_few_operations(columns)
+
+    def learns_fast(self, input: Tensor) -> bool:
+        """Whether gradients of this input, which needs none itself, are computed in few operations: on a CPU."""
         mixed = torch.is_autocast_enabled(input.device.type)
-        if len(self) and torch.is_grad_enabled() and input.device.type == "cpu" and not mixed:
-            parameters = [each for layer in self._linear for each in (layer.weight, layer.bias)]
-            return _Layers.apply(input, self._is_tanh, *parameters)  # pyright: ignore[reportReturnType]
-        return super().forward(input)
+        return bool(len(self)) and torch.is_grad_enabled() and input.device.type == "cpu" and not mixed
+
+    def _in_few_operations(self, input: Tensor) -> Tensor:
+        parameters = [each for layer in self._linear for each in (layer.weight, layer.bias)]
+        return _Layers.apply(input, self._is_tanh, *parameters)  # pyright: ignore[reportReturnType]
 
 
 class _Layers(torch.autograd.Function):
@@ -43,9 +55,13 @@ class _Layers(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, is_tanh: bool, *parameters: Tensor) -> Tensor:
+        """Compute the features of inputs [N, inputs] float32, or [N, K] int64 as for Perceptron.of_choices."""
         outputs = [inputs]
         for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
-            output = torch.addmm(bias, outputs[-1], weight.t())
+            if outputs[-1].dtype == torch.int64:
+                output = torch.embedding(weight.t(), inputs).sum(1).add_(bias)
+            else:
+                output = torch.addmm(bias, outputs[-1], weight.t())
             outputs.append(_tanh(output) if is_tanh else output.relu_())
         ctx.is_tanh = is_tanh
         ctx.save_for_backward(*outputs, *parameters[::2])
@@ -64,9 +80,18 @@ class _Layers(torch.autograd.Function):
                 inner = torch.ops.aten.tanh_backward(outer, output)
             else:
                 inner = torch.ops.aten.threshold_backward(outer, output, 0)
-            results += [inner.sum(0), inner.t() @ outputs[layer]]
+            results += [inner.sum(0), _weight_gradient(inner, outputs[layer], weights[layer].shape[1])]
             outer = inner @ weights[layer] if layer or ctx.needs_input_grad[0] else None
         return outer, None, *reversed(results)
+
+
+def _weight_gradient(inner: Tensor, inputs: Tensor, width: int) -> Tensor:
+    """Return the gradient of the weights of a layer [units, width], from that of its outputs [N, units]."""
+    if inputs.dtype != torch.int64:
+        return inner.t() @ inputs
+    columns = inputs.shape[1]
+    each = inner if columns == 1 else inner.repeat_interleave(columns, 0)
+    return torch.ops.aten.embedding_dense_backward(each, inputs.flatten(), width, -1, False).t()
 
 
 def _tanh(values: Tensor) -> Tensor:

@@ -5,7 +5,11 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
+from daedalus.policy.network.custom_encoder import ObservationSpaces
+from daedalus.policy.network.encoders import FlatEncoder
 from daedalus.policy.network.perceptron import Perceptron
+from daedalus.protocol.spaces import DiscreteSpace
+from daedalus.protocol.spec import PolicySpec
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
@@ -36,3 +40,32 @@ def test_features_without_gradients_equal_those_with() -> None:
     with torch.no_grad():
         assert_close(perceptron(inputs), perceptron(inputs.clone().requires_grad_()))
     assert_close(perceptron(inputs).detach(), nn.Sequential(*perceptron)(inputs).detach())
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("hidden", [(7,), (8, 6)])
+def test_choices_have_the_features_and_gradients_of_one_hot_inputs(hidden: tuple[int, ...], activation: str) -> None:
+    """A column may be chosen by several rows. The reference: torch's own layers on the one-hot inputs."""
+    spaces: ObservationSpaces = {"place": DiscreteSpace(counts=(5,)), "dice": DiscreteSpace(counts=(3, 2))}
+    spec = PolicySpec.model_validate({"hidden": hidden, "activation": activation})
+    encoder = FlatEncoder(spaces, spec)
+    observations = {"place": torch.tensor([[4], [0], [4], [2]]), "dice": torch.tensor([[0, 1], [2, 0], [0, 0], [1, 1]])}
+    one_hot = torch.tensor(
+        [
+            [0, 0, 0, 0, 1, 1, 0, 0, 0, 1],
+            [1, 0, 0, 0, 0, 0, 0, 1, 1, 0],
+            [0, 0, 0, 0, 1, 1, 0, 0, 1, 0],
+            [0, 0, 1, 0, 0, 0, 1, 0, 0, 1],
+        ],
+        dtype=torch.float32,
+    )
+    parameters, outer = list(encoder.parameters()), torch.randn(4, hidden[-1])
+    expected = torch.nn.Sequential.forward(encoder.layers, one_hot)
+    features = encoder(observations)
+    torch.testing.assert_close(features, expected)
+    for given, wanted in zip(
+        torch.autograd.grad(features, parameters, outer), torch.autograd.grad(expected, parameters, outer), strict=True
+    ):
+        torch.testing.assert_close(given, wanted)
+    with torch.no_grad():
+        torch.testing.assert_close(encoder(observations), expected)
