@@ -26,6 +26,7 @@ from daedalus.protocol.spec import EnvironmentSpec
 
 # Packages that register environments when they are imported: beginning of the id -> module and extra.
 _PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
+_OLD_ATARI = ("-v0", "-v4")  # versions of Atari's games under names without ALE/, such as PongNoFrameskip-v4
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
@@ -147,6 +148,9 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
         for beginning, (module, extra) in _PACKAGES.items():
             if name.startswith(beginning):
                 gymnasium.register_envs(import_extra(module, extra, f"environment {name}"))
+        if name.endswith(_OLD_ATARI) and name not in gymnasium.registry:
+            with suppress(ImportError):
+                gymnasium.register_envs(importlib.import_module("ale_py"))
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:

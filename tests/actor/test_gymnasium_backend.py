@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -377,3 +378,16 @@ def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
     plain = make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
     assert plain.spaces.observations["observation"].shape == (210, 160, 3)
     plain.close()
+
+
+@pytest.mark.parametrize("name", ["PongNoFrameskip-v4", "Pong-v0"])
+def test_atari_games_are_found_by_their_old_names(name: str) -> None:
+    """In a process of its own, where nothing has registered them yet."""
+    pytest.importorskip("ale_py")
+    program = (
+        "from daedalus.actor.environments.make import make_environments\n"
+        "from daedalus.protocol.spec import EnvironmentSpec\n"
+        f"print(make_environments(EnvironmentSpec(id={name!r}), 1).spaces.observations['observation'].shape)"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert finished.stdout == "(210, 160, 3)\n", finished.stderr
