@@ -276,9 +276,8 @@ def watch(
                 actors.remove(actor)
                 stop([actor.process])
                 playing = sum(other.name not in _HELPERS for other in actors)
-                needed = (
-                    not playing or spec.algorithm.synchronous
-                )  # a synchronous algorithm waits for all actors at its start
+                # A synchronous algorithm waits for all actors at its start.
+                needed = not playing or spec.algorithm.synchronous
                 if needed and actor.name not in _HELPERS:
                     raise
                 _warn(f"{error}; training continues without this process", record)
