@@ -1,6 +1,7 @@
 """Environments that each break gymnasium's interface in one way."""
 
 import os
+import signal
 import time
 from typing import Any
 
@@ -48,6 +49,11 @@ class Faulty(gymnasium.Env[Any, Any]):
         reward: Any = np.nan if self._fault == "reward" and self._step == 3 else 1.0
         result = self._observe(), reward, int(over) if self._fault == "flag" else over, False, {}
         return result[:4] if self._fault == "values" else result
+
+    def close(self) -> None:
+        if self._fault == "close" and self._step:  # a signal that it handles does not end it, either
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            time.sleep(3600)
 
 
 gymnasium.register("Faulty-v0", lambda **kwargs: Faulty(**kwargs))

@@ -1,8 +1,9 @@
 """Environments in separate processes: gymnasium's AsyncVectorEnv with a safe start and end."""
 
 import signal
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import gymnasium
@@ -10,6 +11,9 @@ from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+
+_CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video
+_TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
@@ -38,17 +42,35 @@ class EnvironmentProcesses(AsyncVectorEnv):
         return self._call(lambda: super(EnvironmentProcesses, self).step(actions))
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """End the processes: by request if they are idle, otherwise by a signal."""
-        try:
-            if self._idle and not terminate:
-                super().close_extras(timeout)
-        except (EOFError, OSError):
-            pass  # one process has died; the others are ended below
-        finally:
-            for process in self.processes:
-                process.terminate()
-            for process in self.processes:
-                process.join()
+        """End the processes: by request if they are idle, then by a signal, then by force.
+
+        Unlike the base class this waits for no answer: a simulator may not return from its `close`.
+
+        Args:
+          timeout: seconds that idle processes have to close their environments; None: `_CLOSE_SECONDS`.
+          terminate: end them by a signal at once.
+        """
+        pipes = [pipe for pipe in self.parent_pipes if pipe is not None and not pipe.closed]
+        if self._idle and not terminate:
+            for pipe in pipes:
+                with suppress(OSError):  # its process has died
+                    pipe.send(("close", None))
+            self._join(_CLOSE_SECONDS if timeout is None else timeout)
+        for process in self.processes:
+            process.terminate()
+        self._join(_TERMINATE_SECONDS)
+        for process in self.processes:
+            process.kill()
+        for process in self.processes:
+            process.join()
+        for pipe in pipes:
+            pipe.close()
+
+    def _join(self, seconds: float) -> None:
+        """Wait until all processes have ended, at most so many seconds."""
+        deadline = time.monotonic() + seconds
+        for process in self.processes:
+            process.join(max(deadline - time.monotonic(), 0.0))
 
     def _call(self, call: Callable[[], Any]) -> Any:
         self._idle = False

@@ -17,12 +17,12 @@ from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 from plain import PlainEnvironments, choices
 
-from daedalus.actor.environments import make
+from daedalus.actor.environments import environment_processes, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, make_gymnasium
 from daedalus.actor.environments.wrappers import RepeatedSteps
-from daedalus.policy.user_modules import NO_MODULES
+from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
 created = partial(make.make_environments, modules=TEST_MODULES)
@@ -226,6 +226,18 @@ def test_close_after_an_interrupted_step_ends_the_processes() -> None:
     environments.parent_pipes[1] = pipe
     environments.close()
     assert not any(process.is_alive() for process in environments.processes)
+
+
+def test_close_ends_processes_whose_environments_do_not_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment_processes, "_CLOSE_SECONDS", 0.5)
+    monkeypatch.setattr(environment_processes, "_TERMINATE_SECONDS", 0.1)
+    spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "close"})
+    factory = EnvironmentFactory(spec=spec, modules=UserModules(frozenset({"faulty_environments"})))
+    environments = EnvironmentProcesses([factory] * 2)
+    environments.reset(seed=1)
+    environments.step(np.zeros(2, np.int64))
+    environments.close()
+    assert [process.exitcode for process in environments.processes] == [-signal.SIGKILL] * 2
 
 
 def test_killed_process_is_reported_and_close_ends_the_others() -> None:
