@@ -49,13 +49,13 @@ def run(cell: Cell) -> dict[str, Any]:
 
     keep_freed_memory()
     began = time.monotonic()
-    outcome = train(specification(cell.task, cell.variant, cell.seed, cell.budget), cell.lag)
-    counters = outcome.counters
+    learner = train(specification(cell.task, cell.variant, cell.seed, cell.budget), cell.lag)
+    counters = learner.counters
     return {
         **asdict(cell),
         "env_steps": counters.env_steps,
         "final_return": "" if counters.episode_return_mean is None else f"{counters.episode_return_mean:.6g}",
-        "env_steps_to_threshold": outcome.env_steps_to_target or "",
+        "env_steps_to_threshold": learner.env_steps_to_target or "",
         "lag_mean": f"{counters.policy_lag_mean:.4g}",
         "seconds": f"{time.monotonic() - began:.1f}",
     }

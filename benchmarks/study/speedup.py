@@ -1,7 +1,8 @@
 """Measure how much sooner more actors reach a reference score: table 2 of Mnih et al. (2016).
 
     python -m benchmarks.study.speedup --file build/speedup.csv
-    python -m benchmarks.study.speedup --file build/speedup.csv --tasks catch --methods a3c --seeds 1 2
+    python -m benchmarks.study.speedup --file build/speedup.csv --tasks acrobot --methods a3c --seeds 1 2
+    python -m benchmarks.study.speedup --file build/simulated.csv --simulated
     python -m benchmarks.study.speedup --file build/speedup.csv --table
 
 1 to 16 actors with one environment each, all on this machine. A step of an environment takes 5 ms, most of it waiting
@@ -9,6 +10,9 @@
 Runs with few actors are made side by side, with at most 16 actors at a time. The seconds of a run count from the first
 rollouts, without the start of the processes. The score is the mean return of the last 50 training episodes; to be
 comparable, all actors of the methods with action values explore with epsilon 0.05 in the end.
+
+With --simulated the actors of a run are in one process and time is simulated: an environment step takes 5 ms, and all
+else none. Runs are then a hundred times as fast, and the two cores set no limit to the number of actors.
 
 Each run adds a line to the file; the same command again makes only those that are missing.
 """
@@ -31,14 +35,27 @@ import numpy as np
 
 from benchmarks.recorded_runs import RecordedRuns
 from benchmarks.running import COMMAND, machine, table
+from benchmarks.study.simulated_actors import train_simulated
+from daedalus.actor.environments.make import make_environments
 from daedalus.cli.comparing.comparison import estimate
 from daedalus.cli.comparing.tables import written
+from daedalus.cli.settings_arguments import Choice
+from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.settings import override
+from daedalus.protocol.spec import EnvironmentSpec
 
 _IDENTITY = ("task", "method", "actors", "seed", "milliseconds")
 _RESULTS = ("seconds", "env_steps")  # until the score was reached; blank if it was not
 _ACTORS_AT_ONCE = 16
 _MODULE = "benchmarks.study.waiting"
-_VALUES = ("training.exploration=[0.05]", "training.exploration_env_steps=20000", "training.target_period=50")
+# Learning rates are the best of four on CartPole, with 1 and with 16 actors, on seeds 101 to 104.
+_POLICY = ("training.learning_rate=7e-4",)
+_VALUES = (
+    "training.learning_rate=2e-3",
+    "training.exploration=[0.05]",
+    "training.exploration_env_steps=5000",
+    "training.target_period=50",
+)
 
 
 class Task(NamedTuple):
@@ -52,39 +69,66 @@ class Task(NamedTuple):
 
 TASKS = {
     "cartpole": Task("CartPole-v1", 150.0, 400_000, ("environment.reward_scale=0.05",)),
-    "catch": Task("Catch-v0", 0.5, 400_000, ("policy.encoder=small",)),
+    "acrobot": Task("Acrobot-v1", -150.0, 400_000, ("environment.reward_scale=0.05",)),
     "frozen_lake": Task("FrozenLake-v1", 0.8, 200_000, ("environment.kwargs.is_slippery=false",)),
 }
 # By name: algorithm and settings.
 METHODS: dict[str, tuple[str, Sequence[str]]] = {
-    "a3c": ("a3c", ()),
-    "a3c, gradients": ("a3c", ("collection.upload=gradients",)),
+    "a3c": ("a3c", _POLICY),
+    "a3c, gradients": ("a3c", (*_POLICY, "collection.upload=gradients")),
     "one_step_q": ("one_step_q", _VALUES),
     "one_step_sarsa": ("one_step_sarsa", _VALUES),
     "n_step_q": ("n_step_q", _VALUES),
 }
 
 
-def train(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Make a run; return its results."""
-    task, (algorithm, settings) = TASKS[run["task"]], METHODS[run["method"]]
-    changes = (
-        f'environment.kwargs.of="{task.id}"',
-        f"environment.kwargs.milliseconds={run['milliseconds']}",
-        f"collection.actors={run['actors']}",
+def changes(run: Mapping[str, Any]) -> list[str]:
+    """Return the assignments that make the default settings those of a run."""
+    task, (_, settings) = TASKS[run["task"]], METHODS[run["method"]]
+    return [
         "collection.envs_per_actor=1",
         "collection.rollout_length=20",
-        "training.learning_rate=1e-3",
         f"training.target_return={task.score}",
         "training.target_episodes=50",
+        *task.settings,
+        *settings,
+    ]
+
+
+def simulate(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Make a run in simulated time; return its results."""
+    task, (algorithm, _) = TASKS[run["task"]], METHODS[run["method"]]
+    environments = make_environments(EnvironmentSpec(id=task.id), 1)
+    environments.close()
+    choice = Choice(
+        preset=None,
+        env=task.id,
+        algorithm=algorithm,
+        seed=run["seed"],
+        env_steps=task.env_steps,
+        actors=run["actors"],
+        wrap=None,
+    )
+    spec = choice.spec(lambda settings: override(settings, changes(run)), default_settings(environments.spaces))
+    learner, seconds = train_simulated(spec, run["milliseconds"] / 1000)
+    if learner.env_steps_to_target is None:
+        return {"seconds": "", "env_steps": ""}
+    return {"seconds": f"{seconds:.2f}", "env_steps": learner.env_steps_to_target}
+
+
+def train(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Make a run of processes; return its results."""
+    assignments = [
+        f'environment.kwargs.of="{TASKS[run["task"]].id}"',
+        f"environment.kwargs.milliseconds={run['milliseconds']}",
         "service.log_seconds=0.5",
         "evaluation.seconds=100000",
         "evaluation.final_episodes=1",
-        *task.settings,
-        *settings,
-    )
-    words = [word for change in changes for word in ("--set", change)]
-    words += ["--algorithm", algorithm, "--seed", run["seed"], "--env-steps", task.env_steps]
+        *changes(run),
+    ]
+    words = [word for assignment in assignments for word in ("--set", assignment)]
+    words += ["--algorithm", METHODS[run["method"]][0], "--seed", run["seed"], "--actors", run["actors"]]
+    words += ["--env-steps", TASKS[run["task"]].env_steps]
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
         command = [*COMMAND, "train", "--env", f"{_MODULE}:Waiting-v0", *words, "--run-dir", directory]
@@ -122,13 +166,13 @@ class Places:
                 self._changed.notify_all()
 
 
-def make(wanted: Sequence[Mapping[str, Any]], runs: RecordedRuns) -> None:
-    """Make runs side by side, and add the line of each to the file when it has ended."""
+def make(wanted: Sequence[Mapping[str, Any]], runs: RecordedRuns, simulated: bool) -> None:
+    """Make runs, those of processes side by side, and add the line of each to the file when it has ended."""
     places, lock = Places(_ACTORS_AT_ONCE), threading.Lock()
 
     def one(run: Mapping[str, Any]) -> None:
-        with places.taken(run["actors"]):
-            line = {**run, **train(run)}
+        with places.taken(_ACTORS_AT_ONCE if simulated else run["actors"]):
+            line = {**run, **(simulate if simulated else train)(run)}
         with lock:
             runs.add(line)
             print(", ".join(str(value) for value in line.values()), flush=True)
@@ -175,6 +219,7 @@ def main() -> None:
     options.add_argument("--actors", nargs="+", type=int, default=[16, 8, 4, 2, 1])
     options.add_argument("--seeds", nargs="+", type=int, default=list(range(11, 21)))
     options.add_argument("--milliseconds", type=float, default=5.0, help="duration of an environment step")
+    options.add_argument("--simulated", action="store_true", help="simulate the time: one process, one run at a time")
     options.add_argument("--table", action="store_true", help="only print the tables of the runs so far")
     parsed = options.parse_args()
     runs = RecordedRuns(parsed.file, _IDENTITY, _RESULTS)
@@ -183,7 +228,7 @@ def main() -> None:
         for seed, actors, task, method in itertools.product(parsed.seeds, parsed.actors, parsed.tasks, parsed.methods)
     ]
     if not parsed.table:
-        make(runs.missing(wanted), runs)
+        make(runs.missing(wanted), runs, parsed.simulated)
     print(machine())
     print(results(runs.read()))
 
