@@ -123,6 +123,7 @@ def train(run: Mapping[str, Any]) -> dict[str, Any]:
         f"environment.kwargs.milliseconds={run['milliseconds']}",
         "service.log_seconds=0.5",
         "evaluation.seconds=100000",
+        "evaluation.max_episode_env_steps=1",  # no time is lost on the policy that has reached the score
         "evaluation.final_episodes=1",
         *changes(run),
     ]
