@@ -47,6 +47,7 @@ from daedalus.protocol.spec import EnvironmentSpec
 _IDENTITY = ("task", "method", "actors", "seed", "milliseconds")
 _RESULTS = ("seconds", "env_steps")  # until the score was reached; blank if it was not
 _ACTORS_AT_ONCE = 16
+_RESAMPLES = 10_000
 _MODULE = "benchmarks.study.waiting"
 # Learning rates are the best of four on CartPole, with 1 and with 16 actors, on seeds 101 to 104.
 _POLICY = ("training.learning_rate=7e-4",)
@@ -184,26 +185,45 @@ def make(wanted: Sequence[Mapping[str, Any]], runs: RecordedRuns, simulated: boo
 
 
 def results(lines: Sequence[Mapping[str, str]]) -> str:
-    """Return a table for each task: how many times sooner than one actor, and with which share of its env_steps."""
+    """Return a table for each task: how many times sooner than one actor more of them reach the score."""
     texts = []
     for task in dict.fromkeys(line["task"] for line in lines):
+        of_task = [line for line in lines if line["task"] == task]
+        counts = sorted({int(line["actors"]) for line in of_task} - {1})
         rows = []
         for method in METHODS:
-            chosen = [line for line in lines if (line["task"], line["method"]) == (task, method)]
-            counts = sorted({int(line["actors"]) for line in chosen})
-            if 1 not in counts:
+            chosen = [line for line in of_task if line["method"] == method]
+            alone, env_steps = (_values(chosen, 1, name) for name in _RESULTS)
+            if not len(alone):
                 continue
-            alone = {name: _values(chosen, 1, name) for name in _RESULTS}
+            sooner, shares = [], []
             for count in counts:
-                seconds, env_steps = (_values(chosen, count, name) for name in _RESULTS)
-                sooner = np.median(alone["seconds"]) / np.median(seconds)
-                share = np.median(env_steps) / np.median(alone["env_steps"])
-                reached = f"{np.isfinite(seconds).sum()} of {len(seconds)}"
-                interval = written(estimate([seconds]), "{:.1f}".format)
-                rows.append((method, count, reached, interval, f"{sooner:.1f}", f"{share:.2f}"))
-        header = ("method", "actors", "reached", "seconds", "times sooner", "env_steps, relative")
-        texts.append(f"{task}, mean return {TASKS[task].score:g}\n\n{table(header, rows)}")
-    return "\n\n".join([*texts, "Times sooner and env_steps: of the medians, relative to one actor."])
+                seconds, needed = (_values(chosen, count, name) for name in _RESULTS)
+                sooner.append(_ratio(alone, seconds, "{:.1f}") if len(seconds) else "")
+                shares.append(f"{np.median(needed) / np.median(env_steps):.2f}" if len(needed) else "")
+            reached = f"{sum(bool(line['seconds']) for line in chosen)} of {len(chosen)}"
+            interval = written(estimate([alone]), "{:.1f}".format)
+            rows.append((method, interval, *sooner, " / ".join(shares), reached))
+        header = ("method", "seconds of 1 actor", *(f"{count}: times sooner" for count in counts))
+        texts.append(
+            f"{task}, mean return {TASKS[task].score:g}\n\n{table((*header, 'env_steps, relative', 'reached'), rows)}"
+        )
+    note = "Times sooner and env_steps: ratios of the medians to those of one actor; 95 % bootstrap intervals."
+    return "\n\n".join([*texts, note])
+
+
+def _ratio(above: np.ndarray, below: np.ndarray, form: str) -> str:
+    """Return the ratio of two medians with its bootstrap interval; runs that did not reach the score are infinite."""
+    random = np.random.default_rng(0)
+
+    def drawn(values: np.ndarray) -> np.ndarray:
+        return np.median(random.choice(values, (_RESAMPLES, len(values))), axis=1)
+
+    with np.errstate(invalid="ignore"):  # neither reached the score: no ratio
+        ratios = np.nan_to_num(drawn(above) / drawn(below), nan=1.0, posinf=math.inf)
+        middle = np.median(above) / np.median(below)
+    low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
+    return f"{form.format(middle)} [{form.format(low)}, {form.format(high)}]"
 
 
 def _values(lines: Sequence[Mapping[str, str]], actors: int, name: str) -> np.ndarray:
