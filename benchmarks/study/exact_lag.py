@@ -14,7 +14,7 @@ def train(spec: RunSpec, lag: int) -> LocalLearner:
       spec: settings of the run.
       lag: updates by which snapshots arrive late. Where a batch makes several updates, snapshots are at least so late.
     """
-    actor = LocalActor(spec)
+    actor = LocalActor(spec, "actor-0")
     try:
         learner = LocalLearner(spec, actor.spaces)
         actor.begin(learner.program, spec.training.seed)

@@ -19,8 +19,6 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Gradient, Rollout, RolloutIdentity
 
-_IDENTITY = RolloutIdentity(actor="a", incarnation=1, sequence=0, learner_epoch=1)
-
 
 class LocalLearner:
     """A learner that trains on one upload at a time, and counts.
@@ -68,10 +66,16 @@ class LocalLearner:
 
 
 class LocalActor:
-    """An actor that plays, and computes gradients if the run's uploads are gradients."""
+    """An actor that plays, and computes gradients if the run's uploads are gradients.
 
-    def __init__(self, spec: RunSpec) -> None:
-        self._spec = spec
+    Args:
+        spec: Settings of the run.
+        name: Of the actor. The learner's running returns go on from rollout to rollout of an actor, by its name.
+    """
+
+    def __init__(self, spec: RunSpec, name: str) -> None:
+        self._spec, self.name = spec, name
+        self._sequence = 0
         self._collector = EnvironmentCollector()
         self.spaces, _ = self._collector.prepare(spec)
         self._gradients = RolloutGradients(spec, self.spaces) if spec.collection.upload == "gradients" else None
@@ -89,7 +93,9 @@ class LocalActor:
     def play(self, snapshot: Snapshot) -> Rollout | Gradient:
         """Return what the learner receives of a rollout under a snapshot. A rollout is valid until the next call."""
         self._collector.load(snapshot)
-        rollout = self._collector.collect(_IDENTITY)
+        identity = RolloutIdentity(actor=self.name, incarnation=1, sequence=self._sequence, learner_epoch=1)
+        self._sequence += 1
+        rollout = self._collector.collect(identity)
         if self._gradients is None:
             return rollout
         self._gradients.load(snapshot.weights)

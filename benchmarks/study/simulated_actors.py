@@ -6,6 +6,7 @@ import numpy as np
 
 from benchmarks.study.one_process import LocalActor, LocalLearner
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.protocol.messages import Join
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Gradient, Rollout
 
@@ -23,13 +24,14 @@ def train_simulated(spec: RunSpec, step_seconds: float) -> tuple[LocalLearner, f
       spec: settings of the run. Seeds and exploration of the actors are those that a learner gives them.
       step_seconds: duration of a step of each environment.
     """
-    actors = [LocalActor(spec) for _ in range(spec.collection.actors)]
+    actors = [LocalActor(spec, f"actor-{number}") for number in range(spec.collection.actors)]
     try:
         learner = LocalLearner(spec, actors[0].spaces)
         fleet = Fleet(spec.training.seed, actors[0].spaces, spec.training.epsilons)
-        for number, actor in enumerate(actors):
-            name = f"actor-{number}"
-            actor.begin(learner.program, fleet.seed_for(name, 0), fleet.epsilon_for(name))
+        for actor in actors:
+            join = Join(actor=actor.name, incarnation=1, environments=1, spaces=actor.spaces)
+            assert fleet.join(join, now=0.0) is None
+            actor.begin(learner.program, fleet.seed_for(actor.name, 0), fleet.epsilon_for(actor.name))
         return learner, _simulate(spec, step_seconds, learner, actors)
     finally:
         for actor in actors:

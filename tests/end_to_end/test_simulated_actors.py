@@ -39,6 +39,20 @@ def test_actors_lag_by_the_updates_of_the_others_and_play_at_the_same_time(uploa
     assert seconds[1] / seconds[4] == pytest.approx(4, rel=0.1)
 
 
+def test_the_running_returns_of_each_actor_go_on_from_rollout_to_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
+    one_process = importlib.import_module("benchmarks.study.one_process")
+    train, sequences = one_process.LocalLearner.train, {}
+
+    def recording(learner: Any, upload: Any) -> None:
+        sequences.setdefault(upload.identity.actor, []).append(upload.identity.sequence)
+        train(learner, upload)
+
+    monkeypatch.setattr(one_process.LocalLearner, "train", recording)
+    trained(3, "rollouts", 1000)
+    assert sorted(sequences) == ["actor-0", "actor-1", "actor-2"]
+    assert all(numbers == list(range(len(numbers))) for numbers in sequences.values())
+
+
 def test_a_run_repeats() -> None:
     first, again = (trained(3, "rollouts", 1000) for _ in range(2))
     assert first[1] == again[1]
