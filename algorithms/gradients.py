@@ -24,7 +24,7 @@ from daedalus.protocol.algorithms import is_own
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import TrainingSpec
 
-_MOST_ROWS = 32  # of a recorded sequence: recording takes a tenth of a second for each row of a memory
+_MOST_ROWS = 32  # of a recorded sequence: a memory takes long to record, 5 ms for each row, and gains little
 
 
 class Terms(NamedTuple):

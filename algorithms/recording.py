@@ -1,7 +1,8 @@
 """Recorded computations: the operations of a function of tensors, repeated without Python.
 
 An update of a small network takes most of its time in Python and in the graph of gradients, not in its computations:
-with 64 rows and two networks of 64 x 64 units, it takes 1.3 ms, and 0.55 ms when its operations are repeated.
+with 128 rows and two networks of 64 x 64 units, it takes 0.83 ms, and 0.30 ms when its operations are repeated. The
+recording takes 15 ms.
 """
 
 import logging
@@ -12,7 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-EARLIER_CALLS = 1000  # before a recording is made, which takes as long as about as many calls
+from daedalus.algorithms.operation_tape import OperationTape
+
+EARLIER_CALLS = 20  # before a recording is made, which saves about as many calls of the function
 _LARGEST_NUMBER = 4  # of recordings
 _TOLERANCE = 1e-3  # of a recording's first results, as a share of their norm
 
@@ -76,17 +79,13 @@ def _repeated(recording: Recording, tensors: Sequence[Tensor]) -> tuple[Tensor, 
 
 
 def _recording(function: Function, tensors: Sequence[Tensor]) -> Recording:
-    # Imported only where it is needed: this takes a second.
-    from torch.fx.experimental.proxy_tensor import make_fx
-
-    traced = make_fx(lambda *arguments: tuple(each.detach() for each in function(arguments)))(*tensors)
-    traced.graph.eliminate_dead_code()
-    traced.recompile()
+    tape, repeat = OperationTape.of(function, tensors)
+    others = tuple(tape.inputs.values())[len(tensors) :]
     with warnings.catch_warnings(), torch.no_grad():
         # TorchScript is deprecated. Its successors need a compiler on each machine, or Python for each operation.
         warnings.simplefilter("ignore")
-        recording: Any = torch.jit.trace(traced, tuple(tensors), check_trace=False)
-    return recording
+        program: Any = torch.jit.trace(repeat, (*tensors, *others), check_trace=False)
+    return lambda *values: program(*values, *others)
 
 
 def _is_finite(values: Tensor) -> bool:
