@@ -84,15 +84,22 @@ class OperationTape(TorchDispatchMode):
             raise TapeError("its operations depend on values of its tensors")
         arguments, keywords = self._numbered(args), self._numbered(kwargs or {})
         made = func(*args, **(kwargs or {}))
-        self._operations.append(_Operation(func, arguments, keywords, [self._add(each) for each in _tensors(made)]))
+        tensors = _tensors(made)
+        if func._schema.is_mutable or not all(map(self._is_known, tensors)):
+            self._operations.append(_Operation(func, arguments, keywords, [self._add(each) for each in tensors]))
         return made
+
+    def _is_known(self, tensor: Tensor) -> bool:
+        """Return whether a result is in its place before the function is called: a view of a parameter, or an alias."""
+        place = _place(tensor)
+        return place in self._numbers or place[0] in self._others
 
     def _add(self, tensor: Tensor) -> int:
         number = len(self._kept)
         self._kept.append(tensor)
         place = _place(tensor)
         self._numbers[place] = number
-        if place[0] not in self._others:  # a view of a parameter is no memory of an operation
+        if place[0] not in self._others:  # a parameter that an operation writes to is no memory of the operation
             self._made.add(place[0])
         return number
 
