@@ -200,7 +200,7 @@ def results(lines: Sequence[Mapping[str, str]]) -> str:
             for count in counts:
                 seconds, needed = (_values(chosen, count, name) for name in _RESULTS)
                 sooner.append(_ratio(alone, seconds, "{:.1f}") if len(seconds) else "")
-                shares.append(f"{np.median(needed) / np.median(env_steps):.2f}" if len(needed) else "")
+                shares.append(_share(needed, env_steps))
             reached = f"{sum(bool(line['seconds']) for line in chosen)} of {len(chosen)}"
             interval = written(estimate([alone]), "{:.1f}".format)
             rows.append((method, interval, *sooner, " / ".join(shares), reached))
@@ -213,7 +213,12 @@ def results(lines: Sequence[Mapping[str, str]]) -> str:
 
 
 def _ratio(above: np.ndarray, below: np.ndarray, form: str) -> str:
-    """Return the ratio of two medians with its bootstrap interval; runs that did not reach the score are infinite."""
+    """Return the ratio of two medians with its bootstrap interval; runs that did not reach the score are infinite.
+
+    Return "-" where most runs of one actor did not.
+    """
+    if math.isinf(np.median(above)):
+        return "-"
     random = np.random.default_rng(0)
 
     def drawn(values: np.ndarray) -> np.ndarray:
@@ -224,6 +229,13 @@ def _ratio(above: np.ndarray, below: np.ndarray, form: str) -> str:
         middle = np.median(above) / np.median(below)
     low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
     return f"{form.format(middle)} [{form.format(low)}, {form.format(high)}]"
+
+
+def _share(needed: np.ndarray, alone: np.ndarray) -> str:
+    """Return the ratio of two medians of env_steps; "-" where most runs of one actor did not reach the score."""
+    if not len(needed) or math.isinf(np.median(alone)):
+        return "-"
+    return f"{np.median(needed) / np.median(alone):.2f}"
 
 
 def _values(lines: Sequence[Mapping[str, str]], actors: int, name: str) -> np.ndarray:
