@@ -34,7 +34,7 @@ class FlatParameters:
 
         Gradients whose norm is not finite are left as they are.
         """
-        norm = float(self.gradients.norm())
+        norm = float(torch.linalg.vector_norm(self.gradients))
         if max_norm < norm < math.inf:
             self.gradients.mul_(max_norm / (norm + 1e-6))
         return norm

@@ -104,7 +104,8 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
     size = 1 if batch.share is not None else -(-whole.numel() // number)
     own = [_filled_up(part, size) for part in own]
     order, sizes = torch.cat(own), [len(part) for part in own]
-    shares = {(rows, size): _equal_shares(batch.valid, rows, size) for rows, size in zip(counted, sizes, strict=True)}
+    shares = {pair: _equal_shares(batch.valid, *pair) for pair in set(zip(counted, sizes, strict=True))}
+    states = {length: batch.initial_state.new_zeros((length, 0)) for length in set(sizes)}
 
     def parts_of(values: Tensor) -> tuple[Tensor, ...]:
         """Gather values of rows [T, B, ...] in the order of the pass, and split them: [1, n, ...] each.
@@ -125,7 +126,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
         gathered = each(large, partial(_rows, rows=part))
         yield Minibatch(
             observations={name: parts[index] for name, parts in small.items()} | gathered,
-            initial_state=batch.initial_state.new_zeros((len(part), 0)),
+            initial_state=states[sizes[index]],
             starts=starts,
             actions={name: parts[index] for name, parts in actions.items()},
             masks={name: parts[index] for name, parts in masks.items()},
