@@ -103,7 +103,7 @@ def limit(spec: RunSpec, seconds: float) -> tuple[float, dict[str, float]]:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--rounds", type=int, default=3)
-    options.add_argument("--env-steps", type=int, default=250_000)
+    options.add_argument("--env-steps", type=int, default=750_000)
     options.add_argument("--peer-env-steps", type=int, default=50_000)
     options.add_argument("--seconds", type=float, default=3.0, help="duration of each part of the limit")
     options.add_argument(

@@ -40,7 +40,9 @@ def learning_rate(*arguments: object) -> float:
             raise SystemExit(f"daedalus {' '.join(words)} failed:\n{finished.stdout}{finished.stderr}")
         with open(directory / "metrics.csv", newline="", encoding="utf-8") as file:
             points = [(float(row["wall_seconds"]), int(row["env_steps"])) for row in csv.DictReader(file)]
-    warm = next(point for point in points if point[0] >= points[0][0] + _WARM_SECONDS)
+    warm = next((point for point in points if point[0] >= points[0][0] + _WARM_SECONDS), points[-1])
+    if warm == points[-1]:
+        raise SystemExit(f"the run took less than {_WARM_SECONDS:.0f} s after its start: give it more env_steps")
     return (points[-1][1] - warm[1]) / (points[-1][0] - warm[0])
 
 
