@@ -167,6 +167,23 @@ def test_kumaraswamy_is_that_of_torch() -> None:
     torch.testing.assert_close(family.entropy(parameters), (expected.entropy() + math.log(2)).sum(-1))
 
 
+@pytest.mark.parametrize("scale", [0.0, 1.0, 10.0, 400.0])
+def test_neutral_noise_gives_the_mean_of_kumaraswamy(scale: float) -> None:
+    family = Kumaraswamy(BOX)
+    parameters = scale * torch.randn(50, 6)
+    a, b = (1 + torch.nn.functional.softplus(parameters)).clamp(max=1000.0).double().split(3, -1)
+    neutral = family.sample(parameters, torch.full((50, 3), 0.5), torch.zeros(50, 0))
+    torch.testing.assert_close(0.5 * (neutral + 1.0), reference.Kumaraswamy(a, b).mean.float(), atol=1e-3, rtol=1e-2)
+
+
+def test_mean_of_a_skewed_kumaraswamy_is_not_its_median() -> None:
+    """With a = 1 and b = 3 the density is 3 (1 - x)^2: the mean is 1/4, the median 1 - 0.5^(1/3) = 0.2063."""
+    one = ContinuousSpace(low=(0.0,), high=(1.0,))
+    parameters = torch.tensor([[-30.0, math.log(math.e**2 - 1.0)]])  # softplus of them is 0 and 2
+    neutral = Kumaraswamy(one).sample(parameters, torch.full((1, 1), 0.5), torch.zeros(1, 0))
+    assert 0.5 * (float(neutral) + 1.0) == pytest.approx(0.25, abs=1e-3)
+
+
 def test_neutral_noise_gives_the_mean_of_the_most_probable_component() -> None:
     family = GaussianMixture(ContinuousSpace(low=(None,), high=(None,)), initial_std=0.4, components=2)
     parameters = torch.tensor([[0.0, 2.0, 1.0, 3.0]])  # logits 0 and 2, means 1 and 3
