@@ -12,8 +12,7 @@ from typing import Any
 
 from daedalus.cli.comparing.recorded_run import ENVIRONMENT, SEED, RecordedRun, RunDataError
 
-# Settings that tell nothing about the result of a run.
-_IRRELEVANT = {SEED, "service.log_seconds"}
+_SERVICE = "service."  # settings of how the learner runs, not of what it learns
 _FIRST = ("training.algorithm", "collection.upload", "collection.rollout_length")  # the names that say most
 _MOST_NAMED = 3  # settings in the name of a group, if they are enough
 
@@ -49,7 +48,7 @@ def by_settings(runs: Sequence[RecordedRun], keys: Sequence[str] = ()) -> list[G
     """
     parts: dict[str, list[RecordedRun]] = {}
     for run in runs:
-        parts.setdefault(_identity(run), []).append(run)
+        parts.setdefault(_identity(run, keys), []).append(run)
     groups = list(parts.values())
     chosen = list(keys) or _telling(groups)
     if chosen:
@@ -62,18 +61,23 @@ def by_user(parts: Sequence[Sequence[RecordedRun]]) -> list[Group]:
     return _named(parts, _telling(parts))
 
 
-def _identity(run: RecordedRun) -> str:
+def _identity(run: RecordedRun, keys: Sequence[str] = ()) -> str:
     if not run.settings:
         return str(run.directory)
-    relevant = {key: value for key, value in run.settings.items() if key not in _IRRELEVANT}
+    relevant = {key: value for key, value in run.settings.items() if key in keys or _is_relevant(key)}
     return json.dumps(relevant, sort_keys=True)
+
+
+def _is_relevant(key: str) -> bool:
+    """Return whether a setting tells something about the result of a run."""
+    return key != SEED and not key.startswith(_SERVICE)
 
 
 def _telling(groups: Sequence[Sequence[RecordedRun]]) -> list[str]:
     """Return the fewest settings that are equal within each group and that tell all groups apart; empty if none do."""
     if len(groups) < 2 or not all(run.settings for group in groups for run in group):
         return []
-    known = sorted({key for group in groups for run in group for key in run.settings} - _IRRELEVANT)
+    known = sorted({key for group in groups for run in group for key in run.settings if _is_relevant(key)})
     constant = [key for key in known if all(len({_text(run, key) for run in group}) == 1 for group in groups)]
     differing = [key for key in constant if len({_text(group[0], key) for group in groups}) > 1]
     differing.sort(key=lambda key: (_FIRST.index(key) if key in _FIRST else len(_FIRST), key))

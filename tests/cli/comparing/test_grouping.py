@@ -22,6 +22,13 @@ def test_seeds_of_one_setting_are_one_group(tmp_path: Path) -> None:
     assert names(*runs) == [("CartPole-v1, impala", ["s1", "s2"])]
 
 
+def test_settings_of_the_service_make_no_groups_unless_they_are_named(tmp_path: Path) -> None:
+    runs = [run(tmp_path, f"k{number}", f"service.keep_checkpoints={number}") for number in (3, 50)]
+    assert names(*runs) == [("CartPole-v1, impala", ["k3", "k50"])]
+    named = by_settings(runs, ["service.keep_checkpoints"])
+    assert [group.name for group in named] == ["keep_checkpoints=3", "keep_checkpoints=50"]
+
+
 def test_groups_have_the_name_of_what_differs_and_its_order(tmp_path: Path) -> None:
     runs = [run(tmp_path, f"n{n}", f"collection.rollout_length={n}") for n in (64, 5, 20)]
     assert names(*runs) == [
