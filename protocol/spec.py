@@ -286,7 +286,7 @@ class EvaluationSpec(Specification):
     episodes: Annotated[int, Field(ge=1, le=10_000)] = 10
     """Episodes of each evaluation during training."""
     actions: Literal["greedy", "sampled"] = "greedy"
-    """Actions of evaluations: the most probable, or sampled as in training."""
+    """Actions of evaluations: the most probable choices and the means, or sampled as in training."""
     max_episode_env_steps: PositiveInt = 27_000
     """Cut episodes of evaluations after this many env_steps, and report how many were cut: the environment may never
     end them. The default is Atari's half an hour, at four frames a step."""

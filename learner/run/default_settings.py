@@ -26,6 +26,10 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> di
     settings = tomllib.loads(file.read_text("utf-8"))
     if kind == "large_images" and spaces is not None and not all(map(_has_colours, _images(spaces))):
         del settings["environment"]["grey"]
+    if spaces is not None and _has_continuous(spaces):
+        # The bonus would widen a Gaussian for nothing: noise beyond the bounds is clipped (docs/results.md).
+        settings["training"]["entropy_bonus"] = 0.0
+        settings["training"].pop("entropy_bonus_final", None)
     if kind == "vectors_continuous" and spaces is not None:
         settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
     if leave_out:
@@ -38,9 +42,11 @@ def kind_of(spaces: Spaces) -> Kind:
     images = _images(spaces)
     if images:
         return "large_images" if any(max(space.shape) > _LARGE for space in images) else "images"
-    if any(isinstance(space, ContinuousSpace) for space in spaces.actions.values()):
-        return "vectors_continuous"
-    return "vectors_discrete"
+    return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
+
+
+def _has_continuous(spaces: Spaces) -> bool:
+    return any(isinstance(space, ContinuousSpace) for space in spaces.actions.values())
 
 
 def _noise_scale(spaces: Spaces) -> float:

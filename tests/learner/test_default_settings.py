@@ -71,6 +71,13 @@ def test_noise_of_all_numbers_of_an_action_together_is_bounded(arms: int, number
     assert default_settings(where)["policy"]["initial_std"] == std
 
 
+@pytest.mark.parametrize("observation", [VECTOR, image(96, 96, 3), image(210, 160, 3)])
+def test_continuous_actions_get_no_entropy_bonus(observation: ArraySpace) -> None:
+    training = default_settings(spaces(JOINTS, observation))["training"]
+    assert (training["entropy_bonus"], training.get("entropy_bonus_final")) == (0.0, None)
+    assert default_settings(spaces(CHOICES, observation))["training"]["entropy_bonus"] > 0
+
+
 def test_components_to_leave_out_become_a_setting() -> None:
     assert default_settings(spaces(CHOICES, VECTOR), ["mission"])["environment"]["leave_out"] == ["mission"]
     assert "environment" not in default_settings(spaces(CHOICES, VECTOR))
