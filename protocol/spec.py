@@ -56,7 +56,8 @@ class EnvironmentSpec(Specification):
     action_repeat: Annotated[int, Field(ge=1, le=64)] = 1
     """Take each action this many times and sum the rewards; together they are one env_step."""
     no_reward_limit: PositiveInt | None = None
-    """Truncate an episode after this many env_steps in a row without a positive reward. Not in evaluations."""
+    """End an episode after this many env_steps in a row without a positive reward. Learning takes the value after it as
+    0, also with `bootstrap_terminations`. Not in evaluations."""
 
     leave_out: Annotated[tuple[ComponentName, ...], Field(max_length=64)] = ()
     """Components of the observation that the policy does not see, such as a text: `leave_out = ["mission"]`."""
@@ -76,7 +77,7 @@ class EnvironmentSpec(Specification):
     reward_scale: Annotated[float, Field(gt=0.0)] = 1.0
     """Multiply the rewards that learning uses by this value."""
     bootstrap_terminations: bool = False
-    """Bootstrap at terminations as if they were truncations."""
+    """Bootstrap at the environment's terminations as if they were truncations."""
 
     @property
     def user_modules(self) -> dict[str, str]:

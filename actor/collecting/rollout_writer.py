@@ -185,8 +185,9 @@ class RolloutWriter:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
         self._rewards *= self._reward_scale
         if self._bootstrap_terminations:
+            given_up = self._terminated & self._truncated  # by no_reward_limit
             self._truncated |= self._terminated
-            self._terminated[:] = False
+            self._terminated[:] = given_up
         finished = self._episodes.take_finished()
         return Rollout(
             identity=identity,

@@ -51,7 +51,7 @@ class EnvpoolEnvironments:
           name: of the environment.
           options: of the pool.
           repeat: how often each action is repeated here.
-          no_reward_limit: truncate an episode after so many steps in a row without a positive reward.
+          no_reward_limit: end an episode after so many steps in a row without a positive reward.
           arrange: turns the pool's observations into frames [E, *frame_shape].
         """
         self.count: int = options["num_envs"]
@@ -97,7 +97,9 @@ class EnvpoolEnvironments:
             live = live[~last]
         if self._no_reward_limit is not None:
             self._unrewarded = np.where((rewards > 0.0) | self._ended, 0, self._unrewarded + 1)
-            truncated |= (self._unrewarded >= self._no_reward_limit) & ~terminated
+            ended = (self._unrewarded >= self._no_reward_limit) & ~terminated
+            terminated |= ended
+            truncated |= ended
         self._ended = terminated | truncated
         return frames, rewards, terminated, truncated
 

@@ -51,7 +51,8 @@ class VectorEnvironment(Protocol):
           actions: of each component [E, D].
 
         Returns: the next observations, true rewards [E] (summed over the repeats), terminated [E], truncated [E].
-        In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame.
+        In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame. An
+        episode that no_reward_limit ends is both terminated and truncated.
         Raises EnvironmentSetupError for a mask that forbids every action.
         """
         ...

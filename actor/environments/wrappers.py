@@ -70,7 +70,7 @@ class RepeatedSteps(gymnasium.Wrapper):
             total += reward
         self._unrewarded = 0 if total > 0.0 else self._unrewarded + 1
         if self._no_reward_limit is not None and self._unrewarded >= self._no_reward_limit and not terminated:
-            truncated = True
+            terminated = truncated = True
         return observation, total, terminated, truncated, info
 
     def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

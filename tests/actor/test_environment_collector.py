@@ -162,8 +162,20 @@ class _Losing(gymnasium.Env[np.ndarray, np.int64]):
         return np.zeros(2, np.float32), -3.0, False, False, {}
 
 
+gymnasium.register("Losing-v0", lambda **_kwargs: _Losing())
+
+
+@pytest.mark.parametrize("bootstrap", [False, True])
+def test_value_after_an_episode_that_no_reward_limit_ends_is_zero(bootstrap: bool) -> None:
+    """Bootstrapped, the value of a car that is lost would be learnt from itself."""
+    spec = EnvironmentSpec(id="Losing-v0", no_reward_limit=3, bootstrap_terminations=bootstrap)
+    rollout = collect(started_collector(spec, Scripted(), rollout_length=8))
+    ends = [False, False, True, False, False, False, True, False]  # the row after an end resets
+    assert rollout.terminated.T.tolist() == [ends] * rollout.environments
+    assert (rollout.truncated >= rollout.terminated).all()
+
+
 def test_negative_rewards_are_clipped_like_positive_ones() -> None:
-    gymnasium.register("Losing-v0", lambda **_kwargs: _Losing())
     spec = EnvironmentSpec(id="Losing-v0", max_episode_steps=2, reward_clip=1.0, reward_scale=2.0)
     rollout = collect(started_collector(spec, Scripted(), rollout_length=2))
     assert rollout.rewards[:, 0].tolist() == [-2.0, -2.0]

@@ -78,7 +78,7 @@ def test_repeated_actions_equal_single_steps(
     environments.close()
 
 
-def test_episode_truncated_by_no_reward_limit_resets_at_the_next_step() -> None:
+def test_episode_that_no_reward_limit_ends_resets_at_the_next_step() -> None:
     """MountainCar rewards every step with -1 and starts at rest, between -0.6 and -0.4."""
     environments = PlainEnvironments(make_environments(_spec("MountainCar-v0", no_reward_limit=3, action_repeat=2), 2))
     environments.reset(1)
@@ -88,7 +88,7 @@ def test_episode_truncated_by_no_reward_limit_resets_at_the_next_step() -> None:
         assert (frames[:, 1] == 0.0).all() == starts
         assert rewards.tolist() == ([0.0, 0.0] if starts else [-2.0, -2.0])
         assert truncated.tolist() == [row % 4 == 3] * 2
-        assert not terminated.any()
+        assert terminated.tolist() == truncated.tolist(), "nothing more is to come"
     environments.close()
 
 
@@ -123,7 +123,7 @@ class _ThreeSteps:
         return np.full((1, 1), self._steps), np.zeros(1), np.array([self._steps == 3]), np.array([False]), {}
 
 
-@pytest.mark.parametrize(("no_reward_limit", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [], [1])])
+@pytest.mark.parametrize(("no_reward_limit", "terminates", "truncates"), [(4, [2], []), (3, [2], []), (2, [1], [1])])
 def test_termination_takes_precedence_over_no_reward_limit(
     no_reward_limit: int, terminates: list, truncates: list
 ) -> None:
