@@ -19,6 +19,14 @@ _MAX_VARIABLES = 8_192  # of all discrete and continuous components together: a 
 ComponentName = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,64}$")]
 
 
+def colours_last(shape: tuple[int, ...]) -> bool:
+    """Return whether an image is (height, width, colours); else (colours, height, width), or (height, width) alone.
+
+    The colours are on the shorter of the first and the last of three axes.
+    """
+    return len(shape) == 3 and shape[-1] < shape[0]
+
+
 class ArraySpace(Specification):
     """Arrays of one shape and dtype (gymnasium's Box): `float32` or `uint8`.
 
@@ -50,12 +58,15 @@ class ArraySpace(Specification):
         return math.prod(self.stacked_shape) * (4 if self.dtype == "float32" else 1)
 
     @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """Colours, height and width of a frame of two or three dimensions."""
+        first, height, width = (1, *self.shape) if len(self.shape) == 2 else self.shape
+        return (width, first, height) if colours_last(self.shape) else (first, height, width)
+
+    @property
     def is_image(self) -> bool:
         """Whether a frame is an image: bytes in two or three dimensions, at least 16 pixels high and wide."""
-        if self.dtype != "uint8" or len(self.shape) not in (2, 3):
-            return False
-        sides = sorted(self.shape)[-2:]  # colours first or last: the two longest sides are those of the image
-        return min(sides) >= 16
+        return self.dtype == "uint8" and len(self.shape) in (2, 3) and min(self.image_shape[1:]) >= 16
 
     def __str__(self) -> str:
         stacked = f", {self.frames} stacked" if self.frames > 1 else ""

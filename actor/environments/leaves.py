@@ -14,6 +14,8 @@ from gymnasium import spaces as gym
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
 
+_LONGEST_NAME = 64  # ComponentName of the protocol
+
 
 class Leaf(NamedTuple):
     """A space that is not composite, and where it is in the nested space."""
@@ -34,7 +36,7 @@ def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
 
     Raises EnvironmentSetupError if there are none, or two get the same name.
     """
-    found = tuple(Leaf(".".join(map(_cleaned, path)) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
+    found = tuple(Leaf(_name(path) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
     names = [leaf.name for leaf in found]
     if not found:
         raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
@@ -56,8 +58,9 @@ def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple
         yield path, space
 
 
-def _cleaned(key: str | int) -> str:
-    return re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII)[:48]
+def _name(path: tuple[str | int, ...]) -> str:
+    """Return the keys in the letters that a name may have, joined by dots: the last 64, which tell most."""
+    return ".".join(re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII) or "_" for key in path)[-_LONGEST_NAME:]
 
 
 class LeftOut(gymnasium.Space):

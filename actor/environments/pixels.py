@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described
+from daedalus.protocol.spaces import colours_last
 from daedalus.protocol.spec import EnvironmentSpec
 
 _GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0.299, 0.587, 0.114
@@ -25,12 +26,13 @@ class Pixels:
         if spec.resize is not None:
             asked.append((f"resize={spec.resize}", partial(resize, size=spec.resize)))
         self._transforms = [transform for _, transform in asked]
+        self._colours_first = len(space.shape) == 3 and not colours_last(space.shape)
         frames = np.zeros((1, *space.shape), space.dtype)
         for name, transform in asked:
             try:
                 if frames.dtype != np.uint8 or frames.ndim not in (3, 4):
-                    raise ValueError("frames must be uint8 images of shape (H, W) or (H, W, C)")
-                frames = transform(frames)
+                    raise ValueError("frames must be uint8 images of shape (H, W), (H, W, C) or (C, H, W)")
+                frames = self._apply(transform, frames)
             except ValueError as error:
                 raise EnvironmentSetupError(
                     f"environment.{name} does not fit observation space {described(space)}: {error}"
@@ -40,8 +42,15 @@ class Pixels:
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Return frames [E, *space.shape] transformed to [E, *shape]."""
         for transform in self._transforms:
-            frames = transform(frames)
+            frames = self._apply(transform, frames)
         return frames
+
+    def _apply(self, transform: Callable[[np.ndarray], np.ndarray], frames: np.ndarray) -> np.ndarray:
+        """Apply a transform of frames whose colours are on the last axis."""
+        if not self._colours_first or frames.ndim == 3:
+            return transform(frames)
+        transformed = transform(np.moveaxis(frames, 1, -1))
+        return np.moveaxis(transformed, -1, 1) if transformed.ndim == 4 else transformed
 
 
 def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
@@ -56,7 +65,7 @@ def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
 def grey(frames: np.ndarray) -> np.ndarray:
     """Return the luma by ITU-R BT.601 of RGB frames [E, H, W, 3], rounded to integers [E, H, W]."""
     if frames.ndim != 4 or frames.shape[3] != 3:
-        raise ValueError(f"a frame of shape {frames.shape[1:]} is not RGB: its last dimension must be 3")
+        raise ValueError(f"a frame of shape {frames.shape[1:]} is not RGB: it must have 3 colours")
     luma, part = (
         np.full(frames.shape[:3], 128, np.uint16),
         np.empty(frames.shape[:3], np.uint16),

@@ -11,6 +11,7 @@ from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 Kind = Literal["vectors_discrete", "vectors_continuous", "images", "large_images"]
 _UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not known
 _LARGE = 128  # pixels of the longer side
+_RGB = 3  # colours, which environment.grey takes
 _FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
@@ -24,7 +25,7 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> di
     kind = _UNKNOWN if spaces is None else kind_of(spaces)
     file = importlib.resources.files("daedalus.learner.run.defaults") / f"{kind}.toml"
     settings = tomllib.loads(file.read_text("utf-8"))
-    if kind == "large_images" and spaces is not None and not all(map(_has_colours, _images(spaces))):
+    if kind == "large_images" and spaces is not None and any(space.image_shape[0] != _RGB for space in _images(spaces)):
         del settings["environment"]["grey"]
     if spaces is not None and _has_continuous(spaces):
         # The bonus would widen a Gaussian for nothing: noise beyond the bounds is clipped (docs/results.md).
@@ -41,7 +42,7 @@ def kind_of(spaces: Spaces) -> Kind:
     """Return the kind of spaces: with an image, else with continuous actions, else with discrete ones only."""
     images = _images(spaces)
     if images:
-        return "large_images" if any(max(space.shape) > _LARGE for space in images) else "images"
+        return "large_images" if any(max(space.image_shape[1:]) > _LARGE for space in images) else "images"
     return "vectors_continuous" if _has_continuous(spaces) else "vectors_discrete"
 
 
@@ -60,7 +61,3 @@ def _noise_scale(spaces: Spaces) -> float:
 
 def _images(spaces: Spaces) -> list[ArraySpace]:
     return [space for space in spaces.observations.values() if isinstance(space, ArraySpace) and space.is_image]
-
-
-def _has_colours(space: ArraySpace) -> bool:
-    return len(space.shape) == 3 and space.shape[-1] == 3

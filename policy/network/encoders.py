@@ -121,7 +121,7 @@ def encoder_names(spec: PolicySpec, spaces: ObservationSpaces) -> str:
 def _image_encoder_name(name: str, space: ArraySpace) -> str:
     if name != "auto":
         return name
-    return "nature" if min(sorted(space.shape)[-2:]) >= _SMALLEST_FOR_NATURE else "impala"
+    return "nature" if min(space.image_shape[1:]) >= _SMALLEST_FOR_NATURE else "impala"
 
 
 def _image_encoder(name: str, space: ArraySpace) -> ImageEncoder:

@@ -4,15 +4,13 @@ import torch
 from torch import Tensor
 
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import ArraySpace
-
-_MAX_COLOURS = 4  # a last axis of at most this size holds the colours of a pixel
+from daedalus.protocol.spaces import ArraySpace, colours_last
 
 
 class ImageLayout:
     """Conversion of the observations of a space to [N, channels, height, width].
 
-    A frame is (H, W), (H, W, C) with C <= 4, or (C, H, W). Stacked frames become channels, oldest first.
+    A frame is (H, W), (H, W, C) or (C, H, W), as the space says. Stacked frames become channels, oldest first.
     """
 
     def __init__(self, encoder: str, space: ArraySpace) -> None:
@@ -25,14 +23,13 @@ class ImageLayout:
         self.encoder, self.space = encoder, space
         frame = space.shape if len(space.shape) == 3 else (1, *space.shape)
         self._split = (space.frames, *frame)
-        self._colours_last = len(space.shape) == 3 and frame[-1] <= _MAX_COLOURS
-        colours, height, width = (frame[-1], *frame[:-1]) if self._colours_last else frame
+        colours, height, width = space.image_shape
         self.shape = (space.frames * colours, height, width)
 
     def arrange(self, observations: Tensor) -> Tensor:
         """Convert [N, *stacked_shape] to [N, channels, height, width] in the memory format channels_last."""
         frames = observations.reshape(-1, *self._split)  # [N, k, C, H, W] or [N, k, H, W, C]
-        if self._colours_last:
+        if colours_last(self.space.shape):
             frames = frames.permute(0, 1, 4, 2, 3)
         return frames.flatten(1, 2).contiguous(memory_format=torch.channels_last)
 

@@ -50,6 +50,16 @@ def test_components_are_named_by_the_keys_and_indices_that_lead_to_them() -> Non
     }
 
 
+@pytest.mark.parametrize(
+    ("key", "name"),
+    [("walker/joints pos", "walker_joints_pos"), ("", "_"), ("arm " * 20 + "left", "arm_" * 15 + "left")],
+)
+def test_any_key_makes_a_name(key: str, name: str) -> None:
+    assert set(Transforms(SPEC, gym.Dict({key: gym.Box(0, 1)}), gym.Discrete(2)).spaces.observations) == {name}
+    long = gym.Dict({"robot" * 10: gym.Dict({key: gym.Box(0, 1)})})
+    assert set(Transforms(SPEC, long, gym.Discrete(2)).spaces.observations) == {f"{'robot' * 10}.{name}"[-64:]}
+
+
 def test_spaces_that_are_not_composite_have_one_component() -> None:
     spaces = Transforms(SPEC, gym.Discrete(5), gym.MultiBinary((2, 2))).spaces
     assert spaces.observations == {"observation": DiscreteSpace(counts=(5,))}

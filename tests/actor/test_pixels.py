@@ -86,6 +86,17 @@ def test_transforms_are_applied_in_order() -> None:
     np.testing.assert_array_equal(pixels(images), resize(grey(images[:, :4, 1:7]), (2, 3)))
 
 
+def test_colours_may_come_first() -> None:
+    spec = EnvironmentSpec(id="x", crop=(0, 2, 1, 1), resize=(4, 5))
+    pixels = Pixels(spec, _space(3, 10, 12))
+    images = _noise(4, 10, 12, 3)
+    assert pixels.shape == (3, 4, 5)
+    expected = resize(images[:, :8, 1:11], (4, 5))
+    np.testing.assert_array_equal(pixels(images.transpose(0, 3, 1, 2)), expected.transpose(0, 3, 1, 2))
+    luma = Pixels(EnvironmentSpec(id="x", grey=True), _space(3, 10, 12))(images.transpose(0, 3, 1, 2))
+    np.testing.assert_array_equal(luma, grey(images))
+
+
 def test_frames_pass_unchanged_without_transforms() -> None:
     pixels = Pixels(EnvironmentSpec(id="x"), _space(4, dtype=np.float32))
     frames = np.ones((2, 4), np.float32)

@@ -31,6 +31,7 @@ def image(*shape: int) -> ArraySpace:
         (spaces(JOINTS, VECTOR, image(96, 96, 3)), "images"),
         (spaces(CHOICES, image(128, 96)), "images"),
         (spaces(CHOICES, image(210, 160, 3)), "large_images"),
+        (spaces(CHOICES, image(3, 210, 160)), "large_images"),
     ],
 )
 def test_kind_follows_the_spaces(where: Spaces, kind: str) -> None:
@@ -56,7 +57,16 @@ def test_default_settings_are_valid_for_each_algorithm(where: Spaces | None, alg
     assert spec.training.target_return is None
 
 
-@pytest.mark.parametrize(("shape", "grey"), [((210, 160, 3), True), ((210, 160), False), ((210, 160, 1), False)])
+@pytest.mark.parametrize(
+    ("shape", "grey"),
+    [
+        ((210, 160, 3), True),
+        ((3, 210, 160), True),
+        ((210, 160), False),
+        ((210, 160, 1), False),
+        ((210, 160, 5), False),
+    ],
+)
 def test_only_images_with_colours_are_made_grey(shape: tuple[int, ...], grey: bool) -> None:
     environment = default_settings(spaces(CHOICES, image(*shape)))["environment"]
     assert environment.get("grey", False) is grey

@@ -219,6 +219,13 @@ def test_layouts_of_one_frame(name: str) -> None:
     torch.testing.assert_close(first(channels_first), deeper(torch.from_numpy(colours)), atol=1e-5, rtol=1e-4)
 
 
+def test_colours_are_on_the_shorter_of_the_outer_axes() -> None:
+    pictures = observations(ArraySpace(shape=(5, 40, 44), dtype="uint8"), (2,))
+    first, last = (encoder_of("nature", shape) for shape in ((5, 40, 44), (40, 44, 5)))
+    seen = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 2, 3, 1)))
+    torch.testing.assert_close(last(seen), first(torch.from_numpy(pictures)), atol=1e-5, rtol=1e-4)
+
+
 @pytest.mark.parametrize("name", ["small", "nature", "impala"])
 def test_bytes_are_scaled_to_the_unit_interval(name: str) -> None:
     seen = torch.from_numpy(observations(ArraySpace(shape=(40, 44), dtype="uint8"), (2,)))

@@ -324,6 +324,7 @@ def test_spaces_of_several_components_have_a_readable_string() -> None:
         ((128,), "uint8", False),
         ((84, 84), "float32", False),
         ((2, 84, 84, 3), "uint8", False),
+        ((20, 5, 17), "uint8", False),
     ],
 )
 def test_images_are_told_from_other_arrays(shape: tuple[int, ...], dtype: str, image: bool) -> None:
