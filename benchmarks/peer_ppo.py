@@ -62,8 +62,8 @@ def main() -> None:
     options.add_argument("--kwargs", type=json.loads, default={}, help="of gymnasium.make, as JSON")
     parsed = options.parse_args()
     module, _, name = parsed.env.rpartition(":")
-    if module:
-        importlib.import_module(module)
+    if module or name.startswith("ALE/"):
+        importlib.import_module(module or "ale_py")  # registers its environments
     environments = make_vec_env(
         name, n_envs=_ENVIRONMENTS, seed=parsed.seed, env_kwargs=parsed.kwargs, wrapper_class=accepted
     )
