@@ -28,7 +28,7 @@ import gymnasium
 from daedalus.actor.clock import Clock
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.collecting.policy_guard import PolicyGuard
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
@@ -109,16 +109,20 @@ class Client:
         self.agents = self._collector.agents
         self._clocks: list[Clock] = []
         self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
         transport = connect_with_retry([connect], self._stop, timeout, credentials)
         assert transport is not None  # only a stop makes it None
         self._transport = transport
-        self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
-        self._collector.on_rollout = self._service.wake
-        self._thread = threading.Thread(target=self._serve, name="actor", daemon=True)
-        self._thread.start()
-        if not self._collector.policy_loaded.wait(timeout) or self._error is not None:
+        try:
+            self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
+            self._collector.on_rollout = self._service.wake
+            self._thread.start()
+            if not self._collector.policy_loaded.wait(timeout):
+                raise ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
+            self._check()
+        except BaseException:  # also Ctrl-C: a process that ends with an open session aborts
             self.close()
-            raise self._error or ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
+            raise
 
     def act(self, observation: Any, action_mask: Any = None, *, override: Any = None) -> Any:
         """See ClientAgent.act: this is the first agent."""
@@ -156,8 +160,11 @@ class Client:
     def close(self) -> None:
         """Leave the run. Idempotent."""
         self._stop.set()
-        self._thread.join(timeout=10.0)
-        self._transport.close()
+        try:
+            if self._thread.is_alive():
+                self._thread.join(timeout=10.0)
+        finally:  # also after another Ctrl-C
+            self._transport.close()
 
     def _report(self) -> ClientReport:
         """Return what the status shows of this client. Called on the client's thread."""
@@ -181,6 +188,8 @@ class Client:
     def _serve(self) -> None:
         try:
             self._service.run()
+            if not self._collector.policy_loaded.is_set():
+                self._error = ActorError("the run ended before a policy came: check that the learner is training")
         except Exception as error:  # broad: any error, ours too, is raised on the caller's thread by its next act()
             self._error = error
         finally:

@@ -13,6 +13,8 @@ from torch.nn.functional import huber_loss, mse_loss
 from daedalus.algorithms.ranks import ONE_RANK, Ranks
 from daedalus.algorithms.returns import Targets
 
+_ROUNDING = 1e-4  # a deviation below this share of the mean may be only the rounding of float32
+_NEGLIGIBLE = 1e-6  # a variance of the targets below this share of their mean square: they are equal
 _MAX_LOG_RATIO = 20.0  # a ratio of 5e8: beyond it the exponential overflows, and the gradient is not a number
 
 
@@ -29,12 +31,14 @@ def mean(values: Tensor, shares: Tensor) -> Tensor:
 def normalized(advantages: Tensor, valid: Tensor, ranks: Ranks = ONE_RANK) -> Tensor:
     """Return advantages [T, B] with mean 0 and standard deviation 1 over the valid rows of all ranks.
 
-    `valid` [T, B] is 1 or 0.
+    The deviation is less than 1 where the advantages are equal except for rounding. `valid` [T, B] is 1 or 0.
     """
     # Not by shares, whose rounding would make equal advantages differ from 0.
     number = ranks.sum(valid.sum()).clamp(min=1.0)
-    centred = advantages - ranks.sum((advantages * valid).sum()) / number
-    return centred / ((ranks.sum((centred.square() * valid).sum()) / number).sqrt() + 1e-8)
+    average = ranks.sum((advantages * valid).sum()) / number
+    centred = advantages - average
+    deviation = (ranks.sum((centred.square() * valid).sum()) / number).sqrt()
+    return centred / (deviation.maximum(_ROUNDING * average.abs()) + 1e-8)
 
 
 def policy_factors(targets: Targets, valid: Tensor, normalize: bool, ranks: Ranks = ONE_RANK) -> Tensor:
@@ -90,9 +94,13 @@ def value_loss(values: Tensor, targets: Tensor, shares: Tensor, kind: Literal["m
 
 
 def explained_variance(values: Tensor, targets: Tensor, shares: Tensor) -> Tensor:
-    """Return 1 - Var[G - V] / Var[G]: 1 for a perfect critic, 0 for a constant one, negative for a worse one."""
-    residual = targets - values
-    return 1.0 - variance(residual, shares) / variance(targets, shares).clamp(min=1e-8)
+    """Return 1 - Var[G - V] / Var[G]: 1 for a perfect critic, 0 for a constant one, negative for a worse one.
+
+    It is nan where the targets G are equal, or there are none: there is nothing to explain.
+    """
+    spread = variance(targets, shares)
+    differ = spread > _NEGLIGIBLE * mean(targets.square(), shares)
+    return torch.where(differ, 1.0 - variance(targets - values, shares) / spread, torch.nan)
 
 
 def variance(values: Tensor, shares: Tensor) -> Tensor:

@@ -143,8 +143,9 @@ class RewardNormalizer:
         for row in range(rollout.rows):
             running = rollout.rewards[row] + self._discount_factor * running
             returns[row] = running
-            running = running * goes_on[row]
-        self._running[identity.actor] = identity, running
+            running = np.where(goes_on[row], running, 0.0)
+        # An actor does not check its rewards: one that is not finite must not reach its later rollouts.
+        self._running[identity.actor] = identity, np.where(np.isfinite(running), running, 0.0)
         while len(self._running) > _MAX_STREAMS:
             del self._running[next(iter(self._running))]
         return returns

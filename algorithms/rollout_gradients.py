@@ -1,5 +1,6 @@
 """Gradients of an actor's own rollouts, at the weights that played them. State; no I/O, no threads."""
 
+import math
 import threading
 from dataclasses import replace
 
@@ -84,13 +85,15 @@ class RolloutGradients:
         moments = {f"observations/{name}": part for name, part in self._observations.moments_of(batch).items()}
         if self._rewards is not None:
             moments["returns"] = self._rewards.moments_of([rollout])
-            self._rewards.moments.merge(moments["returns"])
+            if moments["returns"].squares.isfinite():  # else the learner rejects this gradient, and not the next one
+                self._rewards.moments.merge(moments["returns"])
             self._rewards.scale(batch)
         (terms,) = self._computer.compute(batch, self._entropy_bonus)
         first_pass = self._computer.take_first_pass()
         measured: dict[str, float] = {}
         if first_pass is not None:
-            measured = dict(zip(BATCH_METRICS, batch_metrics(first_pass).tolist(), strict=True))
+            of_batch = zip(BATCH_METRICS, batch_metrics(first_pass).tolist(), strict=True)
+            measured = {name: value for name, value in of_batch if not math.isnan(value)}
             measured |= diagnostics(first_pass, None)
         self._actions.add(batch)
         gradient = Gradient(

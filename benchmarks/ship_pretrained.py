@@ -12,7 +12,7 @@ from pathlib import Path
 
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, read_json
 from daedalus.learner.run.settings import SettingsError
-from daedalus.policy.saving.saved_policy import PRETRAINED, export_policy, find_policy
+from daedalus.policy.saving.saved_policy import PRETRAINED, NoPolicyError, export_policy, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 
 _MOST_ROWS = 1000  # of the learning curve
@@ -36,7 +36,7 @@ def main() -> int:
     arguments = options.parse_args()
     try:
         target = ship(arguments.run, PRETRAINED / arguments.name)
-    except (DamagedError, SettingsError, OSError) as error:
+    except (DamagedError, NoPolicyError, SettingsError, OSError) as error:
         print(f"ship_pretrained: {error}", file=sys.stderr)
         return 1
     size = sum(entry.stat().st_size for entry in target.iterdir())

@@ -53,6 +53,21 @@ def _processes(text: str) -> int:
     return int(text)
 
 
+def whole_number(text: str) -> int:
+    """Return the number in the word of an option, also of a word such as 1e6. For argparse."""
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        number = float(text)
+        if number.is_integer():
+            return int(number)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number")
+
+
 def add_insecure(options: argparse._ActionsContainer) -> None:
     """Add --insecure, for commands that listen."""
     options.add_argument(

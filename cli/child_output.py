@@ -20,6 +20,7 @@ _LOG_BYTES = 8 << 20  # of the log file, and of the one before it
 _SHOWN_AT_ONCE = 40  # lines; afterwards one line in so many seconds
 _SECONDS_A_LINE = 5.0
 _KEPT_LINES = 40
+_SHOWN_AT_END = 5  # error lines of a process that were not shown before: a traceback ends with what matters
 _REPETITION = 2  # a line that equals one of so many before it is not shown: a warning that every environment repeats
 _CLOSE_SECONDS = 5.0
 
@@ -111,7 +112,15 @@ class ChildOutput:
           name: of the process.
           shown: streams whose lines are shown, within the limit; those of others only go to the log.
         """
-        with self._reading(name, lambda stream, lines: self._take(name, stream, lines, stream in shown)) as streams:
+
+        def take(stream: str, lines: list[str]) -> None:
+            self._take(name, stream, lines, stream in shown)
+
+        def end(stream: str) -> None:
+            if stream == "stderr" and stream in shown:
+                self._show_end(name)
+
+        with self._reading(name, take, end) as streams:
             yield streams
 
     @contextmanager
@@ -125,6 +134,13 @@ class ChildOutput:
         self._join(self._threads.get(name, []))
         with self._lock:
             return list(self._unshown.get(name, ()))
+
+    def last_error(self, name: str) -> str:
+        """Return the last line of standard error of a process, or an empty string. Call it after the process's end."""
+        self._join(self._threads.get(name, []))
+        with self._lock:
+            lines = [line.strip() for line in self._newest.get((name, "stderr"), ())]
+        return next(filter(None, reversed(lines)), "")
 
     def close(self) -> None:
         """Wait until the child processes have closed their streams, and say how many lines were not shown."""
@@ -141,13 +157,15 @@ class ChildOutput:
         self.close()
 
     @contextmanager
-    def _reading(self, name: str, take: Callable[[str, list[str]], None]) -> Iterator[Streams]:
+    def _reading(
+        self, name: str, take: Callable[[str, list[str]], None], end: Callable[[str], None] = lambda _: None
+    ) -> Iterator[Streams]:
         writing: dict[str, int] = {}
         try:
             for stream in self._write:
                 reading, writing[stream] = os.pipe()
                 thread = threading.Thread(
-                    target=_read, args=(reading, take, stream), name=f"output-of-{name}", daemon=True
+                    target=_read, args=(reading, take, end, stream), name=f"output-of-{name}", daemon=True
                 )
                 self._threads.setdefault(name, []).append(thread)
                 thread.start()
@@ -170,6 +188,13 @@ class ChildOutput:
                     self._show("stdout", [f"more lines of output are in {self.path} only"])
                 self.withheld += len(lines) - count
 
+    def _show_end(self, name: str) -> None:
+        """Show the last error lines of a process that has ended, beyond the limit: they say why it ended."""
+        with self._lock:
+            lines = list(self._unshown.pop(name, ()))[-_SHOWN_AT_END:]
+            self.withheld -= len(lines)
+            self._show("stderr", lines)
+
     def _without_repetitions(self, name: str, stream: str, lines: Sequence[str]) -> list[str]:
         newest = self._newest.setdefault((name, stream), deque(maxlen=_REPETITION))
         kept = []
@@ -191,8 +216,8 @@ class ChildOutput:
             thread.join(max(deadline - time.monotonic(), 0.0))
 
 
-def _read(reading: int, take: Callable[[str, list[str]], None], stream: str) -> None:
-    """Read a pipe to its end, and pass its lines on."""
+def _read(reading: int, take: Callable[[str, list[str]], None], end: Callable[[str], None], stream: str) -> None:
+    """Read a pipe to its end, and pass its lines on; then call `end`."""
     rest = b""
     with open(reading, "rb", buffering=0) as pipe:
         while data := pipe.read(_LONGEST_LINE):
@@ -202,3 +227,4 @@ def _read(reading: int, take: Callable[[str, list[str]], None], stream: str) -> 
             take(stream, [line.decode(errors="replace") for line in lines])
     if rest:
         take(stream, [rest.decode(errors="replace")])
+    end(stream)

@@ -68,9 +68,9 @@ def evaluate(
       allow_modules: modules that may be imported to make the run's environment. Importing a module runs it, and a file
         named it.
 
-    Raises ValueError for invalid arguments, DamagedError if there is no checkpoint that can be read, NoPolicyError for
-    an unknown pretrained name, HubError if a policy cannot be pulled, EnvironmentSetupError if the environment cannot
-    be made or needs a module that is not allowed, and VideoError if the video cannot be written.
+    Raises ValueError for invalid arguments, NoPolicyError if there is no checkpoint or no such pretrained policy,
+    DamagedError if none can be read, HubError if a policy cannot be pulled, EnvironmentSetupError if the environment
+    cannot be made or needs a module that is not allowed, and VideoError if the video cannot be written.
     """
     arguments = parser().parse_args([])
     arguments.directory = None if directory is None else Path(directory)

@@ -122,8 +122,7 @@ def run_locally(
     except (FailedError, EvaluationFailedError) as error:
         if stopping.is_set():
             raise RunStoppedError from None
-        unshown = output.unshown(error.name) if isinstance(error, FailedError) else []
-        raise RunFailedError("\n".join([*unshown, str(error)])) from None
+        raise RunFailedError(str(error)) from None
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
         trackers.finish(stopping)
@@ -164,8 +163,8 @@ def _train_at(
     learner = _supervised_learner(run, listening, learner_streams)
     actors: list[Supervised] = []
     try:
-        names = [f"actor-{index}" for index in range(spec.collection.actors)]
-        actors += [supervised_actor(name, address, options, output.pipes) for name in names]
+        for index in range(spec.collection.actors):  # one by one: if one cannot be started, those before it are stopped
+            actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
         training = spec.training
         _logger.info(
             "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
@@ -178,7 +177,8 @@ def _train_at(
             run.directory,
         )
         if spec.evaluation.seconds is not None:
-            actors.append(supervised_actor(_EVALUATOR, address, (*options, "--evaluator"), output.pipes))
+            evaluating = (*options, "--evaluator")
+            actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
         if run.watch:
             page.append(supervised_gateway(address, _gateway_options(run), output.pipes))
         trackers.start()
@@ -279,7 +279,7 @@ def watch(
                 # A synchronous algorithm waits for all actors at its start.
                 needed = not playing or spec.algorithm.synchronous
                 if needed and actor.name not in _HELPERS:
-                    raise
+                    raise (error if playing else FailedError("all actors", error.reason, "failed")) from None
                 _warn(f"{error}; training continues without this process", record)
     return 1
 
@@ -295,8 +295,8 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
     If training stopped at its target, the policy of that moment also plays new sampled episodes. Otherwise, if greedy
-    episodes are clearly worse than training was, the same episodes are played with sampled actions, too. Raises
-    EvaluationFailedError.
+    episodes are clearly worse than training was, the same episodes are played with sampled actions, too, unless the
+    policy is greedy anyway. Raises EvaluationFailedError.
     """
     began = time.monotonic()
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
@@ -310,7 +310,8 @@ def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) 
     for confirmed in confirmations:
         summary["confirmation"] = confirmation(without_episodes(confirmed))
         summary["confirmation_return_mean"] = confirmed["return_mean"]
-    if not confirmations and is_below_training(evaluation, summary.get("episode_return_mean")):
+    can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
+    if not confirmations and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
         (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
         evaluation["notes"].append(sampled_note(evaluation, sampled))
         summary["sampled_evaluation"] = without_episodes(sampled)

@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Callable
 
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_status
+from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, interrupts_held
 
 USAGE = """\
 usage: daedalus COMMAND ...
@@ -37,7 +37,8 @@ after training:
 for the shell:
   completion print a script that completes commands, options and presets
 
-`daedalus COMMAND --help` describes a command. To start: daedalus train cartpole"""
+`daedalus COMMAND --help` describes a command, and `daedalus --version` prints the version.
+To start: daedalus train cartpole"""
 
 
 def main() -> int:
@@ -50,6 +51,11 @@ def _run() -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
         return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from daedalus import __version__
+
+        print(f"daedalus {__version__}")
+        return 0
     command, rest = arguments[0], arguments[1:]
     if command in _MODULES:
         line = [sys.executable, "-P", "-m", _MODULES[command], *rest]
@@ -58,7 +64,8 @@ def _run() -> int:
 
             return subprocess.run(line, check=False).returncode
         # The command replaces this process, so signals reach it and its exit status is returned.
-        os.execv(sys.executable, line)
+        with interrupts_held():
+            os.execv(sys.executable, line)
     if command not in _COMMANDS:
         import difflib
 

@@ -1,6 +1,7 @@
 """What every process does: stop on signals, end with its parent, and end when one of its threads fails."""
 
 import contextlib
+import errno
 import logging
 import os
 import select
@@ -9,7 +10,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TextIO
 
 _logger = logging.getLogger(__name__)
@@ -19,6 +20,7 @@ STOPPED = 128 + signal.SIGTERM
 ORDERED = 4  # exit status of a supervised learner that an operator stopped
 RANK_LOST = 5  # exit status of a process of a learner that has lost another one; restarted, it goes on
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
+UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
 _STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
 _STUCK_POLL_SECONDS = 0.05
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
@@ -42,6 +44,23 @@ def raise_descriptor_limit() -> None:
         with contextlib.suppress(ValueError, OSError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
             return
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Block SIGINT in this thread, and in the child processes that are started in the block until `stop_on_signals`.
+
+    A child process needs seconds to import its modules. Ctrl-C would end it there with a traceback; a blocked signal
+    waits for the handlers.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
@@ -71,6 +90,8 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see interrupts_held
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
     threading.Thread(target=watch, name="signals", daemon=True).start()
@@ -120,8 +141,8 @@ def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = l
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
 
-    Every command runs in it. After Ctrl-C the status is 1. `outputs` are the streams that the command writes to,
-    besides standard output and standard error.
+    Every command runs in it. After Ctrl-C, or if the disk is full, the status is 1. `outputs` are the streams that the
+    command writes to, besides standard output and standard error.
     """
     try:
         try:
@@ -135,9 +156,20 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
         unread = [stream for stream in (*outputs, sys.stdout, sys.stderr) if _is_unread(stream)]
         if not unread:  # another pipe: a fault of ours
             raise
-        for stream in unread:  # the interpreter flushes them at its end
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        discard(*unread)
         return UNREAD
+    except OSError as error:
+        if error.errno not in UNWRITABLE or error.filename is not None:
+            raise
+        discard(*outputs, sys.stdout)
+        print(f"daedalus: cannot write the output: {error.strerror}", file=sys.stderr)
+        return 1
+
+
+def discard(*streams: TextIO) -> None:
+    """Discard what streams could not write, and what is written to them: the interpreter flushes them at its end."""
+    for stream in streams:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _is_unread(stream: TextIO) -> bool:

@@ -1,19 +1,16 @@
-"""The quick half of `daedalus check`, in a process of its own: an environment may print, hang, or crash its process.
+"""The quick half of `daedalus check`, in a process of its own, before a run starts.
 
 The process ends before the actors start, so that a simulator of which only one can run is free again.
 """
 
-import json
 import logging
 import os
-import select
-import signal
-import sys
 import threading
-import time
 from typing import TYPE_CHECKING, Any
 
+from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
 from daedalus.learner.run.default_settings import default_settings
+from daedalus.learner.run.settings import preset_names
 from daedalus.policy.user_modules import UserModules, modules_of
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -24,12 +21,7 @@ if TYPE_CHECKING:
 _logger = logging.getLogger(__name__)
 
 _PLAY_SECONDS, _PLAY_ENV_STEPS = 0.3, 50
-_POLL_SECONDS = 0.2
 _MOST_SECONDS = 20.0  # a simulator may need long to start; the run does not wait for it any longer
-
-
-class CheckTimeoutError(Exception):
-    """Error of a check that did not end in time."""
 
 
 class EnvironmentProblemError(Exception):
@@ -64,13 +56,19 @@ def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
         _logger.warning("the check of the environment was %s: the run starts without it", error)
         return EnvironmentReport()
     if report.problems:
-        raise EnvironmentProblemError(report.problems[0])
+        raise EnvironmentProblemError(with_preset(report.problems[0], spec))
     for warning in report.warnings:
         _logger.warning("%s", warning)
     for advice in (slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec)):
         if advice:
             _logger.info("%s", advice)
     return report
+
+
+def with_preset(problem: str, spec: RunSpec) -> str:
+    """Return a problem, with a hint if the unknown environment has the name of a preset."""
+    name = spec.environment.id
+    return f"{problem}; {name!r} is a preset, which is named without --env" if name in preset_names() else problem
 
 
 def transformed_spaces(spec: RunSpec, before: RunSpec, spaces: Spaces | None, *, fork: bool = False) -> Spaces | None:
@@ -153,87 +151,14 @@ def quick_check(
 
     Raises CheckTimeoutError.
     """
-    from daedalus.actor.checking.report import EnvironmentReport
-
-    words = json.dumps({"spec": spec.model_dump(mode="json"), "modules": sorted(modules.allowed), "play": play})
-    reading, writing = os.pipe()
-    with open(reading, "rb", buffering=0) as results:
-        # Apple's frameworks do not work after a fork.
-        forked = fork and sys.platform == "linux" and threading.active_count() == 1
-        try:
-            pid = _forked(words, writing) if forked else _spawned(words, writing)
-        finally:
-            os.close(writing)
-        try:
-            answer = _read(results.fileno(), stop or threading.Event())
-            if answer:
-                os.kill(pid, signal.SIGKILL)  # threads of the environment could keep it alive
-        except BaseException:
-            os.kill(pid, signal.SIGKILL)
-            raise
-        finally:
-            _, status = os.waitpid(pid, 0)
-    if not answer:
-        ended = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
-        problem = f"environment {spec.id} ended its process ({ended}): see what it prints with `daedalus check`"
-        return EnvironmentReport(problems=(problem,))
-    return EnvironmentReport.model_validate_json(answer)
-
-
-def _read(descriptor: int, stop: threading.Event) -> bytes:
-    """Read one line, or nothing if the other end closes before. Raises CheckTimeoutError."""
-    data, until = b"", time.monotonic() + _MOST_SECONDS
-    while not data.endswith(b"\n"):  # not to the end: processes of the environment may hold the descriptor
-        if stop.is_set() or time.monotonic() > until:
-            raise CheckTimeoutError(f"not done within {_MOST_SECONDS:g} s")
-        if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
-            continue
-        part = os.read(descriptor, 1 << 16)
-        if not part:
-            return b""
-        data += part
-    return data
-
-
-def _forked(words: str, writing: int) -> int:
-    """Return the process id of a fork that writes the report to a descriptor."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid:
-        return pid
-    try:
-        silent = os.open(os.devnull, os.O_RDWR)
-        for standard in range(3):
-            os.dup2(silent, standard)
-        _report(words, writing)
-    finally:
-        os._exit(1)  # nothing that belongs to the parent may be closed or flushed here
-
-
-def _spawned(words: str, writing: int) -> int:
-    """Return the process id of a new interpreter that writes the report to a descriptor."""
-    os.set_inheritable(writing, True)
-    command = [sys.executable, "-P", "-m", "daedalus.cli.quick_check", str(writing), words]
-    silent = [(os.POSIX_SPAWN_OPEN, standard, os.devnull, os.O_RDWR, 0) for standard in range(3)]
-    return os.posix_spawn(sys.executable, command, os.environ, file_actions=silent)
-
-
-def _report(words: str, writing: int) -> None:
-    """Check the environment, and write the report to a descriptor."""
-    # It ends with its parent, or soon after, even in native code.
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(int(_MOST_SECONDS) + 5)
-    from daedalus.actor.checking.play import check_environment
-
-    options = json.loads(words)
-    seconds = _PLAY_SECONDS if options["play"] else 0.0
-    modules = UserModules(frozenset(options["modules"]))
-    spec = EnvironmentSpec.model_validate(options["spec"])
-    report = check_environment(spec, modules, seconds=seconds, env_steps=_PLAY_ENV_STEPS)
-    with open(writing, "w", encoding="utf-8") as stream:
-        stream.write(report.model_dump_json() + "\n")
-
-
-if __name__ == "__main__":
-    _report(sys.argv[2], int(sys.argv[1]))
+    return check_in_process(
+        EnvironmentCheck(
+            spec=spec,
+            modules=modules,
+            seconds=_PLAY_SECONDS if play else 0.0,
+            env_steps=_PLAY_ENV_STEPS,
+            most_seconds=_MOST_SECONDS,
+        ),
+        fork=fork,
+        stop=stop,
+    )

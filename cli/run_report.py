@@ -1,9 +1,12 @@
 """The last lines that `daedalus train` prints."""
 
 import importlib.util
+import sys
+from contextlib import suppress
 from typing import Any
 
 from daedalus.cli.local_run import LocalRun
+from daedalus.cli.processes import UNWRITABLE, discard
 
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
@@ -22,12 +25,25 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
         f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
         f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
-        f"on {evaluation['backend']}'s {evaluation['environment']}"
+        f"on {evaluation['environment']} (backend {evaluation['backend']})"
     )
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
         folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
     return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
+
+
+def show(text: str) -> None:
+    """Print the result of a run. A full disk is no fault of the run: standard error has one line then."""
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        discard(sys.stdout)
+        with suppress(OSError):
+            message = f"cannot print the result, which is in the run directory: {error.strerror}"
+            print(f"daedalus train: {message}", file=sys.stderr)
 
 
 def _confirmed(summary: dict[str, Any]) -> list[str]:

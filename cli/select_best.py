@@ -6,15 +6,15 @@ The highest of many scores over a few episodes is partly luck. All candidates pl
 import json
 import logging
 import subprocess
-import sys
 import tempfile
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from daedalus.cli.child_output import STREAMS, ChildOutput
-from daedalus.cli.supervisor import stop
+from daedalus.cli.supervisor import start, stop
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
 
@@ -84,7 +84,8 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
             for arguments, file in zip(commands, files, strict=True):
                 name = f"evaluation-{len(processes)}"
                 with output.pipes(name, shown=() if processes else STREAMS) as streams:
-                    processes[name] = _start_evaluation(arguments, file, streams.stderr)
+                    own = replace(streams, stdout=file.fileno())
+                    processes[name] = start("daedalus.cli.commands.evaluate", *arguments, "--json", streams=own)
             while any(process.poll() is None for process in processes.values()) and not stopping.wait(_POLL_SECONDS):
                 pass
         finally:
@@ -102,9 +103,3 @@ def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutp
 def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
     """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
     return {name: value for name, value in result.items() if name not in ("returns", "lengths")}
-
-
-def _start_evaluation(arguments: list[str], output: IO[bytes], error: int | None) -> subprocess.Popen[bytes]:
-    program = [sys.executable, "-P", "-m", "daedalus.cli.commands.evaluate"]
-    command = [*program, *arguments, "--json", "--exit-with-parent"]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=error)

@@ -14,6 +14,7 @@ from daedalus.cli.arguments import (
     add_processes,
     add_tls,
     command_parser,
+    whole_number,
 )
 from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
@@ -72,7 +73,9 @@ def add_settings(
         help="number of actor processes. `daedalus learner` starts none, but a2c waits for this number",
     )
     options.add_argument("--seed", type=int, metavar="S", help=seed_help)
-    options.add_argument("--env-steps", type=int, metavar="N", help="budget: environment steps of all actors together")
+    options.add_argument(
+        "--env-steps", type=whole_number, metavar="N", help="budget: environment steps of all actors together"
+    )
     options.add_argument(
         "--wrap",
         metavar="MODULE:FUNCTION",
@@ -155,7 +158,9 @@ class Choice:
 
         Raises SettingsError.
         """
-        if (self.preset is None) == (self.env is None):
+        if self.preset is not None and self.env is not None:
+            raise SettingsError(f"leave out one of {self.preset} and --env {self.env}")
+        if self.preset is None and self.env is None:
             raise SettingsError(f"name a preset ({', '.join(preset_names())}) or an environment with --env ID")
         if self.preset is not None:
             return run_spec(self._applied(read_preset(self.preset), change))
@@ -188,8 +193,7 @@ class Choice:
 
 def check_environment(env: str | None, settings: dict[str, Any]) -> None:
     """Check that other settings name no other environment than `env`. Raises SettingsError."""
-    chosen = settings["environment"].get("id")
-    if env is not None and chosen != env:
+    if env is not None and (chosen := settings["environment"].get("id")) != env:
         raise SettingsError(f"--env {env} and environment.id={chosen} are two environments: leave one of them out")
 
 

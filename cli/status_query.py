@@ -27,6 +27,14 @@ def ask(transport: Transport, run: str = keys.ANY_RUN, *, max_actors: int | None
     return [_with_actors(transport, status, max_actors) for status in statuses]
 
 
+def no_answer(transport: Transport, run: str) -> str:
+    """Return the error message where no learner of a run answers, with the runs that do. Raises as `ask` does."""
+    there = "" if run == keys.ANY_RUN else ", ".join(sorted(repr(each.run) for each in ask(transport, max_actors=0)))
+    if there:
+        return f"no learner of run {run!r} answers; the runs here are {there}"
+    return "no learner answers at this address: is a learner running?"
+
+
 def ask_events(transport: Transport, status: RunStatus) -> EventsPage | None:
     """Return the newest events of a run, or None if its learner does not answer. Raises as `ask` does."""
     for answer in transport.query(keys.status(status.run), encode(EventsRequest()), timeout=_ANSWER_SECONDS):

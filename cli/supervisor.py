@@ -1,24 +1,34 @@
 """Supervision of child processes: start them, restart them if they die, and end all of them."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 from daedalus.cli.child_output import OpenStreams, Streams, inherited
-from daedalus.cli.processes import RANK_LOST, STOPPED
+from daedalus.cli.processes import RANK_LOST, STOPPED, interrupts_held
 
 GATEWAY = "gateway"  # name of its process
-_NO_FAULT = {STOPPED, RANK_LOST}  # exit statuses of a process that has not failed by itself
+# Exit statuses that mean something for a learner only.
+_LEARNERS_RESTARTS = {STOPPED: "was stopped by a signal", RANK_LOST: "lost one of its processes"}
+# Signals of a process that crashes by itself. Others come from outside: an operator, or the system.
+_CRASHES = {
+    getattr(signal, name)
+    for name in ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL", "SIGTRAP", "SIGSYS")
+    if hasattr(signal, name)
+}
 
-_MOST_FAILURES = 3  # of one process, in a row, each with an exit status of its own
-_SOON_SECONDS = 60.0  # a process that ran for longer before it failed starts a new count
-_MOST_RESTARTS = 1000  # of one process that is killed by signals
+_MOST_FAILURES = 3  # of one process, in a row
+_SOON_SECONDS = 60.0  # a process that ran for longer before it ended starts a new count
+_MOST_RESTARTS = 1000  # of one process that is killed from outside
 _LEAVING_SECONDS = 10.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
+
+_ACTOR_ERROR = "daedalus actor: "  # beginning of the line in which an actor reports its error
 
 # With fewer cores than processes, the learner runs first, because all actors wait for it.
 _ACTORS_NICENESS = 5  # added to the niceness of the learner
@@ -47,23 +57,29 @@ def start(
       one_thread: limit the thread pools of its libraries.
       own_session: keep it out of the terminal's group for Ctrl-C. It leads a process group of its own.
     """
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
-        stdin=subprocess.PIPE,
-        stdout=streams.stdout,
-        stderr=streams.stderr,
-        env={**os.environ, **_ONE_THREAD} if one_thread else None,
-        pass_fds=descriptors,
-        start_new_session=own_session,
-    )
+    with interrupts_held():
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", module, *arguments, "--exit-with-parent"],
+            stdin=subprocess.PIPE,
+            stdout=streams.stdout,
+            stderr=streams.stderr,
+            env={**os.environ, **_ONE_THREAD} if one_thread else None,
+            pass_fds=descriptors,
+            start_new_session=own_session,
+        )
 
 
 class FailedError(Exception):
-    """Error of a process that failed too often."""
+    """Error of a process that failed too often. `reason` says why, as far as it is known."""
 
-    def __init__(self, name: str, failures: int) -> None:
-        super().__init__(f"{name} failed {failures} times; see the error above")
-        self.name = name
+    def __init__(self, name: str, reason: str, how: str) -> None:
+        super().__init__(f"{name} {how}: {reason}")
+        self.reason = reason
+
+
+def _reason(status: int) -> str:
+    """Return why a process failed, from its exit status."""
+    return f"a fault of native code (signal {-status})" if status < 0 else "see the error above"
 
 
 @dataclass(slots=True)
@@ -73,8 +89,11 @@ class Supervised:
     name: str
     begin: Callable[[bool], subprocess.Popen[bytes]]  # starts the process; the argument is True for the first start
     ended: Set[int]  # exit statuses that mean that the work is done
+    # Exit statuses of a process that has not failed by itself, and how it ended.
+    no_fault: Mapping[int, str] = field(default_factory=lambda: _LEARNERS_RESTARTS)
+    reason: Callable[[int], str] = _reason  # of its last failure, from the exit status
     restarts: int = 0
-    failures: int = 0  # in a row, by exit status, each soon after the start
+    failures: int = 0  # in a row, each soon after the start
     process: subprocess.Popen[bytes] = field(init=False)
     _started: float = field(init=False)
     _ended_at: float | None = None
@@ -92,14 +111,15 @@ class Supervised:
     def failed_at_once(self) -> bool:
         """Whether the first process failed soon after its start, so that a restart would not help."""
         status = self.process.poll()
-        failed = status is not None and status > 0 and status not in _NO_FAULT | self.ended
+        failed = status is not None and status > 0 and status not in {*self.no_fault, *self.ended}
         return failed and self.restarts == 0 and time.monotonic() - self._started < _SOON_SECONDS
 
     def check(self) -> str | None:
         """Restart the process if it died, and return a message about the restart, or None.
 
         A process whose work is done is restarted if the other processes continue: a learner has been restarted since.
-        Raises FailedError if the process failed too often, soon after each start.
+        Raises FailedError if the process failed or crashed too often, soon after each start. A process that is killed
+        from outside has not failed.
         """
         status, now = self.process.poll(), time.monotonic()
         if status is None:
@@ -110,29 +130,40 @@ class Supervised:
                 return None
             self._start(first=False)
             return f"{self.name} ended before the run; started again"
-        if status > 0 and status not in _NO_FAULT:
-            lived = now - self._started
-            self.failures = self.failures + 1 if lived < _SOON_SECONDS else 1
-        if self.failures >= _MOST_FAILURES or self.restarts >= _MOST_RESTARTS:
-            raise FailedError(self.name, self.failures)
+        if now - self._started >= _SOON_SECONDS:
+            self.failures = 0
+        self.failures += -status in _CRASHES if status < 0 else status not in self.no_fault
+        if self.failures >= _MOST_FAILURES:
+            raise FailedError(self.name, self.reason(status), f"failed {self.failures} times")
+        if self.restarts >= _MOST_RESTARTS:
+            raise FailedError(self.name, f"it {self._describe(status)}", f"was started {self.restarts} times")
         self.restarts += 1
         self._start(first=False)
-        return f"{self.name} {_describe(status)}; started again"
+        return f"{self.name} {self._describe(status)}; started again"
 
-
-def _describe(status: int) -> str:
-    """Return how a process ended that had more to do."""
-    if status == STOPPED:
-        return "was stopped by a signal"
-    if status == RANK_LOST:
-        return "lost one of its processes"
-    return f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
+    def _describe(self, status: int) -> str:
+        """Return how the process ended, which had more to do."""
+        if status in self.no_fault:
+            return self.no_fault[status]
+        return f"was killed by signal {-status}" if status < 0 else f"failed with status {status}"
 
 
 def supervised_actor(
-    name: str, connect: str, options: tuple[str, ...] = (), open_streams: OpenStreams = inherited
+    name: str,
+    connect: str,
+    options: tuple[str, ...] = (),
+    open_streams: OpenStreams = inherited,
+    last_error: Callable[[str], str] = lambda _: "",
 ) -> Supervised:
-    """Start an actor, or the evaluator, under supervision."""
+    """Start an actor, or the evaluator, under supervision.
+
+    Args:
+      name: of the actor.
+      connect: address of the learner.
+      options: further options of `daedalus actor`.
+      open_streams: where its output goes.
+      last_error: returns the last line of standard error of a process by its name; it says why an actor failed.
+    """
 
     def begin(_first: bool) -> subprocess.Popen[bytes]:
         arguments = ["--connect", connect, "--name", name, *options]
@@ -141,7 +172,12 @@ def supervised_actor(
         _yield_to_learner(process)
         return process
 
-    return Supervised(name, begin, ended={0})
+    def reason(status: int) -> str:
+        said = last_error(name).removeprefix(_ACTOR_ERROR) if status == 1 else ""
+        how = f"signal {-status}" if status < 0 else f"status {status}"
+        return said or f"the environment ends the process ({how}): play it with `daedalus check`"
+
+    return Supervised(name, begin, ended={0}, no_fault={}, reason=reason)
 
 
 def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: OpenStreams) -> Supervised:
@@ -154,7 +190,7 @@ def supervised_gateway(connect: str, options: tuple[str, ...], open_streams: Ope
         _yield_to_learner(process)
         return process
 
-    return Supervised(GATEWAY, begin, ended={0})
+    return Supervised(GATEWAY, begin, ended={0}, no_fault={})
 
 
 def _yield_to_learner(process: subprocess.Popen[bytes]) -> None:

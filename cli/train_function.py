@@ -20,6 +20,7 @@ from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, 
 from daedalus.cli.settings_arguments import Choice, check_processes, named_directory
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.initial import check_initial
 from daedalus.learner.run.settings import SettingsError, assign
 from daedalus.policy.user_modules import UserModules, modules_of
 
@@ -53,7 +54,7 @@ class RunResult:
 
 
 def train(
-    preset: str | None = None,
+    preset: str | Path | None = None,
     *,
     env: str | None = None,
     algorithm: str | None = None,
@@ -91,9 +92,12 @@ def train(
       log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
       quiet: print nothing.
 
-    Raises SettingsError for invalid settings, TrainingError if a process failed.
+    Raises SettingsError for invalid settings, TypeError for an environment or a callback of another type, TrainingError
+    if a process failed.
     """
     started = time.monotonic()
+    preset = str(preset) if isinstance(preset, Path) else preset
+    _check_types(preset, env, callback)
     log = (log,) if isinstance(log, str) else log
     if unknown := set(log) - set(TRACKERS):
         raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
@@ -104,6 +108,8 @@ def train(
     check_processes(processes, spec)
     directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     run_directory.check_free(directory)  # before the environment is made
+    weights = None if init_from is None else Path(init_from)
+    check_initial(weights)
     with _checking(quiet):
         if env is None:
             spaces = checked_spaces(spec)
@@ -114,7 +120,6 @@ def train(
     if env is not None:
         directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
-    weights = None if init_from is None else Path(init_from)
     with (
         run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,
         observed(callback, lock.directory) as (observer, control),
@@ -132,6 +137,15 @@ def train(
         )
         end = _run(run, quiet)
     return _result(lock.directory, end, control.stop_reason)
+
+
+def _check_types(preset: object, env: object, callback: object) -> None:
+    """Raise TypeError for objects that are often given in place of a name, or of an instance."""
+    for name in (preset, env):
+        if not isinstance(name, str | None):
+            raise TypeError(f'env must be the id of a registered environment, such as "CartPole-v1", not {name}')
+    if not isinstance(callback, Callback | None):
+        raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
 
 
 def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:

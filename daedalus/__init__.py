@@ -12,25 +12,35 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from daedalus.actor.client import Client
+    from daedalus.actor.environments.environment_errors import EnvironmentSetupError
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
+    from daedalus.actor.evaluation.video import VideoError
     from daedalus.cli.callbacks import Callback, TrainingRun
     from daedalus.cli.comparing.recorded_run import RunDataError, read_metrics
     from daedalus.cli.evaluate_function import EvaluationResult, evaluate
     from daedalus.cli.train_function import RunResult, TrainingError, train
     from daedalus.learner.run.settings import SettingsError
+    from daedalus.policy.saving.hub import HubError
+    from daedalus.policy.saving.saved_policy import NoPolicyError
+    from daedalus.policy.saving.sealed import DamagedError
 
     __version__: str
 
 __all__ = [
     "Callback",
     "Client",
+    "DamagedError",
+    "EnvironmentSetupError",
     "EvaluationResult",
+    "HubError",
+    "NoPolicyError",
     "Policy",
     "RunDataError",
     "RunResult",
     "SettingsError",
     "TrainingError",
     "TrainingRun",
+    "VideoError",
     "__version__",
     "evaluate",
     "load_policy",
@@ -41,13 +51,18 @@ __all__ = [
 _MODULES = {
     "Callback": "daedalus.cli.callbacks",
     "Client": "daedalus.actor.client",
+    "DamagedError": "daedalus.policy.saving.sealed",
+    "EnvironmentSetupError": "daedalus.actor.environments.environment_errors",
     "EvaluationResult": "daedalus.cli.evaluate_function",
+    "HubError": "daedalus.policy.saving.hub",
+    "NoPolicyError": "daedalus.policy.saving.saved_policy",
     "Policy": "daedalus.actor.evaluation.loaded_policy",
     "RunDataError": "daedalus.cli.comparing.recorded_run",
     "RunResult": "daedalus.cli.train_function",
     "SettingsError": "daedalus.learner.run.settings",
     "TrainingError": "daedalus.cli.train_function",
     "TrainingRun": "daedalus.cli.callbacks",
+    "VideoError": "daedalus.actor.evaluation.video",
     "evaluate": "daedalus.cli.evaluate_function",
     "load_policy": "daedalus.actor.evaluation.loaded_policy",
     "read_metrics": "daedalus.cli.comparing.recorded_run",

@@ -13,7 +13,7 @@ from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.errors import ClientError
@@ -85,27 +85,25 @@ class ClientActor:
         mask = self.spaces.action_mask(message.action_mask)
         if message.override is not None:
             self.spaces.check_action(message.override)
-        self._add_reward(message.reward)
+        self._check_reward(message.reward)
         epoch = current.session.learner_epoch
-        if self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch):
-            self._begin_rows(current)
+        # With the policy of another learner epoch the unfinished rollout for the previous one is dropped.
+        begins = self._rows is None or (self._rows_epoch != epoch and self.epoch == epoch)
+        rows = self._new_rows(current) if begins else self.rows
         try:
-            self.rows.observe(values, mask)
+            rows.observe(values, mask, 0.0 if begins else message.reward)
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
+        if begins:
+            self._rows, self._rows_epoch, self._full_version, self.version = rows, epoch, -1, current
         self._on_action, self._override = on_action, message.override
 
-    def _add_reward(self, value: float) -> None:
+    def _check_reward(self, value: float) -> None:
         if value and (self._rows is None or not self._rows.in_episode):
             raise ClientError("out_of_turn", "a reward came before any action of the episode: send an act first")
-        if value:
-            self.rows.reward(value)
 
-    def _begin_rows(self, current: PolicyVersion) -> None:
-        """Continue with the policy of another learner epoch; the unfinished rollout for the previous one is dropped.
-
-        Raises ClientError if the client is to explore and the policy cannot.
-        """
+    def _new_rows(self, current: PolicyVersion) -> ClientRows:
+        """Return rows for the learner epoch of a policy. Raises ClientError if it cannot explore as the client must."""
         assert self._transforms is not None
         assert self._session is not None
         spec = current.session.spec
@@ -121,8 +119,7 @@ class ClientActor:
             )
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
-        self._rows_epoch, self._full_version, self.version = current.session.learner_epoch, -1, current
-        self._rows = ClientRows(
+        return ClientRows(
             self._transforms,
             writer,
             example_mask=self.spaces.example_mask,
@@ -166,8 +163,10 @@ class ClientActor:
         return True
 
     def reward(self, value: float) -> None:
-        """Add to the reward of the last action."""
-        self._add_reward(value)
+        """Add to the reward of the last action. Raises ClientError if the episode has none."""
+        self._check_reward(value)
+        if value:
+            self.rows.reward(value)
 
     def end_episode(self, message: EndEpisode) -> None:
         """End the episode. Raises ClientError if the message does not fit; nothing has changed then."""
@@ -177,9 +176,9 @@ class ClientActor:
         if self._rows is None or not self._rows.in_episode:
             return  # another learner has come since the last action, whose row is dropped
         try:
-            self._add_reward(message.reward)
-            self.rows.end_episode(values, terminated=message.terminated)
-            self.rows.complete_episode()
+            self._rows.end_episode(values, terminated=message.terminated)
+            self._rows.reward(message.reward)
+            self._rows.complete_episode()
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None
 

@@ -4,7 +4,9 @@ Spaces are those of protocol/spaces.py: maps of named components. A value is a m
 only component is named `observation` or `action` has bare values.
 """
 
+import itertools
 import math
+from array import array
 from typing import Any
 
 import gymnasium
@@ -17,6 +19,7 @@ from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, Continuous
 
 _NUMBER_BYTES, _INTEGER_BYTES, _FLAG_BYTES = 32, 8, 8  # of one value in JSON, with a comma and some indentation
 _NAME_BYTES, _MESSAGE_BYTES = 128, 4096  # of one component's name, and of everything else in a message
+_TYPE_CODES = {"float32": "d", "uint8": "B", "uint16": "H"}  # of array.array
 
 _Component = ArraySpace | DiscreteSpace | ContinuousSpace
 
@@ -169,49 +172,74 @@ def _array(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarr
         item = np.dtype(space.dtype).newbyteorder("<")
         if len(value) != math.prod(space.shape) * item.itemsize:
             raise ClientError("misfit", f"{what} has {len(value)} bytes, but its space is {space}")
-        array = np.frombuffer(value, item)
+        values = np.frombuffer(value, item)
     else:
-        try:
-            array = np.asarray(value)
-        except (ValueError, OverflowError, RecursionError):
-            raise ClientError("misfit", f"{what} is not an array of numbers") from None
-    if array.dtype.kind not in ("biuf" if space.dtype == "float32" else "biu"):
-        raise ClientError(
-            "misfit", f"{what} is not an array of {'numbers' if space.dtype == 'float32' else 'integers'}"
-        )
-    if array.size != math.prod(space.shape):
-        raise ClientError("misfit", f"{what} has {array.size} values, but its space is {space}")
+        values = _converted(value, space, what)
     if isinstance(space, DiscreteSpace):
-        flat = array.reshape(-1)
-        if (flat < 0).any() or (flat >= space.counts).any():
-            raise ClientError("misfit", f"{what} is outside its space, {space}")
-        return flat.astype(np.int64) if space.size > 1 else np.int64(flat[0])  # type: ignore[return-value] - gymnasium's Discrete has numbers, not arrays
+        if (values >= space.counts).any():
+            raise _out_of_range(space, what)
+        return values.astype(np.int64) if space.size > 1 else np.int64(values[0])  # type: ignore[return-value] - gymnasium's Discrete has numbers, not arrays
     if space.dtype == "uint8":
-        if array.dtype != np.uint8 and ((array < 0).any() or (array > 255).any()):
-            raise ClientError("misfit", f"{what} has a value that is not from 0 to 255")
-        return array.astype(np.uint8).reshape(space.shape)
-    numbers = np.asarray(array, np.float64)
+        return values.astype(np.uint8).reshape(space.shape)
+    numbers = np.asarray(values, np.float64)
     if not (np.abs(numbers) <= LARGEST_OBSERVATION).all():  # false for NaN too
         if not np.isfinite(numbers).all():
             raise ClientError("misfit", f"{what} has a value that is not finite")
-        raise ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
+        raise _out_of_range(space, what)
     return numbers.astype(np.float32).reshape(space.shape)
 
 
-def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:
+def _converted(value: Any, space: ArraySpace | DiscreteSpace, what: str) -> np.ndarray:
+    """Return the numbers of nested lists in one dimension. Raises ClientError if they do not fit the space.
+
+    array.array accepts nothing but numbers, and no fractions for integers. numpy.asarray accepts texts, and would
+    allocate the size of the longest text for each element.
+    """
     try:
-        array = np.asarray(value).reshape(-1)
-    except (ValueError, OverflowError, RecursionError):
-        array = np.array(["not numbers"])
-    if array.dtype.kind not in ("iu" if isinstance(space, DiscreteSpace) else "iuf") or array.size != space.size:
-        kind = "integers" if isinstance(space, DiscreteSpace) else "numbers"
+        numbers = np.asarray(array(_TYPE_CODES[space.dtype], _flat(value)))
+    except (TypeError, ValueError):
+        kind = "numbers" if space.dtype == "float32" else "integers"
+        raise ClientError("misfit", f"{what} is not an array of {kind}") from None
+    except OverflowError:
+        raise _out_of_range(space, what) from None
+    if numbers.size != math.prod(space.shape):
+        raise ClientError("misfit", f"{what} has {numbers.size} values, but its space is {space}")
+    return numbers
+
+
+def _flat(value: Any) -> list[Any]:
+    """Return the elements of nested lists, or one element. Raises ValueError if the lists differ in length or depth."""
+    elements = value if isinstance(value, list) else [value]
+    while elements and isinstance(elements[0], list):
+        if set(map(type, elements)) != {list} or len(set(map(len, elements))) > 1:
+            raise ValueError
+        elements = list(itertools.chain.from_iterable(elements))
+    return elements
+
+
+def _out_of_range(space: ArraySpace | DiscreteSpace, what: str) -> ClientError:
+    if isinstance(space, DiscreteSpace):
+        return ClientError("misfit", f"{what} is outside its space, {space}")
+    if space.dtype == "uint8":
+        return ClientError("misfit", f"{what} has a value that is not from 0 to 255")
+    return ClientError("misfit", f"{what} has a value beyond +-{LARGEST_OBSERVATION:g}: scale the observation")
+
+
+def _check_action(value: Any, space: DiscreteSpace | ContinuousSpace, what: str) -> None:
+    types, kind = ({int}, "integers") if isinstance(space, DiscreteSpace) else ({int, float}, "numbers")
+    try:
+        elements = _flat(value)
+    except ValueError:
+        elements = []
+    numbers = np.array(elements if set(map(type, elements)) <= types else [])
+    if numbers.dtype.kind not in "iuf" or numbers.size != space.size:  # an integer of more than 64 bits is an object
         raise ClientError("misfit", f"{what} must have {space.size} {kind}, as its space is {space}")
     if isinstance(space, DiscreteSpace):
-        fits = (array >= 0) & (array < space.counts)
+        fits = (numbers >= 0) & (numbers < space.counts)
     else:
         low = np.array([-np.inf if bound is None else bound for bound in space.low])
         high = np.array([np.inf if bound is None else bound for bound in space.high])
-        fits = np.isfinite(array) & (array >= low) & (array <= high)
+        fits = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
     if not fits.all():
         raise ClientError("misfit", f"{what} is outside its space, {space}")
 

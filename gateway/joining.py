@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from daedalus.actor.session.learner_queries import ActorError, NameInUseError
+from daedalus.actor.errors import ActorError, NameInUseError
 from daedalus.actor.session.run_end import RunOverError
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
@@ -74,12 +74,12 @@ class Joining:
     async def _ask(self, seat: Seat, session: Welcome) -> bool:
         """Ask to join a learner; return whether the client now takes part in the newest session."""
         join, transforms = seat.actor.prepare(session.spec)
-        if seat.presence is None:
-            key = keys.presence(session.run, join.actor, join.incarnation)
-            seat.presence = self._transport.declare_presence(key)
         began = time.monotonic()
         request = self._link.queries.request_join
         try:
+            if seat.presence is None:
+                key = keys.presence(session.run, join.actor, join.incarnation)
+                seat.presence = self._transport.declare_presence(key)
             welcome = await asyncio.get_running_loop().run_in_executor(self._threads, request, session.run, join)
         except NameInUseError as error:
             if began > seat.since + _NAME_IN_USE_SECONDS:

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from daedalus.actor.errors import LearnerLostError
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.state_lock import StateLock

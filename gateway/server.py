@@ -14,6 +14,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import InvalidState
+from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request as HandshakeRequest
 
 from daedalus.gateway.app import Application
@@ -25,18 +26,24 @@ _MAX_CONNECTIONS = 2048
 _STOP_SECONDS = 2  # for connections to end after a stop
 _KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
-_REQUEST_SECONDS = 10.0  # from the connection to a complete request
+_MAX_FRAGMENTS = 4096  # of one message: the limit on its bytes does not count empty ones
+_REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer
 
 
 class PromptHttp(H11Protocol):
-    """HTTP for clients that send a request soon."""
+    """HTTP for clients that send a request soon, and read its answer."""
 
     _deadline: asyncio.TimerHandle | None = None  # it keeps the connection, with all that was received
 
     def connection_made(self, transport: BaseTransport) -> None:
-        """Close the connection if no request comes."""
+        """End the connection if no request comes."""
         super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
-        self._deadline = self.loop.call_later(_REQUEST_SECONDS, self._close_if_silent)
+        self._begin_deadline()
+
+    def on_response_complete(self) -> None:
+        """End the connection if no further request comes. uvicorn's own deadline ends with the next byte."""
+        self._begin_deadline()
+        super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the memory of the connection."""
@@ -48,13 +55,16 @@ class PromptHttp(H11Protocol):
         self._end_deadline()
         super().handle_websocket_upgrade(event)
 
+    def _begin_deadline(self) -> None:
+        self._end_deadline()
+        self._deadline = self.loop.call_later(_REQUEST_SECONDS, self._abort)
+
     def _end_deadline(self) -> None:
         if self._deadline is not None:
             self._deadline.cancel()
 
-    def _close_if_silent(self) -> None:
-        if self.cycle is None:
-            self.transport.close()
+    def _abort(self) -> None:
+        self.transport.abort()  # `close` waits until the client has read everything
 
 
 class OurWebSocket(WebSocketsSansIOProtocol):
@@ -68,6 +78,14 @@ class OurWebSocket(WebSocketsSansIOProtocol):
         super().handle_connect(event)
         if self.response.status_code == 101:
             self.scope["extensions"] = {**(self.scope["extensions"] or {}), "daedalus": self}  # type: ignore[typeddict-item] - extensions may have any name
+
+    def handle_cont(self, event: Frame) -> None:
+        """End the connection if a message has too many fragments."""
+        if len(self.frames) < _MAX_FRAGMENTS:
+            super().handle_cont(event)
+        elif not self.close_sent:
+            self.conn.fail(CloseCode.MESSAGE_TOO_BIG, f"a message has more than {_MAX_FRAGMENTS} fragments")
+            self.handle_parser_exception()
 
     def send_receive_event_to_app(self) -> None:
         """Deliver a message; pause reading only if the application is behind, which costs two system calls."""
@@ -92,6 +110,11 @@ class OurWebSocket(WebSocketsSansIOProtocol):
                 return
         self.frames = []
         on_message(message)
+
+    def keepalive_timeout(self) -> None:
+        """End the connection of a client that does not answer a ping, although it may not read what was written."""
+        super().keepalive_timeout()
+        self.transport.abort()  # `close` waits until the client has read everything
 
     def resume_writing(self) -> None:
         """Tell the application that the client reads again."""

@@ -113,7 +113,7 @@ class LearnerService:
             self._counters.restore(restored.counters)
             self._annealing = _resumed_annealing(restored, spec)
         self.learner_epoch = epoch = secrets.randbits(62)
-        self._evaluations = Evaluations(epoch)
+        self._evaluations = Evaluations(epoch, self._counters)
         self._heartbeat = Heartbeat(directory)
         self._event_file = EventFile(directory)
         self._health = Health(
@@ -255,10 +255,12 @@ class LearnerService:
                 raise
         finally:
             ended = time.monotonic()
-            self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
-            self._record(recorder, learner, ended, last=True)
-            recorder.close()
-            saved = checkpointer.save()
+            try:
+                self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
+                self._record(recorder, learner, ended, last=True)
+                recorder.close()
+            finally:
+                saved = checkpointer.save()
         solved = seconds_to_target is not None
         self._write_summary(solved, finished, seconds_to_target, ended)
         env_steps = f"{self._counters.env_steps:,} env_steps"
@@ -291,12 +293,12 @@ class LearnerService:
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
             self._beat()
             self._update(learner)
+            self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             now = time.monotonic()
-            if seconds_to_target is None and self._is_solved():
+            if seconds_to_target is None and self._counters.is_solved(training):
                 seconds_to_target = self._reporter.wall_seconds(now)
             if seconds_to_target is not None and training.stop_when_solved:
                 break
-            self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             if now >= log_at:
                 self._record(recorder, learner, now)
                 log_at = now + service.log_seconds
@@ -313,22 +315,17 @@ class LearnerService:
         recorder.record(row, self._reporter.details(learner))
         self._event_file.add(self._server.events.take_new())
 
-    def _is_solved(self) -> bool:
-        """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""
-        training = self._spec.training
-        if training.explores and self._evaluations.reached(training.target_return):
-            return True
-        return self._counters.reached(training.target_return)
-
     def _update(self, learner: "Learner") -> None:
         """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
-        progress = self._annealing.at(self._counters.env_steps)
+        env_steps = self._counters.env_steps
+        progress = self._annealing.at(env_steps)
         rollouts = self._server.rollouts.take_batch(learner.policy_version)
         self._health.left_out = self._server.rollouts.left_out
         if not rollouts:
             return
         skipped = learner.updates_skipped
         left_out = self._learn_from(rollouts, learner, progress)
+        learner.anneal_exploration(self._spec.training.exploration_annealing(progress, env_steps))
         self._add_gradient_inputs(learner)
         self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(rollouts))
         self._server.rollouts.count_trained(rollouts, left_out)

@@ -7,8 +7,10 @@ of this process allows it.
 import importlib
 import os
 import sys
+import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -56,14 +58,14 @@ class UserModules:
         """
         self.check({setting: value})
         name = module_of(value)
+        if name.endswith(".py"):
+            raise UserModuleError(f"{setting}={value}: {_of_file(Path(name), value.rpartition(':')[2])}")
         if os.getcwd() not in sys.path:  # at the end: an installed package has precedence
             sys.path.append(os.getcwd())
         try:
             return importlib.import_module(name)
         except ImportError as error:
-            raise UserModuleError(
-                f"{setting}={value}: cannot import {name} ({error}): install it, or start in the folder of {name}.py"
-            ) from error
+            raise UserModuleError(f"{setting}={value}: {_import_failure(name, error)}") from error
 
     def attribute(self, setting: str, value: str) -> Any:
         """Import the module of a setting `module:name`, and return what has the name there. See `load`."""
@@ -71,10 +73,51 @@ class UserModules:
         try:
             return getattr(module, name)
         except AttributeError:
-            raise UserModuleError(f"{setting}={value}: {getattr(module, '__file__', module)} has no {name!r}") from None
+            raise UserModuleError(
+                f"{setting}={value}: {file_of(module)} has no {name!r}{hidden_file(module)}"
+            ) from None
 
 
 NO_MODULES = UserModules()
+
+
+def shown_path(path: str) -> str:
+    """Return a path, relative to the working directory if it lies there."""
+    return path.removeprefix(os.path.join(os.getcwd(), ""))
+
+
+def file_of(module: ModuleType) -> str:
+    """Return the file of an imported module, for a message."""
+    path = getattr(module, "__file__", None)
+    return shown_path(path) if path else f"the module {module.__name__} of Python"
+
+
+def hidden_file(module: ModuleType) -> str:
+    """Return the end of a message if a file of the working directory has an imported module's name but is another."""
+    name = f"{module.__name__}.py"
+    path = getattr(module, "__file__", None)
+    if not os.path.exists(name) or (path and os.path.exists(path) and os.path.samefile(path, name)):
+        return ""
+    return f"; it was imported in place of {name} of this folder: rename your file"
+
+
+def _of_file(path: Path, name: str) -> str:
+    """Return what to write in place of a file's path."""
+    if path.is_absolute() or ".." in path.parts:
+        return f"name the module, not its file: start in {path.parent} and write {path.stem}:{name}"
+    return f"name the module, not its file: write {'.'.join(path.with_suffix('').parts)}:{name}"
+
+
+def _import_failure(name: str, error: ImportError) -> str:
+    """Return why a module cannot be imported: it is missing, or something that it imports is."""
+    missing = isinstance(error, ModuleNotFoundError) and error.name
+    if missing and f"{name}.".startswith(f"{error.name}."):
+        return f"cannot import {name} ({error}): install it, or start in the folder of {name}.py"
+    places = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
+    place = places[-1]
+    if missing:
+        return f"{shown_path(place.filename)} imports {error.name}, which is not installed"
+    return f"cannot import {name} ({shown_path(place.filename)}, line {place.lineno}: {error})"
 
 
 def module_of(value: str) -> str:

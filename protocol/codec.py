@@ -29,8 +29,9 @@ import zstandard
 from pydantic import ValidationError
 
 from daedalus.protocol import schema
-from daedalus.protocol.limits import Limits
+from daedalus.protocol.limits import LEARNER_LIMITS, Limits
 from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program
+from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import Gradient, Rollout
 
 PROTOCOL_VERSION = 9
@@ -47,10 +48,14 @@ _LEVEL, _BYTES_LEVEL = (
     1,
 )  # zstd levels: the faster one, for floats, would leave pixels and byte planes twice as large
 _MAX_DIMENSIONS = 8
+_MAX_DESCRIBED = 100  # faults of a model; pydantic describes all or none, and a hostile header has 60,000
 
 
 class ProtocolError(Exception):
-    """The bytes are not an acceptable message: a fault of the sender."""
+    """The bytes are not an acceptable message: a fault of the sender. The reason may quote it, so it is bounded."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(bounded_text(reason))
 
 
 class VersionMismatchError(ProtocolError):
@@ -67,7 +72,8 @@ class VersionMismatchError(ProtocolError):
 def encode(message: Message) -> bytes:
     """Encode a message.
 
-    Raises ValueError for an array whose dtype the protocol does not support: a fault of the caller.
+    Raises ValueError for an array whose dtype the protocol does not support, and for a header that no reader accepts:
+    faults of the caller.
     """
     arrays: list[tuple[str, np.ndarray]] = []
     fields = schema.pack(message, "", arrays)
@@ -79,6 +85,11 @@ def encode(message: Message) -> bytes:
         "size": len(body),
     }
     header = cast(bytes, msgpack.packb(content))
+    if len(header) > LEARNER_LIMITS.max_header_bytes:
+        raise ValueError(
+            f"the header of a {type(message).__name__} has {len(header):,} bytes, "
+            f"readers accept {LEARNER_LIMITS.max_header_bytes:,}"
+        )
     flags = _PLAIN
     if isinstance(message, _COMPRESSED) and body:
         in_bytes = isinstance(message, (CompactSnapshot, Gradient)) or any(
@@ -108,7 +119,7 @@ def decode(data: bytes, limits: Limits) -> Message:
     try:
         message = schema.unpack(_KINDS[kind], fields, "", buffers)
     except ValidationError as error:
-        raise ProtocolError(f"{kind}: {error.errors()[0]['msg']}") from None
+        raise ProtocolError(f"{kind}: {_first_fault(error)}") from None
     except ValueError as error:
         raise ProtocolError(f"{kind}: {error}") from None
     if buffers:
@@ -188,6 +199,13 @@ def _read_header(header: bytes) -> tuple[str, dict[str, Any], list[Any], int]:
     if not isinstance(fields, dict) or not isinstance(arrays, list) or type(size) is not int or size < 0:
         raise ProtocolError("the header's fields, arrays or size have the wrong type")
     return kind, fields, arrays, size
+
+
+def _first_fault(error: ValidationError) -> str:
+    count = error.error_count()
+    if count > _MAX_DESCRIBED:
+        return f"{count:,} values are not valid"
+    return error.errors()[0]["msg"]
 
 
 class _Entry(NamedTuple):

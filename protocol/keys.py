@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_MAX_SHOWN = 80  # characters of an invalid name, which may come from a peer
 
 ANY_RUN = "*"
 
@@ -18,7 +19,8 @@ def check_name(name: str, what: str) -> str:
     """Return `name` if it can be one chunk of a key. Raises ValueError, which names `what` it is, otherwise."""
     if not is_name(name):
         raise ValueError(
-            f"{what} {name!r} must be 1 to 64 letters, digits, '.', '_' or '-', starting with a letter or digit"
+            f"{what} {name[:_MAX_SHOWN]!r} must be 1 to 64 letters, digits, '.', '_' or '-', starting with a letter or "
+            "digit"
         )
     return name
 

@@ -120,7 +120,7 @@ class SnapshotRequest:
     If `compact` is false, the answer is the newest Snapshot, or a Refusal `not_ready` if the actor holds it.
     If `compact` is true, the answer is one part of a CompactSnapshot, for a slow link. The request for part 0 makes the
     learner encode its newest snapshot as differences to `held_version`; the requests for the other parts give the
-    policy version of that snapshot.
+    policy version of that snapshot, and the same `held_version`.
     """
 
     actor: str

@@ -6,7 +6,7 @@ The environment's nested spaces are flattened to components, and actions back (a
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import FailFast, Field, StringConstraints, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
@@ -35,7 +35,7 @@ class ArraySpace(Specification):
     """
 
     kind: Literal["array"] = "array"
-    shape: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=4)]  # of one frame
+    shape: Annotated[tuple[PositiveInt, ...], Field(min_length=1, max_length=4), FailFast()]  # of one frame
     dtype: Literal["float32", "uint8"]
     frames: Annotated[int, Field(ge=1, le=16)] = 1
 
@@ -80,7 +80,9 @@ class DiscreteSpace(Specification):
     """
 
     kind: Literal["discrete"] = "discrete"
-    counts: Annotated[tuple[Annotated[int, Field(ge=1, le=_MAX_CHOICES)], ...], Field(min_length=1, max_length=4096)]
+    counts: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=_MAX_CHOICES)], ...], Field(min_length=1, max_length=4096), FailFast()
+    ]
     masked: bool = False  # an action space whose legal choices come with each observation
 
     @model_validator(mode="after")
@@ -135,8 +137,8 @@ class ContinuousSpace(Specification):
     """
 
     kind: Literal["continuous"] = "continuous"
-    low: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096)]
-    high: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096)]
+    low: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096), FailFast()]
+    high: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096), FailFast()]
 
     @model_validator(mode="after")
     def _bounds_agree(self) -> "ContinuousSpace":

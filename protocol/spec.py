@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from daedalus.protocol.algorithms import ALGORITHMS, AlgorithmRecord, Epsilons, check_algorithm, is_own
 from daedalus.protocol.spaces import ComponentName
+from daedalus.protocol.spec_size import check_size
 from daedalus.protocol.specification import NaturalInt, PositiveInt, Specification, UnitInterval
 
 Backend = Literal["gymnasium", "envpool", "ale", "fast"]
@@ -260,11 +261,16 @@ class TrainingSpec(Specification):
         """Whether an actor may take random actions besides those of its policy."""
         return max(self.epsilons) > 0.0
 
-    def exploration_annealing(self, progress: float) -> float:
-        """Return how much of epsilon's way from 1 to its final value is left, at a share of the budget: 1 to 0."""
-        steps = self.exploration_env_steps
-        share = self.record.exploration_share if steps is None else steps / self.env_steps
-        return max(1.0 - progress / share, 0.0) if share else 0.0
+    def exploration_annealing(self, progress: float, env_steps: int) -> float:
+        """Return how much of epsilon's way from 1 to its final value is left, from 1 to 0.
+
+        `progress` is the share of the budget that is used (learner/run/annealing.py), and `env_steps` their number.
+        """
+        if self.exploration_env_steps is None:
+            used, end = progress, self.record.exploration_share
+        else:
+            used, end = env_steps, self.exploration_env_steps
+        return max(1.0 - used / end, 0.0) if end else 0.0
 
     @property
     def updates_per_batch(self) -> int:
@@ -330,6 +336,11 @@ class RunSpec(Specification):
     """Evaluator beside the actors."""
     service: ServiceSpec = ServiceSpec()
     """How the learner runs as a service."""
+
+    @model_validator(mode="after")
+    def _fits_one_message(self) -> "RunSpec":
+        check_size(self.model_dump(mode="json"))
+        return self
 
     @model_validator(mode="after")
     def _one_batch_fits_the_barrier(self) -> "RunSpec":

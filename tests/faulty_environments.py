@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from typing import Any
 
@@ -36,6 +37,8 @@ class Faulty(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
+        if self._fault == "second episode" and self._step:
+            raise ValueError("map 2 is missing")
         self._step = 0
         return self._observe() if self._fault == "reset" else (self._observe(), {})
 
@@ -46,14 +49,48 @@ class Faulty(gymnasium.Env[Any, Any]):
             os._exit(7)
         if self._fault == "error":
             return {}["missing"]
+        if self._fault == "exit":
+            sys.exit(0)
+        if self._fault == "error of a class of its own":
+            raise _SimulatorError(3, "no contact")
+        if self._fault == "error in a function":
+            _connect()
         reward: Any = np.nan if self._fault == "reward" and self._step == 3 else 1.0
-        result = self._observe(), reward, int(over) if self._fault == "flag" else over, False, {}
+        info: Any = _odd_info(self._step) if self._fault == "info" else {}
+        result = self._observe(), reward, int(over) if self._fault == "flag" else over, False, info
         return result[:4] if self._fault == "values" else result
 
     def close(self) -> None:
         if self._fault == "close" and self._step:  # a signal that it handles does not end it, either
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             time.sleep(3600)
+
+
+class _SimulatorError(Exception):
+    """Error that cannot be unpickled: its arguments are not those of its constructor."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(f"{text} (code {code})")
+
+
+def _connect() -> None:
+    raise ConnectionError("no simulator")
+
+
+def _odd_info(step: int) -> dict[Any, Any]:
+    """Return entries that gymnasium cannot batch or that cannot leave a process, besides `length` and `hash`."""
+    odd = {1: 4, "huge": 10**400, "text or number": "a" if step % 2 else 1.0, "shape": np.zeros(step), "f": lambda: 1}
+    return {**odd, "nested": {2: 3}, "length": step, "hash": 2**63 + 5}
+
+
+class _WithFailingStep(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def step(self, action: Any) -> Any:
+        raise RuntimeError("the wrapper fails")
+
+
+def with_failing_step(environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """Return the environment in a wrapper that raises an exception in `step`."""
+    return _WithFailingStep(environment)
 
 
 gymnasium.register("Faulty-v0", lambda **kwargs: Faulty(**kwargs))

@@ -25,7 +25,7 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import play_episodes
 from daedalus.cli.commands.evaluate import main as evaluate_command
 from daedalus.policy.acting.runtime import OnnxRuntime
-from daedalus.policy.saving.saved_policy import NoPolicyError, find_policy, pretrained
+from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -145,7 +145,9 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
         ({}, "name a preset"),
         ({"preset": "cartpole", "settings": {"seed": 1}}, "settings 'seed': 'seed' has no section"),
         ({"preset": "cartpole", "settings": {"training.sed": 1}}, "unknown setting training.sed: did you mean seed"),
-        ({"preset": "cartpole", "run_dir": "."}, "run directory . exists"),
+        ({"preset": "cartpole", "run_dir": "."}, "run directory . is not empty"),
+        ({"preset": Path("absent.toml")}, "absent.toml: No such file"),
+        ({"preset": "cartpole", "init_from": "nowhere"}, "--init-from: nowhere does not exist"),
         ({"preset": "cartpole", "log": "tensorboard"}, "log: unknown tracker 'tensorboard': choose from wandb, mlflow"),
         ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
     ],
@@ -154,6 +156,31 @@ def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(daedalus.SettingsError) as refused:
         daedalus.train(**arguments)
     assert str(refused.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"env": gymnasium.make("CartPole-v1")},
+            'env must be the id of a registered environment, such as "CartPole-v1"',
+        ),
+        (
+            {"preset": gymnasium.make("CartPole-v1")},
+            'env must be the id of a registered environment, such as "CartPole-v1"',
+        ),
+        ({"preset": "cartpole", "callback": print}, "callback must be an instance of a subclass of daedalus.Callback"),
+        (
+            {"preset": "cartpole", "callback": daedalus.Callback},
+            "callback must be an instance of a subclass of daedalus.Callback",
+        ),
+    ],
+)
+def test_objects_of_other_types_are_refused(arguments: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TypeError) as refused:
+        daedalus.train(**arguments, run_dir=tmp_path / "run")
+    assert str(refused.value).startswith(message)
+    assert not (tmp_path / "run").exists()
 
 
 def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:
@@ -326,8 +353,11 @@ def test_invalid_arguments_of_load_policy_and_act_are_refused(tmp_path: Path) ->
         daedalus.load_policy()
     with pytest.raises(ValueError, match="both observation_space and action_space"):
         daedalus.load_policy(tmp_path, action_space=gymnasium.spaces.Discrete(2))
-    with pytest.raises(NoPolicyError, match="no pretrained policy 'car_race'"):
+    with pytest.raises(daedalus.NoPolicyError, match="no pretrained policy 'car_race'"):
         daedalus.load_policy(pretrained="car_race")
+    for read in (daedalus.load_policy, daedalus.evaluate):
+        with pytest.raises(daedalus.NoPolicyError, match="nowhere does not exist"):
+            read(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="has shape"):
         daedalus.load_policy(tmp_path).act(np.zeros(5))
 

@@ -45,6 +45,12 @@ def test_a_package_imports_only_the_allowed_packages(package: str) -> None:
         assert ours <= ALLOWED[package], path
 
 
+def test_collecting_rollouts_needs_no_session() -> None:
+    """The session uses the collectors; an import in the other direction would make the two packages one."""
+    for path, tree in sources("actor/collecting"):
+        assert not [name for name in imported(tree) if name.startswith("daedalus.actor.session")], path
+
+
 def test_no_file_imports_a_package_by_its_folder() -> None:
     """A package that is imported by the name of its folder would exist twice, and other packages may have that name."""
     for folder in (*PACKAGES, "tests", "benchmarks", "examples"):
@@ -55,7 +61,14 @@ def test_no_file_imports_a_package_by_its_folder() -> None:
 
 def test_only_the_zenoh_files_of_the_transport_import_zenoh() -> None:
     users = {path.name for package in PACKAGES for path, tree in sources(package) if "zenoh" in imported(tree)}
-    assert users == {"zenoh_transport.py", "zenoh_session.py", "zenoh_callbacks.py", "zenoh_messages.py"}
+    assert users == {
+        "zenoh_transport.py",
+        "zenoh_session.py",
+        "zenoh_callbacks.py",
+        "zenoh_messages.py",
+        "zenoh_declarations.py",
+        "zenoh_senders.py",
+    }
 
 
 @pytest.mark.parametrize("package", PACKAGES)

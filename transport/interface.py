@@ -95,7 +95,8 @@ class Transport(Protocol):
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         """Send a query without waiting.
 
-        `on_answer` is called exactly once: with the first answer, or with None after `timeout` seconds.
+        `on_answer` is called exactly once: with the first answer, or with None after `timeout` seconds. It is not
+        called if this method raises.
         """
         ...
 

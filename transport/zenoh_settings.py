@@ -98,6 +98,8 @@ def _small_queries() -> list[dict[str, Any]]:
             keys.snapshots("*"),
             keys.status("*"),
             keys.drain("*", "*"),
+            keys.reports("*", "*"),
+            keys.orders("*"),
         ),
         rule("evaluations", EVALUATION_LIMITS.message_bytes, keys.evaluations("*", "*")),
     ]

@@ -21,14 +21,15 @@ from daedalus.transport.credentials_watch import CredentialsWatch
 from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request, Transport, TransportError
 from daedalus.transport.linger import linger_removal
 from daedalus.transport.zenoh_callbacks import Callbacks
+from daedalus.transport.zenoh_declarations import Declarations, Declared
 from daedalus.transport.zenoh_messages import ZenohInbox, ZenohPresence, ZenohRequest
+from daedalus.transport.zenoh_senders import Senders
 from daedalus.transport.zenoh_session import OpenSession, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
 
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
-_MAX_QUERIERS = 2048  # kept for further queries; a process may ask under many names
 _RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
 
@@ -96,17 +97,14 @@ class ZenohTransport:
         self._is_client = is_client
         self._session = open_session()
         self._closed = self._warned_of_size = False
-        # Each declaration, to be repeated in a new session, and the object that it returned in the present session:
-        # Zenoh undeclares that object when it is garbage-collected.
-        self._declared: dict[Callable[[zenoh.Session], object], object] = {}
-        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._declarations = Declarations(self._session)
+        self._senders = Senders(self._session)
         self._lock = threading.Lock()
         self._callbacks = Callbacks()
         self._watch: CredentialsWatch | None = None
-        self._declare(self._listener_of_connections)
+        self._declarations.add(self._listener_of_connections)
 
-    def _listener_of_connections(self, session: zenoh.Session) -> object:
+    def _listener_of_connections(self, session: zenoh.Session) -> Declared:
         callback = self._callbacks.hold(linger_removal().connections_changed)
         return session.info.declare_link_events_listener(callback, history=True)
 
@@ -125,10 +123,9 @@ class ZenohTransport:
             handler(ZenohRequest(query, key))
 
         with _as_transport_error(f"serve {key}"):
-            self._declare(lambda session: session.declare_queryable(key, self._callbacks.hold(on_query), complete=True))
-
-    def _declare(self, declaration: Callable[[zenoh.Session], object]) -> None:
-        self._declared[declaration] = declaration(self._session)
+            self._declarations.add(
+                lambda session: session.declare_queryable(key, self._callbacks.hold(on_query), complete=True)
+            )
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """See Transport."""
@@ -138,26 +135,23 @@ class ZenohTransport:
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
         """See Transport."""
         first: list[bytes] = []
+        ended = threading.Lock()  # acquired by the first to report the end: Zenoh's thread, or the error raised here
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None and not first:
                 first.append(reply.ok.payload.to_bytes())
 
         def on_end() -> None:
-            on_answer(first[0] if first else None)
+            if ended.acquire(blocking=False):
+                on_answer(first[0] if first else None)
 
         with _as_transport_error(f"query {key}"):
-            self._querier(key, timeout).get(self._callbacks.hold(on_reply, on_end), payload=payload)
-
-    def _querier(self, key: str, timeout: float) -> zenoh.Querier:
-        with self._lock:
-            querier = self._queriers.pop((key, timeout), None)
-            if querier is None:
-                if len(self._queriers) >= _MAX_QUERIERS:
-                    self._queriers.pop(next(iter(self._queriers)))
-                querier = self._session.declare_querier(key, timeout=timeout, express=True)
-            self._queriers[key, timeout] = querier  # the last one used is the last
-            return querier
+            querier = self._senders.querier(key, timeout)
+            try:
+                querier.get(self._callbacks.hold(on_reply, on_end), payload=payload)
+            except zenoh.ZError:  # Zenoh then releases the callback too, on another thread
+                if ended.acquire(blocking=False):
+                    raise
 
     def publish(self, key: str, payload: bytes) -> None:
         """See Transport."""
@@ -170,20 +164,7 @@ class ZenohTransport:
                 MAX_MESSAGE_BYTES >> 20,
             )
         with _as_transport_error(f"publish {key}"):
-            self._publisher(key).put(payload)
-
-    def _publisher(self, key: str) -> zenoh.Publisher:
-        with self._lock:
-            publisher = self._publishers.get(key)
-            if publisher is None:
-                publisher = self._session.declare_publisher(
-                    key,
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    priority=zenoh.Priority.DATA_HIGH,
-                    express=True,
-                )
-                self._publishers[key] = publisher
-            return publisher
+            self._senders.publisher(key).put(payload)
 
     def subscribe(self, key: str, on_news: Callable[[], None]) -> Inbox:
         """See Transport."""
@@ -193,29 +174,23 @@ class ZenohTransport:
             inbox.put(sample.payload)
             on_news()
 
-        def declaration(session: zenoh.Session) -> object:
+        def declare(session: zenoh.Session) -> Declared:
             return session.declare_subscriber(key, self._callbacks.hold(on_sample))
 
         with _as_transport_error(f"subscribe to {key}"):
-            self._declare(declaration)
-        inbox.undeclare = lambda: self._undeclare(declaration)
+            self._declarations.add(declare)
+        inbox.undeclare = lambda: self._declarations.remove(declare)
         return inbox
-
-    def _undeclare(self, declaration: Callable[[zenoh.Session], object]) -> None:
-        declared = self._declared.pop(declaration, None)
-        if isinstance(declared, (zenoh.Subscriber, zenoh.LivelinessToken)):
-            with contextlib.suppress(zenoh.ZError):  # its session was closed, and the declaration with it
-                declared.undeclare()
 
     def declare_presence(self, key: str) -> Declaration:
         """See Transport."""
 
-        def declaration(session: zenoh.Session) -> object:
+        def declare(session: zenoh.Session) -> Declared:
             return session.liveliness().declare_token(key)
 
         with _as_transport_error(f"declare presence under {key}"):
-            self._declare(declaration)
-        return ZenohPresence(lambda: self._undeclare(declaration))
+            self._declarations.add(declare)
+        return ZenohPresence(lambda: self._declarations.remove(declare))
 
     def watch_presence(self, key: str, on_change: Callable[[str, bool], None]) -> None:
         """See Transport."""
@@ -226,14 +201,16 @@ class ZenohTransport:
             (present.add if is_there else present.discard)(name)
             on_change(name, is_there)
 
-        def declaration(session: zenoh.Session) -> object:
-            while present:  # as the previous session saw it: the new subscriber reports again what is still present
-                on_change(present.pop(), False)
+        def declare(session: zenoh.Session) -> Declared:
+            # As the previous session saw it: the new subscriber reports again what is still present.
+            for name in list(present):
+                present.discard(name)
+                on_change(name, False)
             # Without history the subscriber sometimes misses a token that is declared just after it.
             return session.liveliness().declare_subscriber(key, self._callbacks.hold(on_sample), history=True)
 
         with _as_transport_error(f"watch presence under {key}"):
-            self._declare(declaration)
+            self._declarations.add(declare)
 
     def reopen(self, unless_served: str | None = None) -> bool:
         """See Transport. A router is never reopened: its address would still be in use by itself."""
@@ -284,12 +261,9 @@ class ZenohTransport:
             if self._closed:
                 session.close()
                 return False
-            previous, self._session = self._session, session
-            self._queriers.clear()
-            self._publishers.clear()
-        previous.close()
+            self._session, self._senders = session, Senders(session)
         with _as_transport_error("repeat the declarations"):
-            self._declared = {declaration: declaration(session) for declaration in list(self._declared)}
+            self._declarations.move_to(session)
         return True
 
     def close(self) -> None:

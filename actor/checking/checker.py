@@ -45,7 +45,7 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
             _play_legally(environment)
             check_env(environment, skip_render_check=True)
             failed = ()
-        except Exception as error:  # of its assertions, or of the user's code
+        except (Exception, SystemExit) as error:  # of its assertions, or of the user's code
             failed = (f"gymnasium's checker: {first_line(error)}",)
         finally:
             environment.close()

@@ -17,6 +17,7 @@ from daedalus.actor.checking.violations import Violation, reset_violations, step
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.environments.user_code import place_of
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -42,7 +43,7 @@ def check_environment(
     try:
         environment, rest = make_one(spec, modules)
     except EnvironmentSetupError as error:
-        return EnvironmentReport(problems=(f"{error}{_place(error.__cause__)}",))
+        return EnvironmentReport(problems=(str(error),))
     try:
         mask = _first_mask(environment, seed)
         texts = Texts(environment.observation_space, rest.leave_out)
@@ -158,9 +159,11 @@ class _Play:
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:
             return getattr(self._environment, method)(*arguments, **keywords)
+        except EnvironmentSetupError:  # of a vector environment, or of the transforms
+            raise
         except (Exception, SystemExit) as error:  # of the user's code
             wrong = self._structure_of(method, arguments, keywords) if isinstance(error, TypeError | ValueError) else ""
-            raise _ProblemError(wrong or f"{method} raises {first_line(error)}{_place(error)}") from None
+            raise _ProblemError(wrong or f"{method} raises {first_line(error)}{place_of(error)}") from None
 
     def _structure_of(self, method: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> str:
         """Return the problem if a wrapper failed because the environment returns the wrong number of values."""
@@ -180,14 +183,3 @@ class _Play:
                 raise _ProblemError(f"{text} ({when})")
             without_numbers = re.sub(r"-?\d[\d.e+-]*", "", text)
             self._warnings.setdefault(without_numbers, f"{text} ({when})")
-
-
-def _place(error: BaseException | None) -> str:
-    """Return the line of the user's code where an error was raised, or an empty string."""
-    place, traceback = "", error.__traceback__ if error is not None else None
-    while traceback is not None:
-        module = traceback.tb_frame.f_globals.get("__name__", "")
-        if module.partition(".")[0] not in ("daedalus", "gymnasium", "importlib", "numpy"):
-            place = f" ({traceback.tb_frame.f_code.co_filename}, line {traceback.tb_lineno})"
-        traceback = traceback.tb_next
-    return place

@@ -99,12 +99,13 @@ class ClientAgent:
 
     def _switch_policy(self) -> None:
         """Continue with a policy that has begun meanwhile; drop the unfinished rollout of the previous one."""
-        rows = self._exchange.next_rows(self._index)
-        if rows is None:
+        begun = self._exchange.next_rows(self._index)
+        if begun is None:
             return
         if self._rows is not None and not self._rows.is_between_rollouts:
             self._exchange.drop()
-        self._rows, self._loaded = rows, None
+        self._rows, self._loaded = begun
+        self._rows.use(self._loaded.runtime)
 
     def _load_newest(self, rows: ClientRows) -> None:
         """Let the newest weights act."""

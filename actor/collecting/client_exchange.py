@@ -31,8 +31,10 @@ class ClientExchange:
         self._lock = threading.Lock()  # guards everything below
         self._dropped = 0
         self._together = False  # the agents' rollouts are sent as one
-        self._next_rows: list[ClientRows | None] = [None] * agents  # of a policy that has begun, and does not act yet
-        self._newest: LoadedPolicy | None = None
+        self._begun: list[ClientRows] = []  # by agent, under a policy that has begun and has no weights yet
+        self._newest: LoadedPolicy | None = None  # None before the weights of the policy that has begun
+        # By agent: a policy that can act, and the first rows under it. None once the agent acts with it.
+        self._next: list[tuple[ClientRows, LoadedPolicy] | None] = [None] * agents
         self._confirmed_at = -math.inf  # the monotonic time at which the newest policy was the learner's newest
         self._may_begin = [True] * agents  # whether the agent's next row may begin a rollout
         self._parts: dict[int, Rollout] = {}  # full rollouts by agent, while they wait for those of the others
@@ -52,8 +54,7 @@ class ClientExchange:
         service has asked for it.
         """
         with self._lock:
-            self._next_rows[:] = rows
-            self._newest, self._together = None, together
+            self._begun, self._newest, self._together = rows, None, together
             self._may_begin = [not together] * self._agents
             self._dropped += len(self._full) + len(self._parts)
             self._full.clear()
@@ -63,6 +64,9 @@ class ClientExchange:
         """Let newer weights act."""
         with self._lock:
             self._newest = policy
+            if self._begun:
+                self._next = [(rows, policy) for rows in self._begun]
+                self._begun = []
 
     def confirm(self, at: float) -> None:
         """Note that the newest policy was the learner's newest at a monotonic time, in seconds."""
@@ -83,18 +87,16 @@ class ClientExchange:
 
     # --------------------------------------------------------------------------------- for the caller's thread
 
-    def next_rows(self, agent: int) -> ClientRows | None:
+    def next_rows(self, agent: int) -> tuple[ClientRows, LoadedPolicy] | None:
         """Return, once, the agent's rows under a policy that has begun meanwhile, if it can act by now."""
         with self._lock:
-            if self._newest is None:
-                return None
-            rows, self._next_rows[agent] = self._next_rows[agent], None
-            return rows
+            found, self._next[agent] = self._next[agent], None
+            return found
 
     def newest_policy(self, agent: int) -> LoadedPolicy | None:
         """Return the newest weights; None if they are of a policy that begins, and not for the rows in use."""
         with self._lock:
-            return None if self._next_rows[agent] is not None else self._newest
+            return self._newest if self._next[agent] is None else None
 
     def policy_age(self) -> float:
         """Return the seconds since the newest policy was last known to be the learner's newest."""
@@ -114,7 +116,7 @@ class ClientExchange:
     def keep(self, agent: int, rollout: Rollout) -> None:
         """Keep a full rollout of an agent for the service, unless its policy is that of a previous learner."""
         with self._lock:
-            if self._next_rows[agent] is not None:
+            if self._newest is None or self._next[agent] is not None:
                 self._dropped += 1
             elif self._together:
                 self._keep_part(agent, rollout)

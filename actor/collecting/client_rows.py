@@ -8,7 +8,7 @@ import numpy as np
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
@@ -65,10 +65,11 @@ class ClientRows:
         """Let a runtime with other weights choose the actions. Call only between rollouts."""
         self._writer.use(runtime)
 
-    def observe(self, observation: Any, action_mask: Any = None) -> None:
+    def observe(self, observation: Any, action_mask: Any = None, reward: float = 0.0) -> None:
         """Note an observation to act on, which the last action, or the last episode's end, led to.
 
-        Raises ValueError if the observation or the mask does not fit the spaces; nothing has changed then.
+        Adds `reward`, if there is one, to the reward of the last action. Raises ValueError if the observation, the mask
+        or the reward does not fit; nothing has changed then.
         """
         if action_mask is None and self._example_mask is not None:
             raise ValueError("this client was constructed with an action_mask: pass one to every act()")
@@ -78,6 +79,8 @@ class ClientRows:
                 "would choose illegal actions"
             )
         observed = self._transforms.observe_one(observation, action_mask, needed=True)
+        if reward:
+            self.reward(reward)
         self.complete_episode()
         if self._last is None:
             self._writer.start(observed)

@@ -64,6 +64,7 @@ class RolloutWriter:
         self._runtime = runtime
         self._reward_clip, self._reward_scale = spec.reward_clip, np.float32(spec.reward_scale)
         self._bootstrap_terminations = spec.bootstrap_terminations
+        self._gives_up = spec.no_reward_limit is not None  # otherwise both flags are a termination at the time limit
         self._random, self._count = random, count
         self._epsilon = np.full((count, 1), epsilon, np.float32)
         self._episodes = EpisodeCounter(count)
@@ -185,7 +186,7 @@ class RolloutWriter:
             self._rewards.clip(-self._reward_clip, self._reward_clip, out=self._rewards)
         self._rewards *= self._reward_scale
         if self._bootstrap_terminations:
-            given_up = self._terminated & self._truncated  # by no_reward_limit
+            given_up = self._terminated & self._truncated & self._gives_up
             self._truncated |= self._terminated
             self._terminated[:] = given_up
         finished = self._episodes.take_finished()

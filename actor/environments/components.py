@@ -29,7 +29,7 @@ def unsupported(kind: str, leaf: Leaf) -> EnvironmentSetupError:
     where = f" (component {leaf.name!r})" if leaf.path else ""
     remedy = "use Box, Discrete, MultiDiscrete or MultiBinary, or a Dict or Tuple of these"
     if isinstance(leaf.space, gym.Box | gym.MultiBinary):
-        axes = f"with one to {_MAX_DIMENSIONS} axes" if kind == "observation" else "of numbers"
+        axes = f"with at most {_MAX_DIMENSIONS} axes" if kind == "observation" else "of numbers"
         remedy = f"use an array {axes} that is not empty"
     if kind == "observation" and leaf.path:
         remedy += f"; or leave the component out: --set \"environment.leave_out=['{leaf.name}']\""

@@ -1,16 +1,25 @@
-"""Errors of environments that cannot be created, each with a message of one line that says what to do."""
+"""Errors of environments that cannot be created or played, each with a message of one line that says what to do."""
 
 import difflib
 import importlib
+import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
+
+from daedalus.actor.environments.user_code import frames_of, is_of_user, place_of
+from daedalus.policy.user_modules import file_of, hidden_file
+
+_logger = logging.getLogger(__name__)
 
 OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
 _MOST_CHARACTERS = 160  # of a space in a message
+_MOST_NAMES = 5  # of environments in a message
+_CLOSE = 0.7  # similarity of two names that could be meant for each other
 
 
 class EnvironmentSetupError(Exception):
@@ -33,9 +42,40 @@ def reason_of(error: ValidationError) -> str:
 
 def unknown_environment(name: str, known: Collection[str], otherwise: str) -> EnvironmentSetupError:
     """Return an error that suggests the known names closest to `name`, or says `otherwise` if none is close."""
-    near = difflib.get_close_matches(name, known, 3, 0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else otherwise
-    return EnvironmentSetupError(f"unknown environment {name!r}: {hint}")
+    return EnvironmentSetupError(f"unknown environment {name!r}: {_suggestion(name, known) or otherwise}")
+
+
+def unknown_to_gymnasium(name: str) -> EnvironmentSetupError:
+    """Return the error for an id without a module that nothing has registered."""
+    own = f"if it is your own, write module:{name}, with the module that registers it"
+    near = _suggestion(name, gymnasium.registry)
+    return EnvironmentSetupError(f"unknown environment {name!r}: {f'{near} Or, {own}' if near else own}")
+
+
+def not_registered(name: str, module: ModuleType) -> EnvironmentSetupError:
+    """Return the error for a module that registers no environment `name`; it suggests one that the module registers."""
+    prefix = f"{module.__name__}:"
+    own = [each.id for each in gymnasium.registry.values() if _is_of(each, module.__name__)]
+    few = f"it registers {', '.join(prefix + each for each in own[:_MOST_NAMES])}" if own else ""
+    hint = _suggestion(name, own, prefix) or few + (" and others" if len(own) > _MOST_NAMES else "")
+    return EnvironmentSetupError(
+        f"unknown environment {prefix + name!r}: {file_of(module)} registers no {name}{'; ' if hint else ''}{hint}"
+        f"{hidden_file(module)}"
+    )
+
+
+def _is_of(registered: EnvSpec, module: str) -> bool:
+    """Return whether the class of a registered environment lies in a module."""
+    entry = registered.entry_point
+    place = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    return f"{place}.".startswith(f"{module}.")
+
+
+def _suggestion(name: str, known: Collection[str], prefix: str = "") -> str:
+    """Return a question that names the known names closest to `name`, with a prefix, or an empty string."""
+    by_lower = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(name.lower(), by_lower, 3, _CLOSE)
+    return f"did you mean {' or '.join(prefix + by_lower[each] for each in near)}?" if near else ""
 
 
 def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> ModuleType:
@@ -71,8 +111,31 @@ def creation_errors(environment: str) -> Iterator[None]:
         raise EnvironmentSetupError(
             f"environment {environment} needs a package that is not installed: {remedy}"
         ) from None
-    except Exception as error:  # broad: the constructor of a user's environment may raise anything
-        raise EnvironmentSetupError(f"environment {environment} cannot be created: {first_line(error)}") from error
+    except (Exception, SystemExit) as error:  # broad: the constructor of a user's environment may raise anything
+        raise EnvironmentSetupError(
+            f"environment {environment} cannot be created: {first_line(error)}{place_of(error)}"
+        ) from error
+
+
+def playing_error(environment: str, call: str, error: BaseException) -> EnvironmentSetupError:
+    """Return the error for an exception that an environment raised while it played.
+
+    The message has one line. Where the exception passed several functions of the user, that line does not explain it:
+    the traceback of the user's part is then logged.
+
+    Args:
+      environment: its id.
+      call: the method that was called, `reset` or `step`. A vector environment resets in its `step`, too.
+      error: the exception, caught where the call was made.
+    """
+    for frame in frames_of(error):
+        if frame.tb_frame.f_code.co_name in ("reset", "step"):
+            call = frame.tb_frame.f_code.co_name
+        if is_of_user(frame):
+            if frame.tb_next is not None or error.__cause__ is not None:
+                _logger.error("environment %s: %s failed", environment, call, exc_info=(type(error), error, frame))
+            break
+    return EnvironmentSetupError(f"environment {environment}: {call} raises {first_line(error)}{place_of(error)}")
 
 
 def described(space: object) -> str:

@@ -1,19 +1,73 @@
 """Environments in separate processes: gymnasium's AsyncVectorEnv with a safe start and end."""
 
+import multiprocessing.connection
+import multiprocessing.resource_tracker
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from dataclasses import dataclass
+from queue import Empty
+from typing import Any, SupportsFloat
 
 import gymnasium
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
+from daedalus.actor.environments.episode_info import info_to_keep
 
 _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
+_DEATH_SECONDS = 2.0  # from the end of a process's pipe to its exit status
+_ERROR_SECONDS = 10.0  # from the answer of a process that failed to its error
+
+_Stepped = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
+
+
+class OfItsOwnProcess(gymnasium.Wrapper):
+    """A wrapper with results that can leave a process: errors without objects of the user, and the `info` that is read.
+
+    gymnasium would wait for ever for an exception that cannot be pickled.
+    """
+
+    def __init__(self, environment: gymnasium.Env, name: str) -> None:
+        """Construct from the environment and its id."""
+        super().__init__(environment)
+        self._name = name
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env. Raises EnvironmentSetupError for anything that the environment raises."""
+        with self._errors("reset"):
+            observation, info = self.env.reset(seed=seed, options=options)
+            return observation, info_to_keep(info, ended=False)
+
+    def step(self, action: Any) -> _Stepped:
+        """See gymnasium.Env. Raises EnvironmentSetupError for anything that the environment raises."""
+        with self._errors("step"):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            ended = bool(terminated or truncated)
+            return observation, reward, terminated, truncated, info_to_keep(info, ended=ended)
+
+    @contextmanager
+    def _errors(self, call: str) -> Iterator[None]:
+        try:
+            yield
+        except EnvironmentSetupError as error:
+            raise EnvironmentSetupError(str(error)) from None
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise EnvironmentSetupError(str(playing_error(self._name, call, error))) from None
+
+
+@dataclass(frozen=True, slots=True)
+class _Maker:
+    """A picklable function that creates one environment in a process of its own."""
+
+    name: str
+    make: Callable[[], gymnasium.Env]
+
+    def __call__(self) -> gymnasium.Env:
+        return OfItsOwnProcess(self.make(), self.name)
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
@@ -21,24 +75,42 @@ class EnvironmentProcesses(AsyncVectorEnv):
 
     _idle = False  # no call is in progress, so the processes can be asked to end
 
-    def __init__(self, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
-        # Zenoh does not work after a fork.
-        options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
+    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
+        """Start the processes.
+
+        Args:
+          name: id of the environments, for errors.
+          makers: picklable functions, each of which creates one environment.
+
+        Raises EnvironmentSetupError if a process dies, and whatever the first environment raises.
+        """
+        self._name = name
+        wrapped = [_Maker(name, maker) for maker in makers]
         with _interrupts_blocked():
             try:
-                super().__init__(makers, **options)
-            except ValueError as error:
-                if not isinstance(error.__cause__, CustomSpaceError):
-                    raise
-                super().__init__(makers, **options, shared_memory=False)  # such as a text of a class of its own
+                self._start(wrapped)
+            except (EOFError, ConnectionError):
+                error = self._death()
+                self.close(terminate=True)
+                raise error from None
         self._idle = True
 
+    def _start(self, makers: Sequence[_Maker]) -> None:
+        # Zenoh does not work after a fork.
+        options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
+        try:
+            super().__init__(makers, **options)
+        except ValueError as error:
+            if not isinstance(error.__cause__, CustomSpaceError):
+                raise
+            super().__init__(makers, **options, shared_memory=False)  # such as a text of a class of its own
+
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """See AsyncVectorEnv. Raises EnvironmentSetupError if a process has died."""
+        """See AsyncVectorEnv. Raises EnvironmentSetupError if an environment fails or its process has died."""
         return self._call(lambda: super(EnvironmentProcesses, self).reset(seed=seed, options=options))
 
     def step(self, actions: Any) -> Any:
-        """See AsyncVectorEnv. Raises EnvironmentSetupError if a process has died."""
+        """See AsyncVectorEnv. Raises EnvironmentSetupError if an environment fails or its process has died."""
         return self._call(lambda: super(EnvironmentProcesses, self).step(actions))
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
@@ -77,13 +149,37 @@ class EnvironmentProcesses(AsyncVectorEnv):
         try:
             result = call()
         except (EOFError, ConnectionError):
-            if None in self.parent_pipes:  # the environment's own error, sent by its process
-                raise
-            raise EnvironmentSetupError(
-                "the process of an environment has died: check whether it was killed, such as for lack of memory"
-            ) from None
+            raise self._death() from None
         self._idle = True
         return result
+
+    def _raise_if_errors(self, successes: Iterable[bool]) -> None:
+        """Raise the first error that a process sent. gymnasium would also print the traceback of each."""
+        if all(successes):
+            return
+        try:
+            _, _, error, _ = self.error_queue.get(timeout=_ERROR_SECONDS)
+        except Empty:
+            raise EnvironmentSetupError(
+                f"environment {self._name}: the process of an environment has failed, and could not say why"
+            ) from None
+        raise error
+
+    def _death(self) -> EnvironmentSetupError:
+        """Return the error of a process that has died, with its exit status."""
+        closed = multiprocessing.connection.wait([process.sentinel for process in self.processes], _DEATH_SECONDS)
+        for process in self.processes:
+            if process.sentinel in closed:
+                process.join(_DEATH_SECONDS)
+        status = next((process.exitcode for process in self.processes if process.exitcode is not None), None)
+        if status is None:
+            hint = ""
+        elif status == -getattr(signal, "SIGKILL", 9):
+            hint = " (signal 9): check whether it was killed for lack of memory"
+        else:
+            reason = f"signal {-status}" if status < 0 else f"status {status}"
+            hint = f" ({reason}): the environment or one of its libraries ended it; play it with `daedalus check`"
+        return EnvironmentSetupError(f"environment {self._name}: the process of an environment has died{hint}")
 
 
 @contextmanager
@@ -92,6 +188,7 @@ def _interrupts_blocked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    multiprocessing.resource_tracker.ensure_running()  # its start would unblock SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -98,8 +98,8 @@ class EnvpoolEnvironments:
         if self._no_reward_limit is not None:
             self._unrewarded = np.where((rewards > 0.0) | self._ended, 0, self._unrewarded + 1)
             ended = (self._unrewarded >= self._no_reward_limit) & ~terminated
+            truncated = (truncated & ~terminated) | ended
             terminated |= ended
-            truncated |= ended
         self._ended = terminated | truncated
         return frames, rewards, terminated, truncated
 

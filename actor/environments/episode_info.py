@@ -1,11 +1,45 @@
-"""Scalars that environments put into `info` at the end of an episode. State; no I/O."""
+"""What an actor reads of `info`: the masks, and the scalars at the end of an episode. State; no I/O."""
 
 from typing import Any
 
 import numpy as np
 
+from daedalus.actor.environments.masks import MASK_KEY
 from daedalus.protocol.keys import is_name
 from daedalus.protocol.uploads import MAX_INFO_NAMES, MAX_INFO_VALUES
+
+
+def info_to_keep(info: dict[Any, Any], *, ended: bool) -> dict[str, Any]:
+    """Return what an actor reads of the `info` of one environment: the masks, and the scalars if the episode ended.
+
+    gymnasium cannot batch other entries, such as numbers that are beyond an int64 or texts in some environments only,
+    and not every entry can leave the process of an environment.
+    """
+    kept: dict[str, Any] = {}
+    if ended:
+        for name, value in info.items():
+            scalar = _scalar(value) if _is_scalars_name(name) else None
+            if scalar is not None:
+                kept[name] = scalar
+    if MASK_KEY in info:
+        kept[MASK_KEY] = info[MASK_KEY]
+    return kept
+
+
+def _is_scalars_name(name: Any) -> bool:
+    return isinstance(name, str) and not name.startswith("_") and is_name(name)
+
+
+def _scalar(value: Any) -> float | None:
+    """Return a number or a bool as a float, or None for anything else."""
+    if isinstance(value, np.ndarray) and value.shape == ():
+        value = value[()]
+    if not isinstance(value, (int, float, np.integer, np.floating, np.bool_)):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
 
 
 class EpisodeInfo:
@@ -31,7 +65,7 @@ class EpisodeInfo:
             if not isinstance(values, np.ndarray) or values.shape != ended.shape or values.dtype.kind not in "biuf":
                 continue
             known = name in self._values or len(self._values) < MAX_INFO_NAMES
-            if not known or name.startswith("_") or not is_name(name):
+            if not known or not _is_scalars_name(name):
                 continue
             given = ended & info.get(f"_{name}", True)
             with np.errstate(over="ignore"):

@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     creation_errors,
-    first_line,
     import_extra,
-    unknown_environment,
+    not_registered,
+    unknown_to_gymnasium,
 )
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
@@ -49,18 +49,29 @@ class EnvironmentFactory:
         if self.render_mode == "rgb_array":
             render_without_display()
         late_rendered = registered.entry_point == _CAR_RACING and spec.wrap is None
-        environment = gymnasium.make(
-            _late_rendered(registered, spec.backend) if late_rendered else registered,
-            disable_env_checker=True,  # it costs a tenth of the speed, and warns only authors
-            **kwargs,
-        )
+        if late_rendered:
+            registered = _late_rendered(registered, spec.backend)
+        try:
+            # The checker costs a tenth of the speed, and warns only authors.
+            environment = gymnasium.make(registered, disable_env_checker=True, **kwargs)
+        except TypeError as error:
+            if self.render_mode is None or "keyword argument 'render_mode'" not in str(error):
+                raise
+            reason = "its constructor has no argument render_mode"
+            raise EnvironmentSetupError(
+                f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
+            ) from None
         if spec.wrap is not None:
             environment = _wrapped(environment, spec.wrap, self.modules)
         if environment.has_wrapper_attr("action_masks"):
             environment = MaskInInfo(environment)
         if spec.action_repeat > 1 or spec.no_reward_limit is not None or self.camera is not None:
             environment = RepeatedSteps(
-                environment, repeat=spec.action_repeat, no_reward_limit=spec.no_reward_limit, camera=self.camera
+                environment,
+                spec.id,
+                repeat=spec.action_repeat,
+                no_reward_limit=spec.no_reward_limit,
+                camera=self.camera,
             )
         if late_rendered:
             from daedalus.actor.environments.car_racing import RenderObservation  # needs optional packages
@@ -105,16 +116,13 @@ def make_gymnasium(
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     try:
-        environments = GymnasiumEnvironments(environment)
-        if shutter is not None:
-            shutter.is_open = True  # after the reset that shows whether there are masks
-        return environments
+        environments = GymnasiumEnvironments(environment, spec.id)
     except EnvironmentSetupError:
         environment.close()
         raise
-    except Exception as error:  # broad: as above
-        environment.close()
-        raise EnvironmentSetupError(f"environment {spec.id} cannot be reset: {first_line(error)}") from error
+    if shutter is not None:
+        shutter.is_open = True  # after the reset that shows whether there are masks
+    return environments
 
 
 def make_single(spec: EnvironmentSpec, modules: UserModules) -> gymnasium.Env | None:
@@ -138,10 +146,10 @@ def _check_backend(spec: EnvironmentSpec, modules: UserModules) -> None:
 
 def registration(environment_id: str, modules: UserModules) -> EnvSpec:
     """Return gymnasium's registration of `[module:]id`; importing the module registers it."""
-    name = environment_id.rpartition(":")[2]
+    name, own = environment_id.rpartition(":")[2], None
     if name != environment_id:
         try:
-            modules.load("environment.id", environment_id)
+            own = modules.load("environment.id", environment_id)
         except UserModuleError as error:
             raise EnvironmentSetupError(str(error)) from error
     else:
@@ -154,9 +162,7 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
     try:
         return gymnasium.spec(name)
     except gymnasium.error.Error:
-        raise unknown_environment(
-            name, gymnasium.registry.keys(), "install its package, and name its module as module:Id"
-        ) from None
+        raise (unknown_to_gymnasium(name) if own is None else not_registered(name, own)) from None
 
 
 def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
@@ -192,7 +198,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
-        return EnvironmentProcesses([factory] * count)
+        return EnvironmentProcesses(spec.id, [factory] * count)
     return EnvironmentsInTurn([factory] * count)
 
 

@@ -1,7 +1,5 @@
 """Environments of a gymnasium vector environment, as the actor steps them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -9,7 +7,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from daedalus.actor.checking.violations import observation_violations
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
@@ -18,12 +16,18 @@ from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
-    def __init__(self, environment: Any) -> None:
+    def __init__(self, environment: Any, name: str) -> None:
         """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them.
 
         Of environments that are stepped in turn only the first is reset: a reset may be slow.
+
+        Args:
+          environment: the vector environment.
+          name: its id, for errors.
+
+        Raises EnvironmentSetupError if an environment raises an exception, as `reset` and `step` do.
         """
-        self._environment = environment
+        self._environment, self._name = environment, name
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
@@ -32,40 +36,57 @@ class GymnasiumEnvironments:
         if isinstance(self.action_space, gymnasium.spaces.Box):
             return
         if isinstance(environment, SyncVectorEnv):
-            mask = environment.envs[0].reset(seed=0)[1].get(MASK_KEY)
-            self.action_mask = None if mask is None else mask_of_one(mask)
+            self.action_mask = self._first_mask(environment)
         else:
             self.reset(0)
 
     def reset(self, seed: int) -> Any:
         """See BackendEnvironments."""
-        with self._misfits():
+        try:
             observations, info = self._environment.reset(seed=seed)
+        except EnvironmentSetupError:
+            raise
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise self._failure("reset", error) from error
         self.action_mask = info.get(MASK_KEY)
         return observations
 
     def step(self, actions: Any) -> BackendStep:
         """See BackendEnvironments."""
-        with self._misfits():
+        try:
             observations, rewards, terminated, truncated, info = self._environment.step(actions)
+        except EnvironmentSetupError:
+            raise
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise self._failure("step", error) from error
         self.action_mask = info.get(MASK_KEY)
         if info:
             self._episode_info.add(info, terminated | truncated)
         return observations, rewards, terminated, truncated
 
-    @contextmanager
-    def _misfits(self) -> Iterator[None]:
-        """Name an observation that is not of its space: gymnasium only fails to copy it into the batch."""
+    def _first_mask(self, environment: SyncVectorEnv) -> Any:
+        """Reset the first environment, and return its mask with a first axis of 1, or None without masks."""
         try:
-            yield
-        except (KeyError, IndexError, TypeError, ValueError) as error:
+            mask = environment.envs[0].reset(seed=0)[1].get(MASK_KEY)
+            return None if mask is None else mask_of_one(mask)
+        except EnvironmentSetupError:
+            raise
+        except (Exception, SystemExit) as error:  # of the user's code
+            raise self._failure("reset", error) from error
+
+    def _failure(self, call: str, error: BaseException) -> EnvironmentSetupError:
+        """Return the error of a call. It names an observation that is not of its space.
+
+        gymnasium only fails to copy such an observation into the batch.
+        """
+        if isinstance(error, (KeyError, IndexError, TypeError, ValueError)):
             for observation in getattr(self._environment, "_env_obs", ()):  # of SyncVectorEnv
                 if observation is None:
                     continue
                 for kind, text in observation_violations(self.observation_space, observation, "a step or a reset"):
                     if kind == "problem":
-                        raise EnvironmentSetupError(f"environment: {text}") from error
-            raise
+                        return EnvironmentSetupError(f"environment {self._name}: {text}")
+        return playing_error(self._name, call, error)
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments."""

@@ -52,7 +52,7 @@ class VectorEnvironment(Protocol):
 
         Returns: the next observations, true rewards [E] (summed over the repeats), terminated [E], truncated [E].
         In an environment whose last step ended an episode, this step only resets: reward 0 and the first frame. An
-        episode that no_reward_limit ends is both terminated and truncated.
+        episode that no_reward_limit ends is both terminated and truncated, and no other where that limit is set.
         Raises EnvironmentSetupError for a mask that forbids every action.
         """
         ...

@@ -6,8 +6,9 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
 from daedalus.actor.environments.masks import MASK_KEY
+from daedalus.actor.environments.user_code import place_of
 
 Camera = Callable[[np.ndarray], None]
 
@@ -45,9 +46,17 @@ class RepeatedSteps(gymnasium.Wrapper):
     """A wrapper that repeats each action, passes every frame to a camera, and applies no_reward_limit."""
 
     def __init__(
-        self, environment: gymnasium.Env, *, repeat: int, no_reward_limit: int | None, camera: Camera | None = None
+        self,
+        environment: gymnasium.Env,
+        name: str,
+        *,
+        repeat: int,
+        no_reward_limit: int | None,
+        camera: Camera | None = None,
     ) -> None:
+        """Construct from the environment and its id, which is for errors of the camera."""
         super().__init__(environment)
+        self._name = name
         self._repeat = repeat
         self._no_reward_limit = no_reward_limit
         self._camera = camera
@@ -69,8 +78,10 @@ class RepeatedSteps(gymnasium.Wrapper):
             observation, reward, terminated, truncated, info = self._step_once(action)
             total += reward
         self._unrewarded = 0 if total > 0.0 else self._unrewarded + 1
-        if self._no_reward_limit is not None and self._unrewarded >= self._no_reward_limit and not terminated:
-            terminated = truncated = True
+        if self._no_reward_limit is not None:
+            truncated = truncated and not terminated  # gymnasium's time limit sets both at a termination
+            if self._unrewarded >= self._no_reward_limit and not terminated:
+                terminated = truncated = True
         return observation, total, terminated, truncated, info
 
     def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -81,12 +92,18 @@ class RepeatedSteps(gymnasium.Wrapper):
     def _film(self) -> None:
         if self._camera is None:
             return
-        picture = self.env.render()
+        try:
+            picture = self.env.render()
+        except NotImplementedError:
+            raise self._unrecorded(" cannot render rgb_array images") from None
+        except Exception as error:  # of the user's code
+            raise self._unrecorded(f": render raises {first_line(error)}{place_of(error)}") from error
         if not isinstance(picture, np.ndarray):
-            raise EnvironmentSetupError(
-                f"{self.env} renders {type(picture).__name__} instead of an image: a video of it cannot be recorded"
-            )
+            raise self._unrecorded(f" renders {type(picture).__name__} instead of an image")
         self._camera(picture)
+
+    def _unrecorded(self, reason: str) -> EnvironmentSetupError:
+        return EnvironmentSetupError(f"environment {self._name}{reason}: a video of it cannot be recorded")
 
 
 class OneEpisode(gymnasium.Wrapper):

@@ -122,7 +122,7 @@ def load_policy(
       observation_space, action_space: of the environment to play, if it was changed by wrappers or cannot be made here;
         by default the run's environment is made once to learn its spaces.
 
-    Raises DamagedError if there is no checkpoint that can be read, NoPolicyError for an unknown pretrained name,
+    Raises NoPolicyError if there is no checkpoint or no such pretrained policy, DamagedError if none can be read,
     HubError if a policy cannot be pulled, EnvironmentSetupError if the environment cannot be made, needs a module that
     is not allowed or is not the one of the run, and ValueError if not exactly one of directory, pretrained and from_hub
     is given, or only one of the spaces.

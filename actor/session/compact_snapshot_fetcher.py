@@ -41,6 +41,7 @@ class CompactSnapshotFetcher:
         self._lock = threading.Lock()  # guards all below
         self._fetch = 0  # the number of the current fetch; answers to earlier fetches are ignored
         self._parts: dict[int, bytes] = {}  # of the current fetch, received so far
+        self._bytes = 0  # of these parts together
         self._count = 0  # of its parts; 0 before it is known
         self._requested = 0  # how many of its parts were requested
         self._version: int | None = None
@@ -70,7 +71,8 @@ class CompactSnapshotFetcher:
             if self._fetching or self._fetched is not None or time.monotonic() < self._next_at:
                 return
             self._fetch += 1
-            self._fetching, self._parts, self._count, self._version, self._requested = True, {}, 0, None, 1
+            self._fetching, self._requested, self._version = True, 1, None
+            self._parts, self._count, self._bytes = {}, 0, 0
             self._began = time.monotonic()
         self._request(self._fetch, 0, None)
 
@@ -121,7 +123,13 @@ class CompactSnapshotFetcher:
             return none
         if not self._count:
             self._count, self._version = message.parts, message.policy_version
-        if (message.parts, message.policy_version) != (self._count, self._version) or self._count > _MAX_PARTS:
+        self._bytes += message.data.size
+        if (
+            (message.parts, message.policy_version) != (self._count, self._version)
+            or self._count > _MAX_PARTS
+            or self._bytes > LEARNER_LIMITS.message_bytes
+            or message.part in self._parts
+        ):
             self._end(None, rest=_RETRY_SECONDS)
             return none
         self._parts[message.part] = message.data.tobytes()

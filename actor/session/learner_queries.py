@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.errors import ActorError, ActorRefusedError, NameInUseError
 from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.policy.acting.runtime import PolicyError, program_hash
 from daedalus.protocol import keys
@@ -35,25 +36,6 @@ _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
 _LOOK_AROUND_SECONDS, _MAX_RUNS = 10.0, 10  # between looks for other runs, and how many are named
 _REOPEN_SECONDS = 5.0  # without an answer for so long, the session may be dead: open another
-
-
-class ActorError(Exception):
-    """The actor cannot take part; the message says why and what to do."""
-
-
-class LearnerLostError(Exception):
-    """The learner left, or another learner epoch began; join again."""
-
-    def __init__(self, reason: str = "the learner went away; looking for it again") -> None:
-        super().__init__(reason)
-
-
-class ActorRefusedError(ActorError):
-    """The learner refused or quarantined the actor."""
-
-
-class NameInUseError(ActorRefusedError):
-    """The actor name is in use by another actor, or was in use a moment ago."""
 
 
 class LearnerQueries:

@@ -12,9 +12,10 @@ from typing import Literal
 
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
+from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.client_reports import ClientReports
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import ActorError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.session_monitor import SessionMonitor

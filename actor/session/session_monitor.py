@@ -3,8 +3,9 @@
 import time
 from collections.abc import Callable
 
+from daedalus.actor.errors import ActorRefusedError, LearnerLostError
 from daedalus.actor.session.learner_presence import LearnerPresence
-from daedalus.actor.session.learner_queries import ActorRefusedError, LearnerLostError, LearnerQueries
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import DRAINED, RunEndWatch, RunOverError
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession

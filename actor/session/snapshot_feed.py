@@ -4,8 +4,9 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
+from daedalus.actor.errors import LearnerLostError
 from daedalus.actor.session.compact_snapshot_fetcher import CompactSnapshotFetcher
-from daedalus.actor.session.learner_queries import LearnerLostError, LearnerQueries
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.run_end import RunEndWatch
 from daedalus.actor.session.snapshot_fetcher import SnapshotFetcher
 from daedalus.protocol import keys

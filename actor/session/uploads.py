@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec

@@ -55,11 +55,13 @@ class LocalLearner:
 
     def train(self, upload: Rollout | Gradient) -> None:
         """Make the updates of a batch that is this upload."""
-        version, progress = self._learner.policy_version, self._annealing.at(self.counters.env_steps)
+        version, env_steps = self._learner.policy_version, self.counters.env_steps
+        progress = self._annealing.at(env_steps)
         if isinstance(upload, Gradient):
             self._learner.apply([upload], progress)
         else:
             self._learner.step([upload], progress)
+        self._learner.anneal_exploration(self._training.exploration_annealing(progress, env_steps))
         self.counters.trained([upload], version, self._learner.policy_version - version)
         if self.env_steps_to_target is None and self.counters.reached(self._training.target_return):
             self.env_steps_to_target = self.counters.env_steps

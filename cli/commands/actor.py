@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.errors import ActorError
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.learner_queries import ActorError
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging

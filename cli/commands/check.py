@@ -5,11 +5,14 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from dataclasses import replace
 
 import numpy as np
 
 from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
 from daedalus.cli.arguments import command_parser
+from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
+from daedalus.cli.quick_check import with_preset
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError
@@ -19,9 +22,10 @@ from daedalus.protocol.spec import RunSpec
 
 _DESCRIPTION = """\
 Makes one environment and plays it with random actions: whether reset and step keep to gymnasium's interface, whether
-observations have the shape, the dtype and the bounds of their space, whether all numbers are finite, whether episodes
-end, and how long a step takes. Then prints what `daedalus train` with the same options would choose, and builds the
-network. `daedalus train` itself makes the first steps of this check before it starts."""
+observations have the shape and the bounds of their space and a dtype that can be converted to its own, whether all
+numbers are finite, whether episodes end, and how long a step takes. Then prints what `daedalus train` with the same
+options would choose, and builds the network. `daedalus train` itself makes the first steps of this check before it
+starts."""
 
 _EXAMPLES = """\
 examples:
@@ -32,6 +36,7 @@ examples:
 exit status: 0 it can be trained on, 1 it cannot, 2 bad usage"""
 
 _SECONDS, _ENV_STEPS = 10.0, 20_000
+_MORE_SECONDS = 600.0  # for the start of a simulator, its resets and its last step
 
 
 def parser() -> argparse.ArgumentParser:
@@ -59,35 +64,55 @@ def check(arguments: list[str]) -> int:
     if not parsed.seconds > 0.0:
         print(f"daedalus check: --seconds is {parsed.seconds:g}: choose a number above 0", file=sys.stderr)
         return 2
-    with redirect_stdout(sys.stderr):  # the environment may print
-        lines = _checked(spec, parsed)
+    lines = _checked(spec, parsed)
     print("\n".join(f"{name:<14}{text}" for name, text in lines))
     return 1 if any(name == "problem" for name, _ in lines) else 0
 
 
 def _checked(spec: RunSpec, parsed: argparse.Namespace) -> list[tuple[str, str]]:
     """Return the lines of the report, each with its name."""
-    from daedalus.actor.checking.checker import gymnasium_notes  # gymnasium, which the parser does not need
-    from daedalus.actor.checking.play import check_environment
-
     environment, modules = spec.environment, UserModules(frozenset(modules_of(spec.user_modules)))
-    seed = spec.training.seed
-    report = check_environment(environment, modules, seconds=parsed.seconds, env_steps=_ENV_STEPS, seed=seed)
-    notes = () if report.problems else gymnasium_notes(environment, modules)
-    chosen = report
+    check = EnvironmentCheck(
+        spec=environment,
+        modules=modules,
+        seconds=parsed.seconds,
+        env_steps=_ENV_STEPS,
+        seed=spec.training.seed,
+        most_seconds=parsed.seconds + _MORE_SECONDS,
+        shown=True,
+        notes=True,
+    )
+    chosen = report = _report(check)
     if parsed.env is not None:
         spec = resolve_spec(parsed, default_settings(report.spaces, [*environment.leave_out, *report.constant_texts]))
-        if spec.environment != environment:
-            chosen = check_environment(spec.environment, modules, seconds=0.0, env_steps=0)
+        if spec.environment != environment and report.spaces is not None:
+            chosen = _report(replace(check, spec=spec.environment, seconds=0.0, notes=False))
     network, fault = _network(spec, chosen.spaces, modules)
     problems = [*report.problems, *filter(None, (chosen.text_problem(spec), fault))]
     return [
         *_description(spec, report),
         *_choices(spec, network),
         *(("warning", text) for text in report.warnings),
-        *(("note", text) for text in (*notes, *_advice(spec, report))),
-        *([("problem", text) for text in problems] or [("result", "no problem found")]),
+        *(("note", text) for text in (*report.notes, *_advice(spec, report))),
+        *([("problem", with_preset(text, spec)) for text in problems] or [("result", _result(report))]),
     ]
+
+
+def _report(check: EnvironmentCheck) -> EnvironmentReport:
+    """Check an environment, in a process of its own where the system has such processes."""
+    if not hasattr(os, "posix_spawn"):  # Windows
+        with redirect_stdout(sys.stderr):  # the environment may print
+            return check.run()
+    try:
+        return check_in_process(check)
+    except CheckTimeoutError as error:
+        problem = f"environment {check.spec.id}: the check was {error}: a call does not return"
+        return EnvironmentReport(problems=(problem,))
+
+
+def _result(report: EnvironmentReport) -> str:
+    count = len(report.warnings)
+    return f"can be trained on, with {count} warning{'s' if count > 1 else ''}" if count else "no problem found"
 
 
 def _description(spec: RunSpec, report: EnvironmentReport) -> Iterator[tuple[str, str]]:

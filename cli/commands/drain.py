@@ -5,7 +5,7 @@ import sys
 import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.status_query import ask
+from daedalus.cli.status_query import ask, no_answer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
@@ -96,7 +96,7 @@ def _statuses_with(transport: Transport, run: str, name: str) -> list[RunStatus]
     """Return the statuses of the runs that an actor takes part in. Raises DrainError if there is none."""
     statuses = ask(transport, run)
     if not statuses:
-        raise DrainError("no learner answers at this address: is a learner running?")
+        raise DrainError(no_answer(transport, run))
     found = [each for each in statuses if any(actor.actor == name and actor.alive for actor in each.actors)]
     if not found:
         raise DrainError(f"no actor {name!r} takes part: `daedalus status` lists them")

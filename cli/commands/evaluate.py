@@ -167,8 +167,8 @@ def _play(
             video.frames_per_second = _frames_per_second(spec)
         if environments.spaces != policy.spaces:
             raise EnvironmentSetupError(
-                f"{spec.backend}'s {spec.id} has {environments.spaces}; the policy was trained on {policy.spaces}: "
-                "choose another --backend, or install the versions that the run used (versions.json)"
+                f"{spec.id} (backend {spec.backend}) has {environments.spaces}; the policy was trained on "
+                f"{policy.spaces}: choose another --backend, or install the versions that the run used (versions.json)"
             )
         runtime = OnnxRuntime(policy.program, progress.stop)
         runtime.load(policy.weights)
@@ -231,7 +231,7 @@ def _note(evaluation: Evaluation, longest: int, *, sampled: bool) -> str:
 def _text(result: dict[str, Any]) -> str:
     best = "best checkpoint, " if result["best_checkpoint"] else ""
     text = (
-        f"{result['backend']}'s {result['environment']}, {best}policy version {result['policy_version']}: "
+        f"{result['environment']} (backend {result['backend']}), {best}policy version {result['policy_version']}: "
         f"return {result['return_mean']:.1f} +- {result['return_std']:.1f} "
         f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
         f"over {result['episodes']} {result['actions']} episodes"

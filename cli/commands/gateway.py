@@ -14,7 +14,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
 from daedalus.cli.logs import add_logging, configure_logging

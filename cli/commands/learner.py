@@ -53,7 +53,7 @@ from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.saving.saved_policy import checkpoints, find_policy
+from daedalus.policy.saving.saved_policy import NoPolicyError, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.spaces import Spaces
@@ -77,6 +77,7 @@ _FAILURES = (
     CredentialsError,
     DamagedError,
     NetworkError,
+    NoPolicyError,
     RanksDisagreeError,
     SettingsError,
     TransportError,
@@ -148,7 +149,9 @@ def _serve(
     """
     if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
         stack.enter_context(RunLock(run.directory))
-    Heartbeat(run.directory).clear()  # before a router is waited for
+    if arguments.run_dir is not None:
+        stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
+    Heartbeat(run.directory).clear()
     resumed = arguments.resume and run.exists
     finished = finished_run(run.directory, run.spec) if resumed else None
     if finished is not None:

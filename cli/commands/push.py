@@ -8,6 +8,7 @@ from daedalus.cli.arguments import command_parser
 from daedalus.cli.comparing.recorded_run import RunDataError
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.policy.saving.hub import HubError
+from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 
 _DESCRIPTION = """\
@@ -52,7 +53,7 @@ def push(arguments: list[str]) -> int:
     )
     try:
         address = upload(parsed.directory, parsed.repository, private=parsed.private)
-    except (HubError, RunDataError, DamagedError) as error:
+    except (HubError, RunDataError, NoPolicyError, DamagedError) as error:
         print(f"daedalus push: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

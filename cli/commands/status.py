@@ -7,7 +7,7 @@ from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import one_line, printable
-from daedalus.cli.status_query import ask, ask_events, fleet_size
+from daedalus.cli.status_query import ask, ask_events, fleet_size, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
 from daedalus.learner.run.heartbeat import silence
@@ -38,7 +38,7 @@ epsilon is the probability with which an actor takes a random action, in the end
 counts snapshots. An s marks an actor that fetches compact snapshots, over a slow link.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
-0 alive or starting, 1 not alive"""
+0 alive or starting, 1 not alive or no such directory"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -92,13 +92,14 @@ def status(arguments: list[str]) -> int:
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
+            unanswered = "" if statuses else no_answer(transport, parsed.run)
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
         print(f"daedalus status: {error}", file=sys.stderr)
         return NO_ANSWER
     if not statuses:
-        print("daedalus status: no learner answers at this address: is a learner running?", file=sys.stderr)
+        print(f"daedalus status: {unanswered}", file=sys.stderr)
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
@@ -117,6 +118,9 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
 
 
 def _check_alive(directory: Path) -> int:
+    if not directory.is_dir():
+        print(f"daedalus status: {directory} does not exist: name a run directory", file=sys.stderr)
+        return NO_ANSWER
     silent = silence(directory)
     if silent is None:
         return HEALTHY

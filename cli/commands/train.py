@@ -6,7 +6,15 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from daedalus.cli.arguments import add_allow_module, add_insecure, add_processes, add_tls, allowing, command_parser
+from daedalus.cli.arguments import (
+    add_allow_module,
+    add_insecure,
+    add_processes,
+    add_tls,
+    allowing,
+    command_parser,
+    whole_number,
+)
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
@@ -15,7 +23,7 @@ from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.run_observer import RunObserver
-from daedalus.cli.run_report import report
+from daedalus.cli.run_report import report, show
 from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, check_processes, resolve
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay
@@ -23,6 +31,7 @@ from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
 from daedalus.learner.run.finished import FinishedRun, finished_run
+from daedalus.learner.run.initial import check_initial
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -88,6 +97,7 @@ def train(arguments: list[str]) -> int:
         spec, directory = resolve(parsed)
         if parsed.run_dir is not None:
             run_directory.check_free(directory)  # before the environment is made
+        check_initial(parsed.init_from)
         if parsed.env is None:
             spaces = checked_spaces(spec, fork=True)
         else:
@@ -167,7 +177,9 @@ def resume_parser() -> argparse.ArgumentParser:
     """Return the parser of `daedalus resume`."""
     options = command_parser("resume", _RESUME, _RESUME_EXAMPLES)
     options.add_argument("directory", type=Path, metavar="RUN_DIR", help="run to continue")
-    options.add_argument("--env-steps", type=int, metavar="N", help="new budget (default: the budget of the run)")
+    options.add_argument(
+        "--env-steps", type=whole_number, metavar="N", help="new budget (default: the budget of the run)"
+    )
     options.add_argument(
         "--set",
         action="append",
@@ -263,5 +275,5 @@ def _run(
         if not (resume or output.withheld):
             run_directory.remove_failed(directory)
         return error.status
-    print(report(run, end.summary))
+    show(report(run, end.summary))
     return end.status

@@ -79,7 +79,7 @@ def compare_groups(groups: Sequence[Group], threshold: float | None = None) -> C
                 improvement=improvement([returns[index]], [returns[0]]) if index else None,
             )
         )
-    environment = next((run.settings[ENVIRONMENT] for run in runs if run.settings), "")
+    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
     return Comparison(environment=environment, evaluated=evaluated, threshold=threshold, results=results)
 
 

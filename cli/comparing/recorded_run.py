@@ -3,16 +3,16 @@
 import csv
 import json
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from daedalus.cli.comparing.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
+from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 
 SEED, ENVIRONMENT = "training.seed", "environment.id"
@@ -22,10 +22,7 @@ RETURN, ENV_STEPS, SECONDS = "episode_return_mean", "env_steps", "wall_seconds"
 _NUMBERS = {"training.env_steps", "training.target_return", "training.target_episodes", SEED}
 _SUMMARY_NUMBERS = ("env_steps", "evaluation_return_mean", "seconds_to_target")
 _LARGEST = 1e300
-
-
-class RunDataError(Exception):
-    """Error for a run directory that cannot be used. The message is one line."""
+_MAX_METRICS_BYTES = 1 << 30  # a month of rows at the default log interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,12 +41,12 @@ class RecordedRun:
         budget = self.settings.get("training.env_steps", math.nan)
         ended = self.summary.get("finished") or self.evaluation is not None
         # A run that was resumed with a larger budget has made more steps than its summary says.
-        if ended and done <= self.summary.get("env_steps", math.inf):
+        steps = self.summary.get("env_steps")
+        if ended and (steps is None or done <= steps):
             return ""
-        return (
-            f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): "
-            f"continue it with: daedalus resume {self.directory}"
-        )
+        running = is_locked(self.directory)
+        remedy = "it is still running" if running else f"continue it with: daedalus resume {self.directory}"
+        return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
 
     @property
     def evaluation(self) -> float | None:
@@ -75,9 +72,9 @@ class RecordedRun:
         the target of a run that stopped at the target. The metrics need wall_seconds.
         """
         at_target = self.summary.get("solved") and threshold == self.target
-        seconds = self.summary.get("seconds_to_target")
-        if at_target and seconds is not None and self.settings.get("training.stop_when_solved"):
-            return float(self.summary["env_steps"]), seconds / 60.0
+        steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
+        if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
+            return float(steps), seconds / 60.0
         above = self.metrics[RETURN] >= threshold
         episodes = self.metrics.get("episodes")
         if episodes is not None:  # the mean of fewer episodes may be luck
@@ -145,24 +142,26 @@ def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
 
 
 def _settings(path: Path) -> dict[str, Any]:
-    try:
-        settings = tomllib.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
+    settings = read_toml(path)
+    if not settings:
         return {}
-    except OSError as error:
-        raise RunDataError(f"{path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RunDataError(f"{path} is damaged: {error}") from None
-    with suppress(SettingsError):  # another release may have had settings that this one does not have
+    try:
         # With the defaults of settings that an earlier release did not have.
         settings = run_spec(settings).model_dump(mode="json")
+    except SettingsError:  # another release may have had settings that this one does not have
+        settings = json.loads(json.dumps(settings, default=str))  # TOML has dates, too
     return {
         f"{section}.{key}": value
         for section, values in settings.items()
         if isinstance(values, dict)
         for key, value in values.items()
-        if f"{section}.{key}" not in _NUMBERS or _is_number(value)
+        if _is_usable(f"{section}.{key}", value)
     }
+
+
+def _is_usable(setting: str, value: Any) -> bool:
+    """Return whether a value of config.toml is of the kind that other code relies on."""
+    return isinstance(value, str) if setting == ENVIRONMENT else setting not in _NUMBERS or _is_number(value)
 
 
 def _is_number(value: Any) -> bool:
@@ -170,16 +169,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _summary(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise RunDataError(f"{path}: {error.strerror}") from None
-    except ValueError:
-        raise RunDataError(f"{path} is damaged: it is not valid JSON") from None
-    if not isinstance(content, dict):
-        raise RunDataError(f"{path} is damaged: it is not a JSON object")
+    content = read_json(path)
     for name in _SUMMARY_NUMBERS:
         if not _is_number(content.get(name)):
             raise RunDataError(f"{path} is damaged: {name} is not a number")
@@ -190,13 +180,12 @@ def _metrics(directory: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the columns of metrics.csv, [rows]. The line that a running learner is writing is left out."""
     path = directory / METRICS
     nothing = f"{directory} has no metrics yet: wait until the run has made its first updates"
+    content = read_file(path, _MAX_METRICS_BYTES)
+    if content is None:
+        raise RunDataError(nothing)
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = content.decode()
         header, *rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
-    except FileNotFoundError:
-        raise RunDataError(nothing) from None
-    except OSError as error:
-        raise RunDataError(f"{path}: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise RunDataError(f"{path} is damaged: {error}") from None
     except ValueError:  # no line at all

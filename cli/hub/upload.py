@@ -34,7 +34,7 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
       repository: USER/NAME; it is created if it does not exist.
       private: create it as a private repository.
 
-    Raises HubError, RunDataError, DamagedError.
+    Raises HubError, RunDataError, NoPolicyError, DamagedError.
     """
     api = hub_api()  # first: without the library, nothing can be done
     check_repository(repository)

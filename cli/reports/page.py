@@ -67,7 +67,7 @@ def comparison_page(
     """
     runs = [run for group in groups for run in group.runs]
     comparison = group_sections.comparison_of(groups, threshold)
-    environment = next((run.settings[ENVIRONMENT] for run in runs if run.settings), "")
+    environment = next((run.settings[ENVIRONMENT] for run in runs if ENVIRONMENT in run.settings), "")
     title = f"{len(runs)} runs of {environment}" if environment else f"{len(runs)} runs"
     unfinished = [run.unfinished for run in runs if run.unfinished]
     return _document(

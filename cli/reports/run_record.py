@@ -1,11 +1,11 @@
 """All that a report needs of one run, read from its directory. Nothing in the directory is trusted.
 
-A run directory may come from another machine: files are read up to a size limit and checked. Files whose content a
-report shows as it is are not read through links, which could lead to any file of the reader's.
+A run directory may come from another machine: only regular files are read, up to a size limit, and checked. Files whose
+content a report shows as it is are not read through links, which could lead to any file of the reader's.
 """
 
-import json
 import math
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from daedalus.cli.comparing.recorded_run import RecordedRun, RunDataError
+from daedalus.cli.comparing.recorded_run import RecordedRun
+from daedalus.cli.comparing.run_files import RunDataError, read_json
 from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
+from daedalus.policy.saving.regular_files import open_regular
 
-_MAX_JSON_BYTES = 32 << 20
 _MAX_OUTPUT_BYTES = 16 << 10
 _VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
 
@@ -107,7 +108,7 @@ def read_record(run: RecordedRun) -> RunRecord:
         run=run,
         evaluation=_evaluation(directory, run),
         confirmation=confirmation if isinstance(confirmation, dict) else {},
-        versions={name: str(value) for name, value in _json(directory / VERSIONS).items() if value is not None},
+        versions={name: str(value) for name, value in read_json(directory / VERSIONS).items() if value is not None},
         events=events,
         output=_end_of(directory / OUTPUT),
         video=_video(directory),
@@ -124,7 +125,7 @@ def finite(value: Any) -> float | None:
 
 
 def _evaluation(directory: Path, run: RecordedRun) -> RecordedEvaluation | None:
-    content = _json(directory / EVALUATION) or run.summary.get("evaluation")
+    content = read_json(directory / EVALUATION) or run.summary.get("evaluation")
     if not content:
         return None
     try:
@@ -143,29 +144,12 @@ def record_command(directory: Path) -> str:
     return f"daedalus evaluate {shlex.quote(str(directory))} --json > {shlex.quote(str(directory / EVALUATION))}"
 
 
-def _json(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file, or an empty dictionary without the file. Raises RunDataError."""
-    try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise RunDataError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB: delete the file")
-        content = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise RunDataError(f"{path}: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise RunDataError(f"{path} is damaged: it is not valid JSON; delete the file") from None
-    if not isinstance(content, dict):
-        raise RunDataError(f"{path} is damaged: it is not a JSON object; delete the file")
-    return content
-
-
 def _end_of(path: Path) -> str:
     if path.is_symlink():
         return ""
     try:
-        with open(path, "rb") as file:
-            file.seek(max(path.stat().st_size - _MAX_OUTPUT_BYTES, 0))
+        with open_regular(path) as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - _MAX_OUTPUT_BYTES, 0))
             return file.read(_MAX_OUTPUT_BYTES).decode("utf-8", "replace").strip()
     except OSError:
         return ""

@@ -82,7 +82,7 @@ def evaluation_section(record: RunRecord) -> Html:
     best = "best" if evaluation.best_checkpoint else "newest"
     played = (
         f"{evaluation.episodes:,} {evaluation.actions} episodes of the {best} checkpoint, policy version "
-        f"{evaluation.policy_version}, on {evaluation.backend}'s {evaluation.environment}"
+        f"{evaluation.policy_version}, on {evaluation.environment} (backend {evaluation.backend})"
         + ("" if evaluation.seed is None else f", seed {evaluation.seed}")
     )
     numbers = table((), statistics_rows(evaluation, statistics), label="statistics of the evaluation", numeric={1})

@@ -6,11 +6,11 @@ from contextlib import suppress
 
 from daedalus.cli.watching.run_watcher import looks
 from daedalus.cli.watching.screen import Screen
+from daedalus.protocol import keys
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 
 _FRAME_SECONDS, _TEXT_SECONDS = 1.0, 5.0
-_NOBODY = "no learner answers at this address; waiting for one (Ctrl-C ends)"
 
 
 def watch_status(
@@ -27,16 +27,17 @@ def watch_status(
 
     Raises TransportError if the learner refuses this process, or if its answers are damaged.
     """
-    waiting = False
+    wanted = "no learner" if run == keys.ANY_RUN else f"no learner of run {run!r}"
+    nobody, waiting = f"{wanted} answers at this address; waiting for one (Ctrl-C ends)", False
     with suppress(KeyboardInterrupt):
         try:
             for runs in looks(connect, run, threading.Event(), _FRAME_SECONDS if frames else _TEXT_SECONDS):
                 if frames and runs:
                     screen.show(runs)
                 elif frames:
-                    screen.say(_NOBODY)
+                    screen.say(nobody)
                 elif not runs and not waiting:
-                    screen.err(f"daedalus status: {_NOBODY}")
+                    screen.err(f"daedalus status: {nobody}")
                 for each in runs if not frames else ():
                     screen.out(text(each.status))
                 waiting = not runs

@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass
 from typing import Protocol
 
-MAX_CLIENTS = 64  # that have sent a packet
+MAX_RAW_CLIENTS = 64  # that have sent a packet
 _MAX_NEW_CONNECTIONS = 64  # that have not sent a packet yet
 IDLE_SECONDS = 60.0  # a client that sent nothing for this time may lose its place to a new client
 # Bytes of unanswered queries and unread answers. One more message is accepted below a limit: weights of any size fit.
@@ -55,7 +55,7 @@ class ClientTable:
         with self._lock:
             admitted = [(usage.heard, each) for each, usage in self._usage.items() if usage.is_admitted]
             heard, idlest = min(admitted, key=lambda entry: entry[0], default=(now, None))
-            is_full = len(admitted) >= MAX_CLIENTS
+            is_full = len(admitted) >= MAX_RAW_CLIENTS
             if client not in self._usage or (is_full and now - heard < IDLE_SECONDS):
                 return False
             if is_full and idlest is not None:

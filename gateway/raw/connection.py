@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 
 from daedalus.gateway.raw.budget import QueryBudget
-from daedalus.gateway.raw.clients import MAX_CLIENTS, ClientTable
+from daedalus.gateway.raw.clients import MAX_RAW_CLIENTS, ClientTable
 from daedalus.gateway.raw.packet_socket import PacketSocket
 from daedalus.gateway.raw.packets import MAX_ANSWER_BYTES, Kind, Packet, PacketError, fits_packet, is_own_key
 from daedalus.transport.interface import Inbox, Transport, TransportError
@@ -24,7 +24,7 @@ _MAX_FOLLOWED = 8  # the network keeps the newest value of each followed key in 
 _MAX_CHANGES = 1024  # presence changes that wait for a slow client
 
 
-class ClientConnection:
+class RawConnection:
     """Serves one client from `run` until the connection ends."""
 
     def __init__(
@@ -101,7 +101,7 @@ class ClientConnection:
 
     def _serve(self) -> None:
         if not self._clients.admit(self):
-            raise PacketError(f"{MAX_CLIENTS} clients are connected already: try again later")
+            raise PacketError(f"{MAX_RAW_CLIENTS} clients are connected already: try again later")
         transport = self._open_transport()
         if not self._keep(transport):
             return

@@ -15,7 +15,7 @@ from daedalus.gateway import messages
 from daedalus.gateway.channel import channel_of
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.raw.clients import ClientTable
-from daedalus.gateway.raw.connection import ClientConnection
+from daedalus.gateway.raw.connection import RawConnection
 from daedalus.gateway.security import Guard
 from daedalus.transport.interface import Transport
 
@@ -40,7 +40,7 @@ class RawEndpoint:
         """
         self._open_transport, self._guard, self._actor_name = open_transport, guard, actor_name
         self._table = ClientTable()
-        self._clients: set[ClientConnection] = set()
+        self._clients: set[RawConnection] = set()
 
     async def serve(self, scope: Any, receive: Any, send: Any) -> None:
         """Serve one client until one side ends the connection."""
@@ -57,7 +57,7 @@ class RawEndpoint:
         channel_of(scope).become_stream(MAX_CHUNK_BYTES)
         ours, theirs = socket.socketpair()
         only = name if self._guard.tokens is not None else None
-        client = ClientConnection(theirs, self._open_transport, self._table, only)
+        client = RawConnection(theirs, self._open_transport, self._table, only)
         self._table.connect(client)
         self._clients.add(client)
         threading.Thread(target=self._run, args=(client, name), name="raw-client", daemon=True).start()
@@ -88,7 +88,7 @@ class RawEndpoint:
         self._guard.check_token(name, token)
         return self._actor_name(name)
 
-    def _run(self, client: ClientConnection, name: str) -> None:
+    def _run(self, client: RawConnection, name: str) -> None:
         _logger.info("%s exchanges messages of the wire", name)
         reason = client.run()
         if reason:

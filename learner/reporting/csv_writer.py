@@ -1,9 +1,10 @@
 """Metrics writer for a CSV file."""
 
 import csv
+import errno
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
@@ -47,10 +48,11 @@ class CsvWriter:
         columns = (*self._columns, *names)
         beside = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
         try:
-            with open(self._path, newline="", encoding="utf-8", errors="replace") as old, open(beside, "wb") as new:
-                next(old)
+            rows = _rows(self._path)
+            next(rows)
+            with open(beside, "wb") as new:
                 new.write(_line(columns))
-                for cells in csv.reader(old):
+                for cells in rows:
                     new.write(_line([*cells, *[""] * len(names)]))
             os.replace(beside, self._path)
         finally:
@@ -74,8 +76,16 @@ def _header(path: Path) -> Sequence[str]:
     """Return the column names of a file, or an empty sequence if the file is empty or missing."""
     if not path.exists():
         return ()
-    with open(path, newline="", encoding="utf-8") as file:
-        return next(csv.reader(file), ())
+    return next(_rows(path), ())
+
+
+def _rows(path: Path) -> Iterator[Sequence[str]]:
+    """Yield the rows of a file, whose bytes may be damaged. Raises OSError if it has no rows for that reason."""
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        try:
+            yield from csv.reader(file)
+        except csv.Error as error:
+            raise OSError(errno.EILSEQ, f"{path.name} is damaged ({error}): move it away", str(path)) from None
 
 
 def _cell(value: float | None) -> str:

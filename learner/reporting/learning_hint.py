@@ -1,5 +1,6 @@
 """A hint for the user where a run does not learn. State; no I/O."""
 
+import math
 from collections.abc import Mapping
 
 _BASELINE_EPISODES = 20  # after so many, the policy is still about as random as at the start,
@@ -12,16 +13,18 @@ _COLLAPSED = 0.1  # of the first entropy
 class LearningHint:
     """Judge of a run after a fifth of its budget, by its metrics rows.
 
-    A run does not learn where the mean return is still that of its first episodes and the entropy has collapsed, or
-    where the explained variance stayed below 0. Runs that were resumed after the first episodes are not judged.
+    A run does not learn where all returns are equal, where the mean return is still that of its first episodes and the
+    entropy has collapsed, or where the explained variance stayed below 0. Runs that were resumed after the first
+    episodes are not judged.
     """
 
-    def __init__(self, budget: int) -> None:
-        """`budget` is in env_steps."""
-        self._budget = budget
+    def __init__(self, budget: int, *, normalizes_rewards: bool) -> None:
+        """`budget` is in env_steps; `normalizes_rewards` is the setting `training.normalize_rewards`."""
+        self._budget, self._normalizes_rewards = budget, normalizes_rewards
         self._first_return: tuple[float, float] | None = None  # mean and standard deviation
         self._first_entropy: float | None = None
         self._explained: list[float] = []
+        self._lowest, self._highest = math.inf, -math.inf  # returns in all rows
         self._judged = False
         self._due = ""
 
@@ -30,6 +33,9 @@ class LearningHint:
         progress = row["env_steps"] / self._budget
         if self._judged:
             return
+        if row["episodes"]:
+            self._lowest = min(self._lowest, row["episode_return_min"])
+            self._highest = max(self._highest, row["episode_return_max"])
         if self._first_entropy is None:
             self._first_entropy = row.get("entropy")
         if self._first_return is None and row["episodes"] >= _BASELINE_EPISODES:
@@ -52,6 +58,11 @@ class LearningHint:
         if self._first_return is None:
             return ""
         mean, deviation = self._first_return
+        if self._lowest == self._highest:
+            return (
+                f"this run does not learn: every episode so far has the return {self._lowest:.4g}, so that no "
+                "action was better than another; check the reward, and whether random actions can reach the goal"
+            )
         first, entropy = self._first_entropy or 0.0, row.get("entropy", 0.0)
         no_better = row["episode_return_mean"] <= mean + 0.25 * deviation
         if no_better and first > 0.0 and entropy < _COLLAPSED * first:
@@ -61,8 +72,9 @@ class LearningHint:
                 "training.entropy_bonus or a smaller training.learning_rate"
             )
         if len(self._explained) >= _LEAST_ROWS and max(self._explained) < 0.0:
+            normalize = "" if self._normalizes_rewards else "training.normalize_rewards=true or "
             return (
                 "this run does not learn: the explained variance of the value stays below 0; "
-                "try training.normalize_rewards=true or a smaller training.learning_rate"
+                f"try {normalize}a smaller training.learning_rate"
             )
         return ""

@@ -42,7 +42,7 @@ class RunReporter:
         self._evaluations, self._health, self._started = evaluations, health, started
         self._meter = RateMeter(counters, started)
         self._episode_hint = EpisodeHint(spec.training.env_steps)
-        self._learning_hint = LearningHint(spec.training.env_steps)
+        self._learning_hint = LearningHint(spec.training.env_steps, normalizes_rewards=spec.training.normalize_rewards)
         self._user_metrics = user_metrics
 
     def begin(self, now: float) -> None:

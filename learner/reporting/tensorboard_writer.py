@@ -68,13 +68,15 @@ class TensorBoardWriter:
         Its sums are exact if `numbers` is given, else they are computed from the middles of the bins.
         """
         middles = (edges[1:] + edges[:-1]) / 2
-        exact = np.array(numbers, np.float64) if len(numbers) else np.repeat(middles, counts)
+        values = np.array(numbers, np.float64) if len(numbers) else middles
+        weights = np.ones(len(values)) if len(numbers) else counts
+        seen = values[weights > 0]
         return self._histogram_proto(
-            min=float(exact.min()),
-            max=float(exact.max()),
+            min=float(seen.min()),
+            max=float(seen.max()),
             num=float(counts.sum()),
-            sum=float(exact.sum()),
-            sum_squares=float(np.square(exact).sum()),
+            sum=float((values * weights).sum()),
+            sum_squares=float((np.square(values) * weights).sum()),
             bucket_limit=edges[1:].tolist(),
             bucket=counts.astype(float).tolist(),
         )

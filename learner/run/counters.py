@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
 
 _SAVED = (
@@ -41,6 +42,7 @@ class RunCounters:
     policy_lag_sum: int = 0
     policy_lag_max: int = 0
     snapshots_published: int = 0
+    best_evaluation: float | None = None  # the highest mean return of an evaluation
     wall_seconds: float = 0.0  # of the learner processes before this one
     returns: deque[float] = field(init=False)
     lengths: deque[int] = field(init=False)
@@ -81,6 +83,10 @@ class RunCounters:
             if name in self.info or len(self.info) < MAX_INFO_NAMES:
                 self.info.setdefault(name, deque(maxlen=self.target_episodes)).extend(values.tolist())
 
+    def evaluated(self, mean: float) -> None:
+        """Count an evaluation with this mean return."""
+        self.best_evaluation = mean if self.best_evaluation is None else max(mean, self.best_evaluation)
+
     @property
     def episode_return_mean(self) -> float | None:
         """Mean return of the newest `target_episodes` training episodes; None before the first episode."""
@@ -96,11 +102,19 @@ class RunCounters:
         mean = self.episode_return_mean
         return target is not None and mean is not None and len(self.returns) == self.target_episodes and mean >= target
 
+    def is_solved(self, training: TrainingSpec) -> bool:
+        """Return whether the target was reached: also by an evaluation, where actors explore and do worse."""
+        target, best = training.target_return, self.best_evaluation
+        if training.explores and target is not None and best is not None and best >= target:
+            return True
+        return self.reached(target)
+
     def state(self, wall_seconds: float) -> dict[str, Any]:
         """Return all counters as plain JSON values; `wall_seconds` is the duration of the whole run so far."""
         return {
             **{name: getattr(self, name) for name in _SAVED},
             "rollouts_rejected": dict(self.rollouts_rejected),
+            "best_evaluation": self.best_evaluation,
             "wall_seconds": wall_seconds,
             "returns": list(self.returns),
             "lengths": list(self.lengths),
@@ -111,6 +125,7 @@ class RunCounters:
         for name in _SAVED:
             setattr(self, name, state.get(name, 0))  # absent in checkpoints of earlier releases
         self.rollouts_rejected = Counter(state["rollouts_rejected"])
+        self.best_evaluation = state.get("best_evaluation")  # absent in checkpoints of earlier releases
         self.wall_seconds = state["wall_seconds"]
         self.returns.extend(state["returns"])
         self.lengths.extend(state["lengths"])

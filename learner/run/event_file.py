@@ -4,7 +4,6 @@ One JSON object a line, with the fields of protocol/status.py's Event. The kind 
 """
 
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.learner.run.run_directory import EVENTS
+from daedalus.policy.saving.regular_files import read_regular
 from daedalus.protocol.status import Event
 from daedalus.protocol.timestamps import utc
 
@@ -58,9 +58,7 @@ class EventFile:
 def read_events(directory: Path) -> Iterator[RecordedEvent]:
     """Yield the events of a run, oldest first. Damaged lines are left out. Raises OSError except for a missing file."""
     try:
-        with open(directory / EVENTS, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            lines = file.read(min(size, 2 * _MAX_BYTES)).splitlines()
+        lines = read_regular(directory / EVENTS, 2 * _MAX_BYTES).splitlines()
     except FileNotFoundError:
         return
     for line in lines:

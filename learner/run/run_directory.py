@@ -17,7 +17,8 @@ import os
 import platform
 import re
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +55,33 @@ def default_directory(name: str, spec: RunSpec) -> Path:
 
 def check_free(directory: Path) -> None:
     """Check that a directory is free for a new run. Raises SettingsError if it is a file or not empty."""
-    if directory.exists() and (not directory.is_dir() or any(entry.name != LOCK for entry in directory.iterdir())):
+    if not directory.exists():
+        return
+    if not directory.is_dir():
+        raise SettingsError(f"run directory {directory} is a file: choose a directory with --run-dir")
+    if (directory / CONFIG).exists():
         raise SettingsError(
             f"run directory {directory} exists: continue the run with `daedalus resume {directory}`, "
             "or choose another directory with --run-dir"
         )
+    if any(entry.name != LOCK for entry in directory.iterdir()):
+        raise SettingsError(
+            f"run directory {directory} is not empty, and has no {CONFIG}: choose another directory with --run-dir"
+        )
+
+
+@contextmanager
+def made(directory: Path) -> Iterator[None]:
+    """Make a directory before its run is created, and remove it at the end if it is empty. Raises SettingsError."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"run directory {directory}: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            directory.rmdir()
 
 
 def create(directory: Path, spec: RunSpec) -> None:

@@ -115,6 +115,23 @@ class RunLock:
         return (int(named[1]), named[2]) if named else (0, "")
 
 
+def is_locked(directory: Path) -> bool:
+    """Return whether a process has locked a run directory; False where that is not known."""
+    if fcntl is None:
+        return False
+    try:
+        descriptor = os.open(directory / LOCK, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in its place has no writer
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def _is_running(process: int, host: str) -> bool:
     """Return whether a process is known or presumed to run."""
     if not process or host != socket.gethostname():

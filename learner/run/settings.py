@@ -2,6 +2,7 @@
 
 import difflib
 import importlib.resources
+import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,10 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec
+
+_FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
 
 
 class SettingsError(Exception):
@@ -27,21 +31,38 @@ def read_preset(name: str) -> dict[str, Any]:
     if name.endswith(".toml"):
         return read_file(Path(name))
     if name not in preset_names():
-        near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"the presets are {', '.join(preset_names())}"
-        raise SettingsError(f"unknown preset {name!r}: {hint}; any gymnasium environment runs with --env ID")
+        raise SettingsError(_unknown_preset(name))
     text = (importlib.resources.files("daedalus.learner.run.presets") / f"{name}.toml").read_text("utf-8")
     return tomllib.loads(text)
 
 
+def _unknown_preset(name: str) -> str:
+    """Return the error message for a name that is no preset, with what its user may have meant."""
+    if (Path(name) / "config.toml").exists():
+        return (
+            f"{name} is a run directory: continue it with `daedalus resume {name}`, or start a new run with its "
+            f"settings with `daedalus train {name}/config.toml`"
+        )
+    if ":" in name or re.search(r"-v\d+$", name):
+        return f"unknown preset {name!r}: an environment is named with --env, such as with: daedalus train --env {name}"
+    near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"the presets are {', '.join(preset_names())}."
+    return f"unknown preset {name!r}: {hint} Any gymnasium environment runs with --env ID"
+
+
 def read_file(path: Path) -> dict[str, Any]:
-    """Return the settings in a TOML file, such as the config.toml of a run. Raises SettingsError."""
+    """Return the settings in a TOML file, such as the config.toml of a run, by section. Raises SettingsError."""
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        settings = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path} is not valid TOML: {error}") from None
+    if outside := [name for name, value in settings.items() if not isinstance(value, dict)]:
+        raise SettingsError(
+            f"{path}: {outside[0]} is a value outside of the sections: write it below a section, such as [environment]"
+        )
+    return settings
 
 
 def override(settings: dict[str, Any], assignments: Sequence[str]) -> None:
@@ -79,21 +100,34 @@ def assign(settings: dict[str, Any], path: str, value: Any) -> None:
 def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
     """Set the algorithm, unless it is None, and apply the preset's `[for_algorithm.NAME]` settings for it.
 
-    Raises SettingsError if `for_algorithm` is not a table of sections.
+    Raises SettingsError if `for_algorithm` is not a table of sections, or names an unknown algorithm or setting, also
+    for another algorithm.
     """
     training = settings.setdefault("training", {})
     if algorithm is not None:
         training["algorithm"] = algorithm
     tables = settings.pop("for_algorithm", {})
-    table = tables.get(training.get("algorithm"), {}) if isinstance(tables, dict) else tables
-    if not isinstance(table, dict) or not all(isinstance(section, dict) for section in table.values()):
-        raise SettingsError(
-            "for_algorithm is not a table of sections: write [for_algorithm.NAME.SECTION], "
-            "such as [for_algorithm.a3c.training]"
-        )
-    for section, values in table.items():
+    _check_for_algorithm(tables)
+    for section, values in tables.get(training.get("algorithm"), {}).items():
         for key, value in values.items():
             _assign(settings.setdefault(section, {}), key, value)
+
+
+def _check_for_algorithm(tables: Any) -> None:
+    for name, table in tables.items() if isinstance(tables, dict) else [("", None)]:
+        if not isinstance(table, dict) or not all(isinstance(section, dict) for section in table.values()):
+            raise SettingsError(
+                "for_algorithm is not a table of sections: write [for_algorithm.NAME.SECTION], "
+                "such as [for_algorithm.a3c.training]"
+            )
+        try:
+            check_algorithm(name)
+        except ValueError as error:
+            raise SettingsError(f"for_algorithm.{name} {error}") from None
+        for section, values in table.items():
+            for path in [[section], *([section, key] for key in values)]:
+                if path[-1] not in _known_names(path[:-1]):
+                    raise SettingsError(_unknown_setting(["for_algorithm", name, *path], path[:-1]))
 
 
 def _assign(section: dict[str, Any], key: str, value: Any) -> None:
@@ -116,29 +150,38 @@ def _one_line(error: ValidationError) -> str:
     path = [str(part) for part in first["loc"]]
     name = ".".join(path)
     if first["type"] == "extra_forbidden":
-        known = _known_names(path[:-1])
-        near = difflib.get_close_matches(path[-1], known, 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
-        return f"unknown setting {name}: {hint}"
+        return _unknown_setting(path, path[:-1])
     if first["type"] == "missing":
         return f"setting {name} is missing: add it"
     value, message = first["input"], first["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if not name:
         return message
+    if value == "" and first["type"] == "string_too_short":
+        return f"setting {name} is empty"
     if first["type"] == "tuple_type":
-        return f"setting {name} is {value!r}, which is not a list: write {_as_list(name, value)}"
+        return f"setting {name} is {value!r}{_as_list(name, value)}"
     if first["type"] == "string_pattern_mismatch":
-        return f"setting {name} is {value!r}, which is not valid. {_description(path)}"
+        hint = f": write {_FORMS[name]}" if name in _FORMS else f". {_description(path)}"
+        return f"setting {name} is {value!r}, which is not valid{hint}"
     bounds = _bounds(path)
     return f"setting {name} {message}, not {value!r}{f' (it must be {bounds})' if bounds else ''}"
 
 
+def _unknown_setting(path: list[str], section: list[str]) -> str:
+    known = _known_names(section)
+    near = difflib.get_close_matches(path[-1], known, 3, 0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
+    return f"unknown setting {'.'.join(path)}: {hint}"
+
+
 def _as_list(name: str, value: Any) -> str:
-    """Return an assignment of a list. A shell removes the quotes of texts, so that no valid list is left."""
+    """Return why a value is not a list, and how to write one. A shell removes the quotes of texts in a list."""
     if not isinstance(value, str):
-        return f"{name}=[{value}]"
+        return f", which is not a list: write {name}=[{value}]"
+    if value.startswith("[") and not value.endswith("]"):
+        return ": the closing bracket is missing"
     parts = [part.strip() for part in value.strip("[]").split(",")]
-    return f'--set "{name}={parts}"'
+    return f', which is not a list: write --set "{name}={parts}"'
 
 
 def _description(path: list[str]) -> str:
@@ -172,8 +215,12 @@ def _bounds(path: list[str]) -> str:
     found = []
     for constraint in field.metadata if field else ():
         found += [
-            f"{text} {getattr(constraint, key):g}"
+            f"{text} {_plain(getattr(constraint, key))}"
             for key, text in words.items()
             if getattr(constraint, key, None) is not None
         ]
     return " and ".join(found)
+
+
+def _plain(bound: float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"

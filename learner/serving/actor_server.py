@@ -155,7 +155,7 @@ class ActorServer:
                 self._ended_at < actor.last_seen + _LEAVE_SECONDS and not self.fleet.is_present(actor)
                 for actor in self.fleet.actors.values()
             )
-        self.events.add("ended", f"{outcome}: {reason}")
+        self.events.add("ended", reason)
         self._responses.end(self._ended, finished=finished)
         self._publish_end()
         with self.lock:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from daedalus.learner.serving.sequence_window import SequenceWindow
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import UNKNOWN, Origin
+from daedalus.protocol.texts import bounded_text
 
 _MAX_CONSECUTIVE_UNFIT = 3  # rollouts, after which the incarnation is quarantined
 _MAX_NON_FINITE = 3  # rollouts without a finite gradient, after which the incarnation is quarantined
@@ -63,7 +64,7 @@ class Actor:
         """
         self.consecutive_unfit += 1
         if self.consecutive_unfit >= _MAX_CONSECUTIVE_UNFIT:
-            self.quarantined = f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}"
+            self.quarantined = bounded_text(f"{self.consecutive_unfit} unfit rollouts in a row, the last: {violation}")
 
     def count_trained(self, *, finite: bool) -> None:
         """Count a rollout that was trained on. Quarantine the actor if several had no finite gradient.

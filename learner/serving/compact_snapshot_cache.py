@@ -1,10 +1,12 @@
 """Compact snapshots for actors on slow links: weights in bfloat16, as differences to the version that an actor holds.
 
-A compact snapshot is sent in parts. State, no I/O and no threads. Encoding is slow, so the transport's threads must not
-call this file.
+A compact snapshot is sent in parts. Each request of a fetch gives the version that the actor holds, and all but the
+first also the version of the snapshot: encoded snapshots are kept by these two, whoever asks. State, no I/O and no
+threads. Encoding is slow, so the transport's threads must not call this file.
 """
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,17 +19,20 @@ from daedalus.protocol.messages import CompactSnapshot, Refusal, Snapshot, Snaps
 # would block the learner's messages to all other readers.
 PART_BYTES = 32 << 10
 _HELD_BYTES = 64 << 20  # of versions that can be the base of a difference
-_MAX_READERS = 256  # actors that fetch a snapshot at the same time
+# Encoded snapshots are kept for the fetches in progress.
+_PREPARED_BYTES = 256 << 20
+_MAX_PREPARED = 1024  # held versions that actors name: those that are not held here share one whole snapshot
+_FORGET_SECONDS = 120.0  # after the last request; an actor that still fetches asks within 60 s
 _LARGE_DIFFERENCE = 1.3  # bytes per weight; above it, the whole snapshot may be smaller than the difference
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Prepared:
     """Encoded CompactSnapshot, before it is split into parts."""
 
-    version: int
-    base: int | None
+    base: int | None  # the version that the differences refer to; None: no differences
     encoded: bytes
+    requested_at: float  # on the monotonic clock, in seconds
 
 
 class CompactSnapshotCache:
@@ -36,7 +41,8 @@ class CompactSnapshotCache:
     def __init__(self, learner_epoch: int) -> None:
         self._epoch = learner_epoch
         self._held: dict[int, Bits] = {}  # by version, the most recently requested version last
-        self._prepared: dict[str, _Prepared] = {}  # by actor, the most recent request last
+        # By the version of the snapshot and the held version that was requested; the most recent request last.
+        self._prepared: dict[tuple[int, int | None], _Prepared] = {}
 
     def answer(self, request: SnapshotRequest, newest: bytes) -> bytes:
         """Return the encoded SnapshotPart that `request` names, or a Refusal.
@@ -45,17 +51,20 @@ class CompactSnapshotCache:
           request: names the part, and the version that the actor holds.
           newest: the newest encoded Snapshot, or the message that is sent in its place.
         """
-        if request.policy_version is None:
+        version, held = request.policy_version, request.held_version
+        if version is None:
             snapshot = decode(newest, Limits(max_bytes=len(newest)))
             if not isinstance(snapshot, Snapshot):
                 return newest
-            self._prepared.pop(request.actor, None)
-            while len(self._prepared) >= _MAX_READERS:
-                del self._prepared[next(iter(self._prepared))]
-            self._prepared[request.actor] = self._prepare(snapshot, request.held_version)
-        prepared = self._prepared.get(request.actor)
-        if prepared is None or request.policy_version not in (None, prepared.version):
+            version = snapshot.policy_version
+            if (version, held) not in self._prepared:
+                self._prepared[version, held] = self._prepare(snapshot, held)
+                self._make_room()
+        prepared = self._prepared.pop((version, held), None)
+        if prepared is None:
             return encode(Refusal(code="unknown", reason="the snapshot is no longer available: request the newest"))
+        self._prepared[version, held] = prepared
+        prepared.requested_at = time.monotonic()
         parts = -(-len(prepared.encoded) // PART_BYTES)
         if request.part >= parts:
             return encode(
@@ -65,7 +74,7 @@ class CompactSnapshotCache:
         return encode(
             SnapshotPart(
                 learner_epoch=self._epoch,
-                policy_version=prepared.version,
+                policy_version=version,
                 part=request.part,
                 parts=parts,
                 data=np.frombuffer(piece, np.uint8),
@@ -73,13 +82,13 @@ class CompactSnapshotCache:
         )
 
     def _prepare(self, snapshot: Snapshot, held: int | None) -> _Prepared:
-        """Return the encoded snapshot, from the cache if another actor requested the same difference."""
+        """Return the encoded snapshot: the whole one if `held` is no version to which a difference can be computed."""
         version = snapshot.policy_version
         base = self._held.get(held) if held is not None else None
         held = None if base is None else held
-        for prepared in self._prepared.values():
-            if (prepared.version, prepared.base) == (version, held):
-                return prepared
+        for (prepared_version, _), prepared in self._prepared.items():
+            if (prepared_version, prepared.base) == (version, held):
+                return replace(prepared)  # of the same bytes
         bits = self._held.pop(version, None) or bfloat16(snapshot.weights)
         encoded = _encoded(snapshot, bits, held, base)
         count = sum(array.size for array in bits.values())
@@ -88,7 +97,22 @@ class CompactSnapshotCache:
             if len(whole) < len(encoded):
                 encoded = whole
         self._hold(version, bits)
-        return _Prepared(version, held, encoded)
+        return _Prepared(held, encoded, time.monotonic())
+
+    def _make_room(self) -> None:
+        """Drop the encoded snapshots that were not requested for longest, but never the newest."""
+        now = time.monotonic()
+        while len(self._prepared) > 1:
+            key, oldest = next(iter(self._prepared.items()))
+            is_current = now - oldest.requested_at <= _FORGET_SECONDS
+            if is_current and len(self._prepared) <= _MAX_PREPARED and self._prepared_bytes <= _PREPARED_BYTES:
+                break
+            del self._prepared[key]
+
+    @property
+    def _prepared_bytes(self) -> int:
+        """Size of the encoded snapshots; those that several held versions share count once."""
+        return sum({id(each.encoded): len(each.encoded) for each in self._prepared.values()}.values())
 
     def _hold(self, version: int, bits: Bits) -> None:
         """Keep a version as the base of later differences. At capacity, drop the least recently requested version."""

@@ -1,8 +1,11 @@
 """Checks of the components of a rollout, its observations, actions and masks, against the spaces. Pure functions."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import Rollout
 
 _MAX_LOG_DENSITY = 20.0  # of one continuous action: its density cannot be higher, and float32 hold the noise
@@ -17,7 +20,7 @@ def first_component_violation(rollout: Rollout, spaces: Spaces) -> str:
         ("masks", rollout.masks, spaces.masks),
     ):
         if given.keys() != expected.keys():
-            return f"{kind} has the components {_names(given)}, expected {_names(expected)}"
+            return f"{kind} has the components {listed_names(given)}, expected {listed_names(expected)}"
     for name, space in spaces.observations.items():
         violation = _observation_violation(rollout, rollout.frames[name], space)
         if violation:
@@ -31,8 +34,9 @@ def first_component_violation(rollout: Rollout, spaces: Spaces) -> str:
     return _log_prob_violation(rollout, spaces)
 
 
-def _names(components: dict[str, np.ndarray] | dict[str, int] | dict) -> str:
-    return ", ".join(sorted(components)[:8]) or "none"
+def listed_names(names: Iterable[str]) -> str:
+    """Return the first names, each bounded because a peer may have chosen it."""
+    return ", ".join(bounded_text(name, MAX_NAME) for name in sorted(names)[:8]) or "none"
 
 
 def _observation_violation(rollout: Rollout, frames: np.ndarray, space: ArraySpace | DiscreteSpace) -> str:

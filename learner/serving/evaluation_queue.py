@@ -49,7 +49,7 @@ class EvaluationQueue:
             return
         sender = keys.last_chunk(request.key)
         if not isinstance(message, EvaluationRequest | EvaluationReport) or message.evaluator != sender:
-            reason = f"expected an EvaluationRequest or EvaluationReport of evaluator {sender!r}"
+            reason = f"expected an EvaluationRequest or EvaluationReport of evaluator {sender[:64]!r}"
             request.reply(encode(Refusal(code="malformed", reason=reason)))
             return
         with self._lock:

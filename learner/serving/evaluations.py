@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daedalus.learner.run.counters import RunCounters
 from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
@@ -20,10 +21,10 @@ class Evaluations:
     """Evaluations of one run during one learner epoch."""
 
     learner_epoch: int
+    counters: RunCounters
     # By evaluator: checkpoint directory, policy version, env_steps.
     in_progress: dict[str, tuple[Path, int, int]] = field(default_factory=dict)
     newest: dict[str, float] = field(default_factory=dict)  # columns of learner/reporting/metrics.py, until taken
-    best_mean: float | None = None  # the highest mean return so far
 
     @property
     def checkpoints_in_use(self) -> set[Path]:
@@ -57,7 +58,7 @@ class Evaluations:
             return Acknowledgement(verdict="rejected", reason="lengths has a value below 1"), ""
         del self.in_progress[report.evaluator]
         mean, std = float(report.returns.mean(dtype=np.float64)), float(report.returns.std(dtype=np.float64))
-        self.best_mean = mean if self.best_mean is None else max(mean, self.best_mean)
+        self.counters.evaluated(mean)
         self.newest = {
             "evaluation_return_mean": mean,
             "evaluation_return_std": std,
@@ -70,10 +71,6 @@ class Evaluations:
         except OSError as error:
             text += f", the best so far, but its checkpoint was not kept: {error.strerror}"
         return Acknowledgement(verdict="accepted"), text
-
-    def reached(self, target: float | None) -> bool:
-        """Return whether the mean return of an evaluation was at least the target."""
-        return target is not None and self.best_mean is not None and self.best_mean >= target
 
     def take_newest(self) -> dict[str, float]:
         """Return the newest evaluation as metrics; empty without an evaluation since the last call."""

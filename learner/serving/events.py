@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from daedalus.protocol import keys
 from daedalus.protocol.status import MAX_EVENTS, Event, EventKind
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.timestamps import utc
 
 _EQUAL_SECONDS = 60.0  # an equal event within this time is counted, not added
 _AT_ONCE, _PER_SECOND = 100.0, 1.0  # events of actors
-_MAX_NAME, _MAX_TEXT = 64, 300  # characters
 
 _logger = logging.getLogger(__name__)
 
@@ -51,8 +51,8 @@ class EventLog:
           cause: events of the same kind, actor and cause are equal; by default, those of the same text.
           level: severity of the log record.
         """
-        actor, text = actor[:_MAX_NAME], text[:_MAX_TEXT]
-        key: tuple[EventKind, str, str] = kind, actor, cause or text
+        actor, text = bounded_text(actor, MAX_NAME), bounded_text(text)
+        key: tuple[EventKind, str, str] = kind, actor, bounded_text(cause) or text
         now = time.monotonic()
         with self._lock:
             equal = self._equal.get(key)

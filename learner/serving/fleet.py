@@ -9,6 +9,7 @@ The lock of the actor server guards all of it.
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import MAX_ENVIRONMENTS, Join, Refusal
 from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import RolloutIdentity
 
 __all__ = ["Actor", "Fleet"]
@@ -102,8 +104,8 @@ class Fleet:
         """Note what a client reports about itself. Return None, or a Refusal if it does not take part."""
         actor = self.actors.get(name)
         if actor is None or (report.actor, report.incarnation) != (name, actor.incarnation):
-            return Refusal(code="unknown", reason=f"this process of {name!r} has not joined")
-        actor.client = report
+            return Refusal(code="unknown", reason=f"this process of {name[:64]!r} has not joined")
+        actor.client = replace(report, safe_reason=bounded_text(report.safe_reason))
         return None
 
     def drain(self, name: str) -> Refusal | None:

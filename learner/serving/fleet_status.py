@@ -7,8 +7,6 @@ from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.status import PAGE_ACTORS, ActorStatus
 
-_MAX_REASON = 300  # characters
-
 
 class FleetTotals(TypedDict):
     """Fields of RunStatus that are over all actors. The counts include forgotten actors."""
@@ -51,7 +49,7 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         software=actor.origin.software,
         address=actor.origin.address,
         alive=fleet.is_present(actor),
-        quarantined=actor.quarantined[:_MAX_REASON],
+        quarantined=actor.quarantined,
         lives=actor.incarnations,
         seconds_since_seen=max(now - actor.last_seen, 0.0),
         environments=actor.environments,
@@ -71,5 +69,5 @@ def _actor_status(fleet: Fleet, actor: Actor, now: float) -> ActorStatus:
         overridden_actions=client.overridden_actions,
         safe_actions=client.safe_actions,
         rollouts_dropped=client.rollouts_dropped,
-        safe_reason=client.safe_reason[:_MAX_REASON],
+        safe_reason=client.safe_reason,
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-_MAX_FORMER = 65_536  # about 20 MB
+_MAX_FORMER = 65_536  # 20 MB; 50 MB if all were quarantined
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from daedalus.learner.serving.components import listed_names
 from daedalus.protocol.compact import bits_of, float32
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import (
     DIAGNOSTICS,
     LARGEST_GRADIENT_NORM,
@@ -22,7 +24,7 @@ from daedalus.protocol.uploads import (
 Shapes = Mapping[str, tuple[int, ...]]
 
 _LARGEST_METRIC = 1e30
-_LARGEST_MOMENT = 1e30  # of observations of up to 1e15, squared
+_LARGEST_MOMENT = LARGEST_OBSERVATION**2  # of one row
 _ARRAY_BYTES = 16  # padding of each array, rounded up
 _MAX_METRICS = len(LOSS_TERMS) + len(DIAGNOSTICS)
 
@@ -84,10 +86,12 @@ def _gradient_violation(gradient: Gradient, shapes: Shapes) -> str:
     different = next((name for name in sorted({*given, *shapes}) if given.get(name) != shapes.get(name)), None)
     if different is not None:
         return (
-            f"the gradient of {different!r} is {_shape(given.get(different))}, and in this run's network "
-            f"{_shape(shapes.get(different))}: install the release and the modules that the learner uses"
+            f"the gradient of {bounded_text(different, MAX_NAME)!r} is {_shape(given.get(different))}, and in this "
+            f"run's network {_shape(shapes.get(different))}: install the release and the modules that the learner uses"
         )
     norm = gradient.norm
+    if not math.isfinite(norm) and not all(np.isfinite(values).all() for values in gradient.gradient.values()):
+        return "the gradient has a value that is not finite: its observations or rewards are not finite, or too large"
     if not norm <= LARGEST_GRADIENT_NORM:  # nor nan
         return (
             f"the norm of the gradient is {norm:.3g}, at most {LARGEST_GRADIENT_NORM:g} is allowed: "
@@ -104,8 +108,12 @@ def _moments_violation(gradient: Gradient, expected: dict[str, tuple[int, ...]])
     given = {name: values.shape for name, values in gradient.moments.items()}
     if given != expected:
         return f"moments are of {_shapes(given)}, expected {_shapes(expected)}"
+    most = gradient.env_steps * _LARGEST_MOMENT
     for name, values in gradient.moments.items():
-        if not np.isfinite(values).all() or np.abs(values).max() > _LARGEST_MOMENT or (values[1] < 0.0).any():
+        if not np.isfinite(values).all():
+            return f"moments/{name} has a value that is not finite"
+        mean, squares = values
+        if np.abs(mean).max() > _LARGEST_MOMENT or squares.min() < 0.0 or squares.max() > most:
             return f"moments/{name} has a value that no rollout has"
     return ""
 
@@ -113,21 +121,27 @@ def _moments_violation(gradient: Gradient, expected: dict[str, tuple[int, ...]])
 def _counts_violation(gradient: Gradient, spaces: Spaces) -> str:
     discrete = {name: space for name, space in spaces.actions.items() if isinstance(space, DiscreteSpace)}
     if gradient.action_counts.keys() != discrete.keys():
-        return f"action_counts are of {_names(gradient.action_counts)}, expected {_names(discrete)}"
+        return f"action_counts are of {listed_names(gradient.action_counts)}, expected {listed_names(discrete)}"
     for name, space in discrete.items():
         counts = gradient.action_counts[name]
-        if counts.shape != (space.choices,) or (counts < 0).any() or (counts > gradient.env_steps).any():
-            return f"action_counts/{name} is not a count of {space.choices} choices in {gradient.env_steps} env_steps"
+        most = gradient.env_steps
+        if (
+            counts.shape != (space.choices,)
+            or (counts < 0).any()
+            or (counts > most).any()  # before the sums, which could overflow
+            or (np.add.reduceat(counts, np.cumsum((0, *space.counts[:-1]))) > most).any()
+        ):
+            return f"action_counts/{name} is not a count of {space.choices} choices in {most} env_steps"
     return ""
 
 
 def _metrics_violation(gradient: Gradient) -> str:
     names = gradient.metrics.keys()
     if not set(LOSS_TERMS) <= names <= {*LOSS_TERMS, *DIAGNOSTICS}:
-        return f"metrics has the names {_names(gradient.metrics)}, expected {', '.join(LOSS_TERMS)}"
+        return f"metrics has the names {listed_names(gradient.metrics)}, expected {', '.join(LOSS_TERMS)}"
     for name, value in gradient.metrics.items():
         if not abs(float(value)) <= _LARGEST_METRIC:  # nor nan
-            return f"metrics/{name[:64]} is {float(value)}, at most {_LARGEST_METRIC:g} is allowed"
+            return f"metrics/{name} is {float(value)}, at most {_LARGEST_METRIC:g} is allowed"
     return ""
 
 
@@ -144,9 +158,5 @@ def _episodes_violation(gradient: Gradient) -> str:
     return ""
 
 
-def _names(names: Mapping[str, object]) -> str:
-    return ", ".join(sorted(name[:64] for name in names)[:8]) or "nothing"
-
-
 def _shapes(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name[:64]} {list(shapes[name])}" for name in sorted(shapes)[:8]) or "nothing"
+    return ", ".join(f"{bounded_text(name, MAX_NAME)} {list(shapes[name])}" for name in sorted(shapes)[:8]) or "none"

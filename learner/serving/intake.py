@@ -18,11 +18,13 @@ from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Gradient, Rollout, Upload
 
 # Per environment and row, besides observations, actions and masks, rounded up; integers may be sent in 8 bytes each.
 _ROW_BYTES, _INTEGER_BYTES = 24, 8
 _SLACK_BYTES = 64 << 10
+_MAX_REASON = 500  # bytes, in the answer to a rollout
 _OTHER_ARRAYS = 17  # besides observations, actions, masks and scalars of info
 # Largest decoded rollout, whichever is larger: bytes, or rollouts with the run's own number of environments. An actor
 # chooses its number, and zeros compress to nothing: the learner's memory must not depend on the actor.
@@ -256,7 +258,8 @@ def _episode_violation(rollout: Rollout) -> str:
 
 
 def acknowledgement(verdict: Upload | Rejected, policy_version: int) -> Acknowledgement:
-    """Return the answer to the sender. A long reason is cut to 500 characters."""
+    """Return the answer to the sender. A long reason is cut."""
     if isinstance(verdict, Rejected):
-        return Acknowledgement(verdict=verdict.verdict, reason=verdict.reason[:500], policy_version=policy_version)
+        reason = bounded_text(verdict.reason, _MAX_REASON)
+        return Acknowledgement(verdict=verdict.verdict, reason=reason, policy_version=policy_version)
     return Acknowledgement(verdict="accepted", policy_version=policy_version)

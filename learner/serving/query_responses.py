@@ -9,13 +9,13 @@ import threading
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.learner.serving.refused_joins import MAX_REASON
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
 from daedalus.protocol.messages import Acknowledgement, Join, Origin, Program, Refusal, Welcome
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import EventKind
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 
 
 class QueryResponses:
@@ -132,16 +132,16 @@ def _read_join(name: str, data: bytes) -> Join | Refusal:
     if not isinstance(message, Join):
         return Refusal(code="malformed", reason="expected a Join message")
     if message.actor != name:
-        reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name!r}"
+        reason = f"the Join is from {message.actor[:64]!r}, but was sent on the key of {name[:64]!r}"
         return Refusal(code="malformed", reason=reason)
     if message.failure:
-        return Refusal(code="failed", reason=message.failure[:MAX_REASON])
+        return Refusal(code="failed", reason=bounded_text(message.failure))
     return message
 
 
 def _where(origin: Origin) -> str:
     """Return host and software for a person, or an empty text if both are unknown."""
-    where = ", ".join(filter(None, (origin.host[:64], origin.software[:64])))
+    where = ", ".join(filter(None, (bounded_text(origin.host, MAX_NAME), bounded_text(origin.software, MAX_NAME))))
     return f" ({where})" if where else ""
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Origin
 from daedalus.protocol.status import RefusedJoin
+from daedalus.protocol.texts import MAX_NAME, bounded_text
 
 _MAX_ENTRIES = 32
 _FORGET_SECONDS = 3600.0  # after the last refusal
-_MAX_NAME, MAX_REASON = 64, 300  # characters: an actor chooses these texts
 
 
 @dataclass(slots=True)
@@ -36,7 +36,7 @@ class RefusedJoins:
           now: time on the monotonic clock, in seconds.
         """
         self._forget_old(now)
-        actor, origin, reason = actor[:_MAX_NAME], bounded(origin), reason[:MAX_REASON]
+        actor, origin, reason = bounded_text(actor, MAX_NAME), bounded(origin), bounded_text(reason)
         key = (origin.host or actor, reason)
         entry = self._entries.pop(key, None)
         if entry is None:
@@ -78,7 +78,9 @@ class RefusedJoins:
 
 
 def bounded(origin: Origin) -> Origin:
-    """Return an origin whose texts have at most 64 characters."""
+    """Return an origin whose texts are bounded."""
     return Origin(
-        host=origin.host[:_MAX_NAME], software=origin.software[:_MAX_NAME], address=origin.address[:_MAX_NAME]
+        host=bounded_text(origin.host, MAX_NAME),
+        software=bounded_text(origin.software, MAX_NAME),
+        address=bounded_text(origin.address, MAX_NAME),
     )

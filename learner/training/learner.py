@@ -84,7 +84,7 @@ class Learner:
         self.metrics = UpdateMetrics(spaces, self.device)
         self.policy_version = 0
         self.updates_skipped = 0  # updates whose gradient was not finite: a new version with unchanged parameters
-        self._anneal_exploration(0.0)
+        self.anneal_exploration(spec.exploration_annealing(0.0, 0))
 
     @property
     def state_size(self) -> int:
@@ -111,7 +111,6 @@ class Learner:
             kept = [rollout for rollout in kept if not any(rollout is each for each in at_fault)] if at_fault else []
         self.updates_skipped += end - self.policy_version
         self.policy_version = end
-        self._anneal_exploration(progress)
         return left_out
 
     def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
@@ -135,6 +134,7 @@ class Learner:
           progress: as for `step`.
           end: policy version after the last update.
         """
+        self.first_pass = None  # its memory is used for this batch
         for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
             if not self._make_update(terms, progress):
                 return False
@@ -176,7 +176,6 @@ class Learner:
         else:
             self.policy_version += 1
             self.updates_skipped += 1
-        self._anneal_exploration(progress)
         self._received_diagnostics = diagnostics_of(gradients[-1])
         for gradient in gradients:
             counts = gradient.action_counts.items()
@@ -206,10 +205,10 @@ class Learner:
         rho_clip = self._spec.rho_clip if self._spec.record.corrected else None
         return {} if first_pass is None else diagnostics(first_pass, rho_clip)
 
-    def _anneal_exploration(self, progress: float) -> None:
-        """Set how much actors with the next snapshot explore, at a share of the budget."""
+    def anneal_exploration(self, annealing: float) -> None:
+        """Set how much actors with the next snapshot explore: a result of `TrainingSpec.exploration_annealing`."""
         if self._network.exploration is not None:
-            self._network.exploration.set_annealing(self._spec.exploration_annealing(progress))
+            self._network.exploration.set_annealing(annealing)
 
     # ----------------------------------------------------------------------------- for actors and checkpoints
 

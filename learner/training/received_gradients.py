@@ -45,9 +45,9 @@ def mean_terms(gradients: Sequence[Gradient], device: torch.device) -> Terms:
 
 
 def batch_metrics_of(gradient: Gradient) -> Tensor | None:
-    """Return BATCH_METRICS [3] of the rollout; None if its algorithm gives none."""
-    given = [float(gradient.metrics[name]) for name in BATCH_METRICS if name in gradient.metrics]
-    return torch.tensor(given) if len(given) == len(BATCH_METRICS) else None
+    """Return BATCH_METRICS [3] of the rollout, nan for those that it does not have; None if it has none."""
+    given = [float(gradient.metrics.get(name, np.nan)) for name in BATCH_METRICS]
+    return None if np.isnan(given).all() else torch.tensor(given)
 
 
 def diagnostics_of(gradient: Gradient) -> dict[str, float]:

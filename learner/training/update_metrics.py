@@ -1,5 +1,7 @@
 """Metrics of updates and batches since the last metrics row. State; no I/O."""
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,7 +14,8 @@ from daedalus.protocol.spaces import ArraySpace, Spaces
 
 GRADIENT_NORM = "gradient_norm"
 GRADIENT_CLIPPED_FRACTION = "gradient_clipped_fraction"  # share of the updates
-METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION, *BATCH_METRICS)
+_UPDATE_METRICS = (*Terms._fields, GRADIENT_NORM, GRADIENT_CLIPPED_FRACTION)
+METRICS = (*_UPDATE_METRICS, *BATCH_METRICS)
 
 
 class UpdateMetrics:
@@ -28,7 +31,8 @@ class UpdateMetrics:
         self._sums = torch.zeros(len(Terms._fields), device=device)
         self._norms = 0.0
         self._batch_sums = torch.zeros(len(BATCH_METRICS), device=device)
-        self._updates = self._clipped_updates = self._batches = 0
+        self._batches = torch.zeros(len(BATCH_METRICS), device=device)  # that have the metric
+        self._updates = self._clipped_updates = 0
         self._actions = ActionCounts(spaces, device)
         self._newest: Tensor | None = None  # the first image of the newest batch
 
@@ -40,9 +44,10 @@ class UpdateMetrics:
         self._clipped_updates += clipped
 
     def add_batch_metrics(self, metrics: Tensor) -> None:
-        """Add BATCH_METRICS of a batch, or of the rollout of a gradient."""
-        self._batch_sums += metrics
-        self._batches += 1
+        """Add BATCH_METRICS of a batch, or of the rollout of a gradient; nan for a metric that it does not have."""
+        known = ~metrics.isnan()
+        self._batch_sums += metrics.where(known, 0.0)
+        self._batches += known
 
     def add_batch(self, batch: Batch) -> None:
         """Count the actions of a batch, and keep one of its observations."""
@@ -60,12 +65,14 @@ class UpdateMetrics:
             return {}
         means = (self._sums / self._updates).tolist()
         means += [self._norms / self._updates, self._clipped_updates / self._updates]
-        means += (self._batch_sums / self._batches).tolist() if self._batches else []
+        batch_means = (self._batch_sums / self._batches).tolist()  # nan without batches that have the metric
         self._sums.zero_()
         self._norms = 0.0
         self._batch_sums.zero_()
-        self._updates = self._clipped_updates = self._batches = 0
-        return dict(zip(METRICS, means, strict=False))  # an algorithm of the user may give no first pass
+        self._batches.zero_()
+        self._updates = self._clipped_updates = 0
+        known = {name: mean for name, mean in zip(BATCH_METRICS, batch_means, strict=True) if not math.isnan(mean)}
+        return dict(zip(_UPDATE_METRICS, means, strict=True)) | known
 
     def take_action_counts(self) -> dict[str, list[int]]:
         """Return how often each choice of each discrete component was chosen in the batches since the last call."""

@@ -6,18 +6,19 @@ import re
 import shutil
 from pathlib import Path
 
-_BEST = re.compile(r"best_(-?\d+\.\d)_(\d{10,})", re.ASCII)
+_BEST = re.compile(r"best_(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _KEPT = 3  # scores over few episodes are noisy: with several, the best can be selected over more episodes
 
 
 def best_name(score: float, policy_version: int) -> str:
-    """Return the name of a checkpoint that is among the best, such as best_812.3_0000012345.
+    """Return the name of a checkpoint that is among the best, such as best_812.34_0000012345.
 
-    Raises ValueError if the score is not finite.
+    The score in the name is exact, because checkpoints are compared by it. Raises ValueError for a score that is not
+    finite.
     """
     if not math.isfinite(score):
         raise ValueError(f"the score must be finite, not {score}")
-    return f"best_{score:.1f}_{policy_version:010d}"
+    return f"best_{float(score)!r}_{policy_version:010d}"
 
 
 def is_best(directory: Path) -> bool:
@@ -26,7 +27,7 @@ def is_best(directory: Path) -> bool:
 
 
 def best_score(directory: Path) -> float:
-    """Return the rounded score in a name made by `best_name`. Raises ValueError for another name."""
+    """Return the score in a name made by `best_name`. Raises ValueError for another name."""
     return _score_and_version(directory)[0]
 
 
@@ -40,11 +41,12 @@ def best_checkpoints(run_directory: Path) -> list[Path]:
 def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
     """Keep a checkpoint under its score if it is among the best and its version is not kept yet.
 
-    Removes the checkpoints that it displaces. Returns whether it is the best. Raises OSError if writing fails.
+    Of equal scores the newest are kept, because they were trained longer. Removes the checkpoints that it displaces.
+    Returns whether it is the best. Raises OSError if writing fails.
     """
     target = checkpoint.with_name(best_name(score, policy_version))
     kept = best_checkpoints(checkpoint.parent.parent)
-    rank = sum(_score_and_version(other)[0] >= best_score(target) for other in kept)
+    rank = sum(_score_and_version(other) > (score, policy_version) for other in kept)
     if rank >= _KEPT or any(_score_and_version(other)[1] == policy_version for other in kept):
         return False
     _link(checkpoint, target)

@@ -4,6 +4,7 @@ huggingface_hub is an extra, imported on first use. A repository may contain any
 pulled, by their names, after a check of their sizes. SealedDirectory checks their contents.
 """
 
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
 from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE
 from daedalus.policy.saving.sealed import MANIFEST, MAX_MANIFEST_BYTES, SEAL
+from daedalus.protocol.texts import bounded_text
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -84,12 +86,11 @@ def pull(repository: str, revision: str | None = None) -> Path:
             raise HubError(f"{error.reason}, and this machine has no copy of {repository}: {error.remedy}") from None
         return cached
     with hub_errors(repository, revision):
-        # By its name, one file tells the cache which commit the name stands for. All others are of the checked commit.
-        paths = [
-            Path(api.hf_hub_download(repository, name, revision=revision if name == SEAL else commit))
-            for name in LIMITS
-        ]
-    return _folder(repository, paths)
+        # Of the checked commit: a branch may have moved since, to files of any size.
+        folder = _folder(repository, [Path(api.hf_hub_download(repository, name, revision=commit)) for name in LIMITS])
+        if revision != commit:
+            _note_commit(folder, revision or "main", commit)
+    return folder
 
 
 class UnreachableError(HubError):
@@ -118,6 +119,15 @@ def _checked_commit(api: "HfApi", repository: str, revision: str | None) -> str:
     if not isinstance(info.sha, str) or re.fullmatch(r"[0-9a-f]{40}", info.sha) is None:
         raise HubError(f"the Hub names no commit of {repository}: try again later")
     return info.sha
+
+
+def _note_commit(folder: Path, name: str, commit: str) -> None:
+    """Note in the cache of huggingface_hub which commit a branch or tag stands for, as a download by name would."""
+    note = folder.parents[1] / "refs" / name
+    note.parent.mkdir(parents=True, exist_ok=True)
+    beside = note.with_name(f"{note.name}.{os.getpid()}.tmp")
+    beside.write_text(commit)
+    os.replace(beside, note)
 
 
 def _cached(api: "HfApi", repository: str, revision: str | None) -> Path | None:
@@ -171,7 +181,7 @@ def hub_errors(repository: str, revision: str | None = None) -> Iterator[None]:
                 f"the Hub refuses this for {repository} (status {status}): {_LOG_IN}, with a token that may do this"
             ) from None
         said = error.server_message or str(error).partition("\n")[0]
-        raise HubError(f"the Hub answers with status {status}: {one_line(said)}; try again later") from None
+        raise HubError(f"the Hub answers with status {status}: {bounded_text(said)}; try again later") from None
     except errors.LocalEntryNotFoundError as error:
         raise UnreachableError(f"a file of {repository} cannot be downloaded ({_cause(error)})", "try again") from None
     except (ConnectionError, TimeoutError, httpx2.HTTPError) as error:
@@ -182,10 +192,5 @@ def hub_errors(repository: str, revision: str | None = None) -> Iterator[None]:
         raise HubError(f"the Hub or its library failed: {why}; try again") from None
 
 
-def one_line(text: str) -> str:
-    """Return the first 200 characters of a foreign text as one line without control characters."""
-    return " ".join(re.sub(r"[^\x20-\x7e\xa0-\ufffd]", " ", text).split())[:200]
-
-
 def _cause(error: BaseException) -> str:
-    return one_line(str(error)) or type(error).__name__
+    return bounded_text(str(error)) or type(error).__name__

@@ -31,7 +31,7 @@ class OtherFormatError(DamagedError):
 
 
 class NoPolicyError(Exception):
-    """No policy has the given name; the message lists the names."""
+    """No policy has the given name, or is in the given directory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,13 +58,14 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
     """Return the policy of a checkpoint, or the best policy of a run directory.
 
     The newest policy of the run is returned if no checkpoint has a score or `newest` is true. Damaged checkpoints are
-    logged and skipped. Raises DamagedError if no checkpoint is readable, OtherFormatError for a run of another release.
+    logged and skipped. Raises NoPolicyError if there is no checkpoint, DamagedError if none is readable,
+    OtherFormatError for a run of another release.
     """
     if (directory / "manifest.json").exists():
         return read_policy(directory)
     candidates = [*([] if newest else best_checkpoints(directory)), *checkpoints(directory)]
     if not candidates:
-        raise DamagedError(f"{directory} has no checkpoints: is it a run directory?")
+        raise NoPolicyError(_no_checkpoints(directory))
     for candidate in candidates:
         try:
             return read_policy(candidate)
@@ -73,6 +74,14 @@ def find_policy(directory: Path, newest: bool = False) -> SavedPolicy:
         except DamagedError as error:
             _logger.warning("skipped a damaged checkpoint: %s", error)
     raise DamagedError(f"{directory} has no readable checkpoint")
+
+
+def _no_checkpoints(directory: Path) -> str:
+    if not directory.exists():
+        return f"{directory} does not exist: name a run directory or one of its checkpoints"
+    if (directory / "config.toml").exists():
+        return f"{directory} has no checkpoints yet: its learner saves the first one after service.checkpoint_seconds"
+    return f"{directory} has no checkpoints: is it a run directory?"
 
 
 def pretrained(name: str) -> Path:

@@ -14,8 +14,11 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from daedalus.policy.saving.regular_files import read_regular
+
 MANIFEST, SEAL = "manifest.json", "seal"
 MAX_MANIFEST_BYTES = 16 << 20
+_SEAL_BYTES = 64
 
 
 class DamagedError(Exception):
@@ -83,12 +86,12 @@ class SealedDirectory:
         """Raise DamagedError, naming the directory, if the manifest is missing or damaged."""
         self._directory = directory
         try:
-            if (directory / MANIFEST).stat().st_size > MAX_MANIFEST_BYTES:
-                raise DamagedError(f"{directory}: the manifest is too large")
-            manifest = (directory / MANIFEST).read_bytes()
-            seal = (directory / SEAL).read_bytes()
+            manifest = read_regular(directory / MANIFEST, MAX_MANIFEST_BYTES + 1)
+            seal = read_regular(directory / SEAL, _SEAL_BYTES + 1)
         except OSError as error:
             raise DamagedError(f"{directory}: {error.strerror}: {error.filename}") from None
+        if len(manifest) > MAX_MANIFEST_BYTES:
+            raise DamagedError(f"{directory}: the manifest is too large")
         if hashlib.sha256(manifest).hexdigest().encode() != seal:
             raise DamagedError(f"{directory}: the manifest is damaged")
         try:
@@ -107,7 +110,7 @@ class SealedDirectory:
             size = (self._directory / name).stat().st_size
             if size != entry.bytes:
                 raise DamagedError(f"{self._directory / name}: {size} bytes instead of {entry.bytes}")
-            data = (self._directory / name).read_bytes()
+            data = read_regular(self._directory / name, entry.bytes)
         except OSError as error:
             raise DamagedError(f"{self._directory / name}: {error.strerror}") from None
         if hashlib.sha256(data).hexdigest() != entry.sha256:

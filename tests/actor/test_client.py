@@ -1,6 +1,8 @@
 """Client: what its own thread reports to the caller's thread."""
 
+import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -11,7 +13,7 @@ from scripted_learner import ScriptedLearner, acknowledge
 from daedalus.actor import Client
 from daedalus.actor import client as client_module
 from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Refusal
@@ -66,6 +68,37 @@ def test_act_raises_a_bug_of_the_clients_thread(learner: ScriptedLearner, monkey
         until(lambda: client.is_over)
         with pytest.raises(ZeroDivisionError, match="a bug"):
             client.act(OBSERVATION)
+
+
+class InterruptedEvent(threading.Event):
+    """An event whose wait ends with Ctrl-C."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_while_waiting_for_a_policy_closes_the_session(
+    network: MemoryNetwork, learner: ScriptedLearner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that ends with an open Zenoh session aborts."""
+    learner.snapshot = encode(Refusal(code="not_ready", reason=""))
+    construct = ClientCollector.__init__
+
+    def construct_interrupted(collector: ClientCollector, *arguments: Any, **options: Any) -> None:
+        construct(collector, *arguments, **options)
+        collector.policy_loaded = InterruptedEvent()
+
+    monkeypatch.setattr(ClientCollector, "__init__", construct_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Client("tcp/127.0.0.1:1", **SPACES)
+    assert network.ends == [learner.transport]
+    assert "actor" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_run_that_is_over_has_no_client(learner: ScriptedLearner) -> None:
+    learner.refusal = Refusal(code="finished", reason="the run is over")
+    with pytest.raises(ActorError, match="the run ended before a policy came"):
+        Client("tcp/127.0.0.1:1", **SPACES)
 
 
 def acts_until(client: Client, condition: Callable[[], bool]) -> None:

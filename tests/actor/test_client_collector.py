@@ -14,9 +14,10 @@ from collectors import started_collector
 
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.collecting.client_exchange import _MAX_FULL_ROLLOUTS
+from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.learner.serving.intake import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -141,6 +142,38 @@ def test_new_policy_acts_from_the_first_step_after_its_weights_came() -> None:
     client.load(played.snapshot(7))
     drive(client, robot, 2 * ROWS)
     assert take(client).policy_version == 7
+
+
+def test_agent_acts_on_when_another_learner_is_joined_while_it_changes_to_the_policy_of_the_last_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    played = Played(run_spec())
+    client, robot = begun(played)
+    observe = ClientRows.observe
+
+    def join_another(rows: ClientRows, *arguments: Any) -> None:
+        """Stand for the service's thread, which may do this at any moment."""
+        monkeypatch.setattr(ClientRows, "observe", observe)
+        client.begin(played.runtime(), played.spec, 4)
+        rows.observe(*arguments)
+
+    monkeypatch.setattr(ClientRows, "observe", join_another)
+    drive(client, robot, 40)
+    assert not client.has_rollout(), "no learner takes the rollouts of the policy before"
+    client.load(played.snapshot(2))
+    drive(client, robot, 40)
+    assert take(client).policy_version == 2
+
+
+def test_first_action_is_of_a_policy_that_came_although_another_learner_is_joined() -> None:
+    played = Played(run_spec())
+    client, robot = begun(played)
+    client.begin(played.runtime(), played.spec, 4)
+    drive(client, robot, 40)
+    assert not client.has_rollout()
+    client.load(played.snapshot(2))
+    drive(client, robot, 2 * ROWS)
+    assert take(client).policy_version == 2
 
 
 def test_invalid_calls_raise_and_change_nothing() -> None:

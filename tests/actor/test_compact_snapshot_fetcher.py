@@ -170,6 +170,34 @@ def test_invalid_answer_ends_the_fetch_and_the_next_succeeds(ends: tuple[Learner
     assert len(learner.taken) == 1
 
 
+def part(number: int, size: int) -> bytes:
+    content = np.zeros(size, np.uint8)
+    return encode(SnapshotPart(learner_epoch=5, policy_version=1, part=number, parts=100, data=content))
+
+
+def test_parts_are_together_no_larger_than_a_snapshot(
+    ends: tuple[Learner, Fetcher], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compact_snapshot_fetcher, "LEARNER_LIMITS", Limits(max_bytes=10_000, max_header_bytes=0))
+    learner, fetcher = ends
+    fetcher.request_newest()
+    for number in range(2):
+        learner.requests.get().reply(part(number, 4_000))
+        assert fetcher.in_progress
+    learner.requests.get().reply(part(2, 4_000))
+    assert not fetcher.in_progress
+    assert fetcher.take() is None
+
+
+def test_part_that_comes_twice_ends_the_fetch(ends: tuple[Learner, Fetcher]) -> None:
+    learner, fetcher = ends
+    fetcher.request_newest()
+    for _ in range(2):
+        assert fetcher.in_progress
+        learner.requests.get().reply(part(0, 10))
+    assert not fetcher.in_progress
+
+
 def test_run_ended_is_passed_on(ends: tuple[Learner, Fetcher]) -> None:
     learner, fetcher = ends
     fetcher.request_newest()

@@ -229,7 +229,7 @@ def test_discrete_observation_outside_its_space_is_refused() -> None:
             gym.Box(np.array([0, 1], np.float32), np.ones(2, np.float32)),
             "the lower bound 1 is not below the upper bound 1: leave a number that cannot change out of the action",
         ),
-        (gym.Box(-1, 1, (0,)), gym.Discrete(2), "use an array with one to 4 axes that is not empty"),
+        (gym.Box(-1, 1, (0,)), gym.Discrete(2), "use an array with at most 4 axes that is not empty"),
         (gym.Discrete(2), gym.Box(-1, 1, (0,)), "use an array of numbers that is not empty"),
     ],
 )
@@ -263,7 +263,7 @@ def test_components_that_are_left_out_are_not_read() -> None:
 @pytest.mark.parametrize(
     ("leave_out", "reason"),
     [
-        ((), r"component 'arm5'\) is not supported: .*with one to 4 axes.*\"environment.leave_out=\['arm5'\]\""),
+        ((), r"component 'arm5'\) is not supported: .*with at most 4 axes.*\"environment.leave_out=\['arm5'\]\""),
         (("arm5", "word"), r"leave_out names 'word', but the components of the observation are arm5, text"),
         (("arm5", "text"), "leave_out names every component of the observation: keep one"),
         (("arm5",), r"component 'text'\) is not supported: use Box, .*\"environment.leave_out=\['text'\]\""),

@@ -162,7 +162,20 @@ class _Losing(gymnasium.Env[np.ndarray, np.int64]):
         return np.zeros(2, np.float32), -3.0, False, False, {}
 
 
+class _Ending(_Losing):
+    """Terminates at its third step."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        self.steps = 0
+        return super().reset()
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.steps += 1
+        return np.zeros(2, np.float32), -3.0, self.steps == 3, False, {}
+
+
 gymnasium.register("Losing-v0", lambda **_kwargs: _Losing())
+gymnasium.register("Ending-v0", lambda **_kwargs: _Ending())
 
 
 @pytest.mark.parametrize("bootstrap", [False, True])
@@ -173,6 +186,17 @@ def test_value_after_an_episode_that_no_reward_limit_ends_is_zero(bootstrap: boo
     ends = [False, False, True, False, False, False, True, False]  # the row after an end resets
     assert rollout.terminated.T.tolist() == [ends] * rollout.environments
     assert (rollout.truncated >= rollout.terminated).all()
+
+
+@pytest.mark.parametrize("no_reward_limit", [None, 5], ids=["unlimited", "limited"])
+def test_termination_at_the_time_limit_is_bootstrapped_like_any_other(no_reward_limit: int | None) -> None:
+    """gymnasium's time limit sets both flags there, but nobody gave the episode up."""
+    spec = EnvironmentSpec(
+        id="Ending-v0", max_episode_steps=3, bootstrap_terminations=True, no_reward_limit=no_reward_limit
+    )
+    rollout = collect(started_collector(spec, Scripted(), rollout_length=4))
+    assert not rollout.terminated.any()
+    assert rollout.truncated[:, 0].tolist() == [False, False, True, False]
 
 
 def test_negative_rewards_are_clipped_like_positive_ones() -> None:

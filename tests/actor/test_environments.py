@@ -1,5 +1,6 @@
 """make_environments: what it creates, and its errors."""
 
+import re
 import warnings
 from typing import Any, Literal
 
@@ -72,6 +73,36 @@ def _needs(backend: str) -> None:
 def test_unknown_environment_error_suggests_close_matches() -> None:
     with pytest.raises(EnvironmentSetupError, match="unknown environment 'CartPoll-v1': did you mean CartPole-v1"):
         make_environments(EnvironmentSpec(id="CartPoll-v1"), 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("cartpole", "did you mean CartPole-v1 or CartPole-v0? Or, if it is your own, write module:cartpole, with the"),
+        ("Zebrafish-v0", "if it is your own, write module:Zebrafish-v0, with the module that registers it"),
+    ],
+)
+def test_unknown_environment_may_be_the_users_own(name: str, hint: str) -> None:
+    with pytest.raises(EnvironmentSetupError) as error:
+        make_environments(EnvironmentSpec(id=name), 1)
+    assert str(error.value).startswith(f"unknown environment {name!r}: {hint}")
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("faulty_environments:Fault-v0", "; did you mean faulty_environments:Faulty-v0?"),
+        ("faulty_environments:Corridor-v1", "; it registers faulty_environments:Faulty-v0"),
+        ("colorsys:Corridor-v1", ""),
+    ],
+)
+def test_environment_that_its_module_does_not_register_is_reported_with_the_file(name: str, hint: str) -> None:
+    module, _, asked = name.partition(":")
+    with pytest.raises(EnvironmentSetupError) as error:
+        make_environments(EnvironmentSpec(id=name), 1, modules=UserModules(frozenset({module})))
+    assert re.fullmatch(
+        rf"unknown environment '{name}': \S*{module}.py registers no {asked}{re.escape(hint)}", str(error.value)
+    )
 
 
 def test_missing_module_is_named() -> None:

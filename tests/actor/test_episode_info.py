@@ -9,7 +9,7 @@ from collectors import collect, started_collector
 from counting_environment import Counting
 from plain import PlainPolicy
 
-from daedalus.actor.environments.episode_info import EpisodeInfo
+from daedalus.actor.environments.episode_info import EpisodeInfo, info_to_keep
 from daedalus.protocol.spec import EnvironmentSpec
 
 ENDED = np.array([True, False, True, True])
@@ -45,11 +45,31 @@ def test_environments_that_gave_no_value_are_left_out() -> None:
         {"episode": {"r": np.zeros(4)}},
         {"_hidden": np.zeros(4)},
         {"a/b": np.zeros(4), "": np.zeros(4), "x" * 65: np.zeros(4), "\x1b[2J": np.zeros(4)},
+        {7: np.ones(4), (1, 2): np.ones(4), None: np.ones(4)},
         {"infinite": np.array([np.nan, 1.0, np.inf, 1e300])},
     ],
 )
-def test_other_entries_are_left_out(info: dict[str, Any]) -> None:
+def test_other_entries_are_left_out(info: dict[Any, Any]) -> None:
     assert taken(info) == {}
+
+
+def test_only_scalars_and_masks_are_kept() -> None:
+    mask = np.ones(3, np.int8)
+    scalars = {
+        "a": 1,
+        "b": True,
+        "c": 2.5,
+        "d": np.float32(0.5),
+        "e": np.uint64(2**63),
+        "f": np.array(4),
+        "g": np.True_,
+    }
+    others = {8: 1.0, "_h": 1.0, "i j": 1.0, "k": None, "l": "2", "m": 1j, "n": np.ones(1), "o": 10**400, "p": {"q": 1}}
+    kept = info_to_keep({**scalars, **others, "action_mask": mask}, ended=True)
+    assert kept.pop("action_mask") is mask
+    assert kept == {"a": 1.0, "b": 1.0, "c": 2.5, "d": 0.5, "e": 2.0**63, "f": 4.0, "g": 1.0}
+    assert {type(value) for value in kept.values()} == {float}  # gymnasium gives a batch the type of its first value
+    assert list(info_to_keep({**scalars, "action_mask": mask}, ended=False)) == ["action_mask"]
 
 
 def test_names_and_values_are_limited() -> None:

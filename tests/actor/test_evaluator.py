@@ -12,7 +12,7 @@ from processes import LIMIT
 from scripted_evaluations import SPACES, RunningEvaluator, ScriptedLearner, run_spec
 
 from daedalus.actor.environments.interface import Observed, Step
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session.origin import own_origin
 from daedalus.protocol.messages import Join, Refusal
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport

@@ -32,6 +32,7 @@ def make_environments(spec: EnvironmentSpec, count: int, **options: Any) -> Plai
     return PlainEnvironments(created(spec, count, **options))
 
 
+FAULTY = UserModules(frozenset({"faulty_environments"}))
 TABLE = ((-1.0, 0.5), (0.0, 0.0), (0.0, 0.5))  # rewards -0.5, 0 and 0.5
 
 
@@ -177,8 +178,28 @@ def test_camera_requires_an_environment_that_renders_images() -> None:
         def render(self) -> None:  # type: ignore[override] - on purpose
             return None
 
-    with pytest.raises(EnvironmentSetupError, match="renders NoneType instead of an image"):
-        RepeatedSteps(Dark(), repeat=1, no_reward_limit=None, camera=lambda _: None).reset()
+    class Broken(Picture):
+        def render(self) -> np.ndarray:
+            raise RuntimeError("no display")
+
+    class Without(Picture):
+        def render(self) -> np.ndarray:
+            raise NotImplementedError  # as gymnasium.Env does
+
+    for environment, reason in (
+        (Dark(), " renders NoneType instead of an image"),
+        (Broken(), r": render raises RuntimeError: no display \(.*test_gymnasium_backend.py, line \d+\)"),
+        (Without(), " cannot render rgb_array images"),
+    ):
+        filmed = RepeatedSteps(environment, "Mine-v0", repeat=1, no_reward_limit=None, camera=lambda _: None)
+        with pytest.raises(EnvironmentSetupError, match=f"environment Mine-v0{reason}: a video of it cannot be recor"):
+            filmed.reset()
+
+
+def test_environment_whose_constructor_takes_no_render_mode_cannot_be_filmed() -> None:
+    spec = EnvironmentSpec(id="faulty_environments:Faulty-v0")
+    with pytest.raises(EnvironmentSetupError, match="Faulty-v0 cannot render rgb_array images: its constructor has no"):
+        make_gymnasium(spec, 1, modules=FAULTY, render_mode="rgb_array", camera=lambda _: None)
 
 
 # ------------------------------------------------------------------------------------------------- processes
@@ -201,7 +222,7 @@ def test_processes_give_the_same_steps_as_one_process() -> None:
 
 
 def _processes(**fields) -> EnvironmentProcesses:
-    return EnvironmentProcesses([EnvironmentFactory(spec=_counting(**fields), modules=TEST_MODULES)] * 2)
+    return EnvironmentProcesses("Mine-v0", [EnvironmentFactory(spec=_counting(**fields), modules=TEST_MODULES)] * 2)
 
 
 def test_close_ends_the_processes() -> None:
@@ -232,8 +253,7 @@ def test_close_ends_processes_whose_environments_do_not_close(monkeypatch: pytes
     monkeypatch.setattr(environment_processes, "_CLOSE_SECONDS", 0.5)
     monkeypatch.setattr(environment_processes, "_TERMINATE_SECONDS", 0.1)
     spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "close"})
-    factory = EnvironmentFactory(spec=spec, modules=UserModules(frozenset({"faulty_environments"})))
-    environments = EnvironmentProcesses([factory] * 2)
+    environments = EnvironmentProcesses("Mine-v0", [EnvironmentFactory(spec=spec, modules=FAULTY)] * 2)
     environments.reset(seed=1)
     environments.step(np.zeros(2, np.int64))
     environments.close()
@@ -245,7 +265,9 @@ def test_killed_process_is_reported_and_close_ends_the_others() -> None:
     environments.reset(seed=1)
     environments.processes[0].kill()
     environments.processes[0].join()
-    with pytest.raises(EnvironmentSetupError, match="has died"):
+    with pytest.raises(
+        EnvironmentSetupError, match=r"environment Mine-v0: .* has died \(signal 9\): .* lack of memory"
+    ):
         environments.step(np.zeros(2, np.int64))
     environments.close()
     assert not any(process.is_alive() for process in environments.processes)
@@ -327,8 +349,65 @@ def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.Monke
     environments = created(EnvironmentSpec(id="Drifting-v0"), 2)
     environments.reset(1)
     environments.step({"action": np.zeros((2, 1), np.int64)})
-    with pytest.raises(KeyError, match="gripper"):
+    with pytest.raises(EnvironmentSetupError, match="Drifting-v0: step raises KeyError: 'gripper'"):
         environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
+# ------------------------------------------------------------------------------------------------ failures in play
+
+
+def _play(processes: bool, steps: int = 12, **settings: Any) -> dict[str, list[float]]:
+    """Play two faulty environments, and return the scalars of their infos."""
+    spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", processes=processes, **settings)
+    environments = make.make_environments(spec, 2, modules=FAULTY)
+    try:
+        environments.reset(1)
+        for _ in range(steps):
+            environments.step({"action": np.zeros((2, 1), np.int64)})
+        return {name: values.tolist() for name, values in environments.take_episode_info().items()}
+    finally:
+        environments.close()
+
+
+@pytest.mark.parametrize("processes", [False, True])
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"kwargs": {"fault": "error"}}, "step raises KeyError: 'missing'"),
+        ({"kwargs": {"fault": "second episode"}}, "reset raises ValueError: map 2 is missing"),
+        ({"kwargs": {"fault": "exit"}}, "step raises SystemExit: 0"),
+        ({"kwargs": {"fault": "error of a class of its own"}}, r"step raises _SimulatorError: no contact \(code 3\)"),
+        ({"wrap": "faulty_environments:with_failing_step"}, "step raises RuntimeError: the wrapper fails"),
+    ],
+)
+def test_exception_of_an_environment_is_reported_with_its_place(
+    processes: bool, settings: dict[str, Any], reason: str
+) -> None:
+    place = r" \(.*faulty_environments.py, line \d+\)$"
+    with pytest.raises(EnvironmentSetupError, match=f"^environment faulty_environments:Faulty-v0: {reason}{place}"):
+        _play(processes, **settings)
+
+
+def test_traceback_is_logged_only_where_it_says_more_than_the_place(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(EnvironmentSetupError):
+        _play(False, kwargs={"fault": "error"})
+    assert not caplog.records
+    with pytest.raises(EnvironmentSetupError):
+        _play(False, kwargs={"fault": "error in a function"})
+    lines = caplog.text.splitlines()
+    assert "environment faulty_environments:Faulty-v0: step failed" in lines[0]
+    assert [line.split(" in ")[1] for line in lines if " in " in line] == ["step", "_connect"]
+
+
+def test_process_that_an_environment_ends_is_reported_with_its_status() -> None:
+    with pytest.raises(EnvironmentSetupError, match=r"Faulty-v0: the process of .* has died \(status 7\)"):
+        _play(True, kwargs={"fault": "crash"})
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_entries_of_info_that_are_no_scalars_are_left_out(processes: bool) -> None:
+    found = _play(processes, kwargs={"fault": "info"})
+    assert found == {"length": [10.0, 10.0], "hash": [float(2**63)] * 2}
 
 
 # ----------------------------------------------------------------------------------------------- missing packages

@@ -9,8 +9,8 @@ from log_lines import LINES
 from processes import LIMIT, until
 from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session import learner_queries, service, session_monitor
-from daedalus.actor.session.learner_queries import ActorError
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome

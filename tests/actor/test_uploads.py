@@ -10,7 +10,7 @@ from processes import LIMIT
 from scripted_learner import POLICY, SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session.uploads import RolloutUploads, make_uploads
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
@@ -52,7 +52,7 @@ def test_an_actor_that_uploads_rollouts_never_imports_torch() -> None:
     program = """
 import sys
 sys.modules["torch"] = None  # as if it were not installed
-from daedalus.actor.session.learner_queries import ActorError
+from daedalus.actor.errors import ActorError
 from daedalus.actor.session.uploads import make_uploads
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import Spaces

@@ -214,6 +214,7 @@ def test_a_resumed_learner_continues_to_the_bit(policy: PolicySpec) -> None:
     whole, resumed = learner_of(policy=policy, **common), learner_of(policy=policy, seed=9, **common)
     for step in range(6):
         whole.step(make_rollouts(step, state_size=whole.state_size), step / 12)
+    whole.anneal_exploration(0.5)
     state = {name: values.clone() for name, values in whole.state().items()}
     saved = {name: values.copy() for name, values in whole.weights().items()}
     resumed.restore(whole.policy_version, saved, state)

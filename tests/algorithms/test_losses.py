@@ -193,6 +193,17 @@ def test_normalized_of_equal_advantages_is_0() -> None:
     assert normalized(torch.tensor([[3.0, 5.0]]), torch.tensor([[1.0, 0.0]]))[0, 0].item() == 0.0  # one valid row
 
 
+@pytest.mark.parametrize("value", [0.1, 0.3, -1.1, 7.7, 1e6])
+@pytest.mark.parametrize("number", [2048, 2047, 1999, 3])
+def test_normalized_of_equal_advantages_is_about_0_where_their_mean_is_rounded(value: float, number: int) -> None:
+    assert normalized(torch.full((number, 1), value), torch.ones(number, 1)).abs().max() < 0.01
+
+
+def test_normalized_keeps_differences_that_are_small_beside_the_mean() -> None:
+    advantages = torch.tensor([[1000.0, 1001.0, 999.0]])
+    assert_close(normalized(advantages, torch.ones(1, 3)), torch.tensor([[0.0, 1.5**0.5, -(1.5**0.5)]]))
+
+
 def test_normalized_does_not_amplify_differences_that_are_only_rounding() -> None:
     tiny = torch.tensor([[1e-9, -1e-9]])
     positive, negative = normalized(tiny, torch.ones(1, 2))[0].tolist()
@@ -212,12 +223,18 @@ def test_explained_variance_is_1_for_a_perfect_critic_0_for_a_mean_and_negative_
     assert explained_variance(-targets, targets, shares_of(valid)).item() == pytest.approx(-3.0, rel=1e-4)
 
 
+@pytest.mark.parametrize("target", [0.0, 1.0, -0.3, 1e6])
+def test_explained_variance_of_equal_targets_is_unknown(random: torch.Generator, valid: Tensor, target: float) -> None:
+    assert explained_variance(normal(random), torch.full_like(valid, target), shares_of(valid)).isnan()
+    assert explained_variance(normal(random), normal(random), torch.zeros_like(valid)).isnan()  # of no rows
+
+
 def test_explained_variance_equals_its_definition_over_the_valid_rows(random: torch.Generator, valid: Tensor) -> None:
     values, targets = normal(random), normal(random)
     kept = valid == 1.0
     residual = (targets - values)[kept]
     expected = 1.0 - residual.var(correction=0) / targets[kept].var(correction=0)
-    for scale in (1.0, 0.01):  # it does not depend on the unit of the rewards
+    for scale in (1.0, 0.01, 1e-6):  # it does not depend on the unit of the rewards
         assert_close(explained_variance(scale * values, scale * targets, shares_of(valid)), expected)
     assert_close(variance(values, shares_of(valid)), values[kept].var(correction=0))
 

@@ -1,5 +1,6 @@
 """algorithms/rollout_gradients.py: what actors compute is what the learner would compute from their rollouts."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed, unpacked
 from daedalus.algorithms.gradients import Terms
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.learner.serving.gradient_checks import restored
+from daedalus.learner.serving.gradient_checks import first_violation, restored
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.protocol.codec import decode, encode
@@ -179,3 +180,37 @@ def test_weights_that_do_not_fit_are_refused() -> None:
     ):
         with pytest.raises(PolicyError, match=reason):
             actor.load(wrong)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_actor_recovers_from_a_reward_that_is_not_finite(bad: float) -> None:
+    """Without a new snapshot, too: the learner makes none while it rejects every gradient."""
+    spec = spec_of(algorithm="a3c", normalize_rewards=True)
+    learner = learner_of(spec)
+    actor = RolloutGradients(spec, SPACES)
+    actor.load(snapshot(learner))
+    rewards = played("a", 0).rewards.copy()
+    rewards[-1, :] = bad
+    rollouts = [replace(played("a", 0), rewards=rewards), played("a", 1), played("a", 2)]
+    violations = [
+        first_violation(restored(sent(actor, each)), spec, learner.gradient_shapes, SPACES, ENVIRONMENTS)
+        for each in rollouts
+    ]
+    assert "not finite" in violations[0]
+    assert violations[1:] == ["", ""]
+
+
+def test_a_gradient_of_equal_targets_has_no_explained_variance() -> None:
+    spec = spec_of(algorithm="a3c", discount_factor=0.0)  # the target of a row is its reward
+    by_rollouts, by_gradients = learner_of(spec), learner_of(spec)
+    actor = RolloutGradients(spec, SPACES)
+    actor.load(snapshot(by_gradients))
+    rollout = replace(played("a", 0), rewards=np.full_like(played("a", 0).rewards, 0.7))
+    gradient = restored(sent(actor, rollout))
+    assert first_violation(gradient, spec, by_gradients.gradient_shapes, SPACES, ENVIRONMENTS) == ""
+    by_gradients.apply([gradient], 0.0)
+    by_rollouts.step([rollout], 0.0)
+    for learner in (by_rollouts, by_gradients):
+        means = learner.metrics.take_means()
+        assert "explained_variance" not in means
+        assert means["value_mean"] != 0.0

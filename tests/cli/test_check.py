@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from daedalus.cli.commands import check as command
 from daedalus.cli.commands.check import check
 
 ENV = ["--env", "faulty_environments:Faulty-v0", "--seconds", "0.05"]
@@ -32,6 +33,11 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
     [
         (["--set", "environment.kwargs.fault=reward"], "problem       environment .* the reward nan: it must be fini"),
         (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
+        (
+            ["--set", "environment.kwargs.fault=crash"],
+            r"problem       .*Faulty-v0 ended its process \(status 7\), as it",
+        ),
+        (["--set", "environment.kwargs.fault=exit"], "problem       .*Faulty-v0: step raises SystemExit: 0 "),
     ],
 )
 def test_a_problem_is_the_exit_status(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,9 +46,24 @@ def test_a_problem_is_the_exit_status(words: list[str], message: str, capsys: py
     assert any(re.match(message, line) for line in output.splitlines()), output
 
 
+def test_an_environment_that_hangs_is_a_problem(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(command, "_MORE_SECONDS", 0.45)
+    assert check([*ENV, "--set", "environment.kwargs.fault=hang"]) == 1
+    assert "Faulty-v0: the check was not done within 0.5 s: a call does not return" in capsys.readouterr().out
+
+
+def test_an_unknown_environment_with_the_name_of_a_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check(["--env", "cartpole"]) == 1
+    assert "; 'cartpole' is a preset, which is named without --env" in capsys.readouterr().out
+
+
 def test_warnings_do_not_change_the_exit_status(capsys: pytest.CaptureFixture[str]) -> None:
     assert check([*ENV, "--set", "environment.kwargs.fault=bounds"]) == 0
-    assert "warning       environment" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("warning       environment") for line in lines) == 2
+    assert lines[-1] == "result        can be trained on, with 2 warnings"
 
 
 @pytest.mark.parametrize("words", [["--env", "A", "--set", "environment.id=B"], ["cartpole", "--seconds", "0"]])

@@ -61,14 +61,27 @@ def test_few_lines_are_all_shown_and_nothing_makes_no_log(screen: Screen) -> Non
     assert len(logged) == 4
 
 
-def test_error_lines_that_were_not_shown_are_kept(screen: Screen) -> None:
-    print_errors = "import sys\nfor n in range(100): print('error', n, file=sys.stderr)"
-    screen.run("evaluation-1", print_errors, shown=())
+PRINT_ERRORS = "import sys\nfor n in range(100): print('error', n, file=sys.stderr)"
+
+
+def test_error_lines_of_a_process_that_is_not_shown_are_kept(screen: Screen) -> None:
+    screen.run("evaluation-1", PRINT_ERRORS, shown=())
     assert screen.output.unshown("evaluation-1") == [f"error {n}" for n in range(60, 100)]
-    screen.run("actor-0", print_errors)
-    assert screen.output.unshown("actor-0")[-1] == "error 99"
+    screen.output.close()
+    assert screen.err == []
+
+
+def test_the_last_error_lines_of_a_process_are_shown(screen: Screen) -> None:
+    for _ in range(2):
+        screen.run("actor-0", PRINT_ERRORS)
+        assert screen.output.last_error("actor-0") == "error 99"
+        assert screen.err[-5:] == [f"error {n}" for n in range(95, 100)]
+    screen.run("actor-1", "print('no error')")
+    assert screen.output.last_error("actor-1") == ""
     screen.output.close()
     assert len(screen.err) < 100
+    (last,) = [line for line in screen.out if "were not shown" in line]
+    assert last.startswith(f"{200 - len(screen.err)} lines")
 
 
 def test_unlimited_output_is_shown_and_not_logged(screen: Screen) -> None:

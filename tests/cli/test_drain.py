@@ -44,8 +44,8 @@ def network() -> MemoryNetwork:
     return MemoryNetwork()
 
 
-def drained(network: MemoryNetwork, name: str = "box", timeout: float | None = None) -> None:
-    drain.drain_actors(MemoryTransport(network), "*", [name], timeout)
+def drained(network: MemoryNetwork, name: str = "box", timeout: float | None = None, run: str = "*") -> None:
+    drain.drain_actors(MemoryTransport(network), run, [name], timeout)
 
 
 def test_command_returns_when_the_actor_has_left(network: MemoryNetwork, capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,8 +64,10 @@ def test_failures_name_what_to_do(network: MemoryNetwork) -> None:
     with pytest.raises(drain.DrainError, match="is a learner running"):
         drained(network)
     learner = Learner(network, leaves_after=10**9)
-    with pytest.raises(drain.DrainError, match="no actor 'other' takes part: `daedalus status` lists them"):
+    with pytest.raises(drain.DrainError, match=r"no actor 'other' takes part: `daedalus status` lists them"):
         drained(network, "other")
+    with pytest.raises(drain.DrainError, match=r"^no learner of run 'other' answers; the runs here are 'mine'$"):
+        drained(network, run="other")
     with pytest.raises(drain.DrainError, match="run 'mine' does not answer: run this command again"):
         drained(network)
     learner.serve_drain()

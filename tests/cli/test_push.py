@@ -239,7 +239,7 @@ def nothing(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
         (nothing, "run cart", "'cart' is not the name of a repository: write USER/NAME"),
         (nothing, "run ada/../cart", "'ada/../cart' is not the name of a repository: write USER/NAME"),
         (nothing, "nowhere ada/cart", "nowhere does not exist: name a run directory"),
-        (nothing, "empty ada/cart", "empty has no checkpoints: is it a run directory?"),
+        (nothing, "empty ada/cart", "empty has no checkpoints yet: its learner saves the first one after"),
     ],
 )
 def test_a_push_that_fails_is_one_line(
@@ -375,6 +375,23 @@ def test_sizes_are_checked_before_anything_is_pulled(hub: HubServer, file: str, 
     with pytest.raises(HubError, match=message):
         pull("ada/cart")
     assert not any("/resolve/" in each for each in hub.requests)
+
+
+def test_a_branch_that_moves_after_the_check_does_not_matter(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_of(Path("run"), 4)
+    assert push(["run", "ada/cart"]) == 0
+    check = hub_module._checked_commit
+
+    def moving(*arguments: Any) -> str:
+        commit = check(*arguments)
+        hub.repositories["ada/cart"].commit({**hub.files("ada/cart"), "seal": b"x" * 100_000})
+        return commit
+
+    monkeypatch.setattr(hub_module, "_checked_commit", moving)
+    folder = pull("ada/cart")
+    assert read_policy(folder).policy_version == 4
+    offline(hub, monkeypatch)
+    assert pull("ada/cart") == folder
 
 
 def test_a_file_that_is_larger_than_the_hub_says_is_refused(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:

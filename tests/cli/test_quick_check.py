@@ -11,9 +11,10 @@ from building import run_spec
 from log_lines import LINES
 from plain import array_space, vector_spaces
 
+from daedalus.cli import check_process
 from daedalus.cli import quick_check as module
+from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck
 from daedalus.cli.quick_check import (
-    CheckTimeoutError,
     EnvironmentProblemError,
     checked_defaults,
     checked_spaces,
@@ -63,12 +64,12 @@ def test_a_run_does_not_wait_for_an_environment_that_hangs(monkeypatch: pytest.M
 def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[int] = []
 
-    def spawned(words: str, writing: int) -> int:
-        started.append(spawn(words, writing))
+    def spawned(check: EnvironmentCheck, writing: int) -> int:
+        started.append(spawn(check, writing))
         return started[0]
 
-    spawn = module._spawned
-    monkeypatch.setattr(module, "_spawned", spawned)
+    spawn = check_process._spawned
+    monkeypatch.setattr(check_process, "_spawned", spawned)
     stop = threading.Event()
     stop.set()
     with pytest.raises(CheckTimeoutError):

@@ -86,7 +86,8 @@ def test_a_report_shows_evaluation_curves_settings_and_versions(folder: Path) ->
     assert report(["run"]) == 0
     text = " ".join(Page(run / "report.html").text.split())
     assert "run solved CartPole-v1 · " in text
-    assert "8 greedy episodes of the best checkpoint, policy version 128, on gymnasium's CartPole-v1, seed 7" in text
+    played = "8 greedy episodes of the best checkpoint, policy version 128, on CartPole-v1 (backend gymnasium), seed"
+    assert played in text
     assert "mean 433.8 95 % interval of the mean" in text
     assert "interquartile mean 492.5 95 % bootstrap interval" in text  # of 480, 490, 500, 500
     assert "lowest and highest 100 to 500" in text
@@ -195,6 +196,93 @@ def test_a_video_that_is_a_link_is_left_out(folder: Path) -> None:
     page = Page(run / "report.html")
     assert "video" not in page.tags
     assert "secret" not in page.text
+
+
+FILES = ("config.toml", "summary.json", "metrics.csv", "evaluation.json", "versions.json", "events.jsonl")
+
+
+def refused(directory: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return why there is no report of a run, without the name of the run."""
+    assert report([directory.name]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err.strip().removeprefix(f"daedalus report: {directory.name}/")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs in folders")
+class TestFileThatIsNotRegular:
+    """A FIFO never ends, nor does a device such as /dev/zero, and reading a FIFO waits for a writer."""
+
+    @pytest.mark.parametrize("name", FILES)
+    def test_fifo(self, folder: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+        run = record(folder / "run")
+        (run / name).unlink(missing_ok=True)
+        os.mkfifo(run / name)
+        assert refused(run, capsys) == f"{name}: not a regular file"
+
+    @pytest.mark.parametrize("name", FILES)
+    def test_link_to_a_device(self, folder: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+        run = record(folder / "run")
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to("/dev/zero")
+        assert refused(run, capsys) == f"{name}: not a regular file"
+
+    def test_log(self, folder: Path) -> None:
+        run = record(folder / "run")
+        os.mkfifo(run / "output.log")
+        assert report(["run"]) == 0
+        assert "printed last" not in Page(run / "report.html").text
+
+
+@pytest.mark.parametrize("name", ["summary.json", "evaluation.json", "versions.json"])
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("[" * 200_000, "is damaged: it is not valid JSON; delete the file"),
+        ('{"a": ' + "[" * 200 + "]" * 200 + "}", "is damaged: its values are nested too deeply"),
+        ('{"a": 1' + "0" * 4000 + "}", "is damaged: it has an integer of more than 64 bits"),
+    ],
+    ids=["depth beyond Python's limit", "depth", "integer"],
+)
+def test_excessive_json_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str, content: str, reason: str
+) -> None:
+    run = record(folder / "run")
+    (run / name).write_text(content)
+    assert refused(run, capsys) == f"{name} {reason}"
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("a = " + "[" * 20_000, "its values are nested too deeply"),
+        (f"[environment.kwargs.{'.'.join('a' * 5000)}]", "its values are nested too deeply"),
+        ("[environment.kwargs]\na = 0x" + "f" * 9000, "it has an integer of more than 64 bits"),
+        ("a = 1" + "0" * 9000, "Exceeds the limit (4300 digits) for integer string conversion"),
+    ],
+    ids=["lists", "tables", "integer", "digits"],
+)
+def test_excessive_settings_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], content: str, reason: str
+) -> None:
+    run = record(folder / "run")
+    (run / "config.toml").write_text(content)
+    assert refused(run, capsys).startswith(f"config.toml is damaged: {reason}")
+
+
+def test_file_that_is_larger_than_any_of_a_run_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = record(folder / "run")
+    os.truncate(run / "config.toml", (1 << 20) + 1)
+    assert refused(run, capsys) == "config.toml is larger than 1 MiB: it is not a file of a run"
+
+
+def test_dates_in_the_settings_of_another_release_are_shown(folder: Path) -> None:
+    run = record(folder / "run")
+    with open(run / "config.toml", "a") as file:
+        file.write("[other_release]\nbegin = 2026-11-22\n")
+    assert report(["run"]) == 0
+    assert "begin 2026-11-22" in " ".join(Page(run / "report.html").text.split())
 
 
 def test_failures_are_counted_and_listed(folder: Path) -> None:

@@ -34,6 +34,6 @@ def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
     text = report(LocalRun(directory=Path("runs/one"), spec=spec, started=time.monotonic()), SUMMARY)
-    assert "episodes of the newest checkpoint on gymnasium's CartPole-v1\n7 of 9 episodes were cut\nrun" in text
+    assert "episodes of the newest checkpoint on CartPole-v1 (backend gymnasium)\n7 of 9 episodes were cut\nrun" in text
     assert "run directory: runs/one" in text
     assert ("daedalus plot runs/one" in text) == installed

@@ -1,7 +1,10 @@
 """Test of cli/settings_arguments.py: what a command line makes of the settings."""
 
+from pathlib import Path
+
 import pytest
 
+from daedalus.cli.commands.train import resume_parser, train_parser
 from daedalus.cli.settings_arguments import learner_parser, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
@@ -13,6 +16,33 @@ def test_two_environments_are_refused() -> None:
         resolve(learner_parser().parse_args(words))
     spec, _ = resolve(learner_parser().parse_args([*words[:3], "environment.id=CartPole-v1"]))
     assert spec.environment.id == "CartPole-v1"
+
+
+def test_a_preset_and_an_environment_are_refused() -> None:
+    with pytest.raises(SettingsError, match=r"^leave out one of cartpole and --env CartPole-v1$"):
+        resolve(learner_parser().parse_args(["cartpole", "--env", "CartPole-v1"]))
+    with pytest.raises(SettingsError, match=r"^name a preset \(acrobot, .*\) or an environment with --env ID$"):
+        resolve(learner_parser().parse_args([]))
+
+
+@pytest.mark.parametrize("text", ["", "[training]\nenv_steps = 3\n", "[environment]\nbackend = 'fast'"])
+def test_a_file_without_an_environment_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(SettingsError, match=r"^setting environment(\.id)? is missing: add it$"):
+        resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+
+
+@pytest.mark.parametrize(("text", "number"), [("1e6", 1_000_000), ("1_000_000", 1_000_000), ("25", 25), ("2.5e1", 25)])
+def test_env_steps_may_be_written_as_any_whole_number(text: str, number: int) -> None:
+    for parser, words in ((learner_parser, []), (train_parser, []), (resume_parser, ["run"])):
+        assert parser().parse_args([*words, "--env-steps", text]).env_steps == number
+
+
+@pytest.mark.parametrize("text", ["1.5", "1e-1", "inf", "nan", "many", ""])
+def test_env_steps_that_are_no_whole_number_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train_parser().parse_args(["cartpole", f"--env-steps={text}"])
+    assert f"argument --env-steps: {text!r} is not a whole number" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "named"), [("config.toml", "Acrobot-v1"), ("mine.toml", "mine")])

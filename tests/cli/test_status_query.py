@@ -208,6 +208,15 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
     assert f"has 905 actors: {2 * PAGE_ACTORS} of them have metrics of their own" in warning
 
 
+@pytest.mark.usefixtures("server")
+def test_a_run_that_is_not_there_is_named_with_those_that_are(
+    operator: MemoryTransport, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("daedalus.cli.commands.status.connect", lambda *_: operator)
+    assert status_command(["--connect", "tcp/127.0.0.1:1", "--run", "other"]) == 1
+    assert capsys.readouterr().err == "daedalus status: no learner of run 'other' answers; the runs here are 'r'\n"
+
+
 # -------------------------------------------------------------------------------------------- --alive
 
 
@@ -233,6 +242,11 @@ def test_alive_depends_on_the_age_of_the_heartbeat_only(
     monkeypatch.undo()
     beating.clear()
     assert status_command(alive) == 0
+
+
+def test_a_directory_that_does_not_exist_is_not_alive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status_command(["--alive", str(tmp_path / "typo")]) == 1
+    assert capsys.readouterr().err == f"daedalus status: {tmp_path / 'typo'} does not exist: name a run directory\n"
 
 
 @pytest.mark.parametrize("content", ["", "x", "12 y z", "nan -"])

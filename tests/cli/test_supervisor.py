@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Set
+from typing import Any
 
 import pytest
 from processes import LIMIT, until
@@ -28,13 +29,13 @@ def test_an_actor_has_a_lower_priority_than_the_learner() -> None:
         stop([actor.process])
 
 
-def supervised(program: str, ended: Set[int] = frozenset({0})) -> Supervised:
+def supervised(program: str, ended: Set[int] = frozenset({0}), **options: Any) -> Supervised:
     """Return a supervised process that runs a line of Python."""
 
     def begin(first: bool) -> subprocess.Popen[bytes]:
         return subprocess.Popen([sys.executable, "-S", "-c", program, str(first)], stdin=subprocess.PIPE)
 
-    return Supervised("worker", begin, ended)
+    return Supervised("worker", begin, ended, **options)
 
 
 def message(process: Supervised) -> str:
@@ -69,6 +70,52 @@ def test_a_process_that_failed_three_times_is_not_restarted() -> None:
     with pytest.raises(FailedError, match="worker failed 3 times"):
         message(process)
     stop([process.process])
+
+
+def test_a_process_that_crashed_three_times_is_not_restarted() -> None:
+    process = supervised("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    assert [message(process), message(process)] == ["worker was killed by signal 11; started again"] * 2
+    with pytest.raises(FailedError, match=r"worker failed 3 times: a fault of native code \(signal 11\)"):
+        message(process)
+    stop([process.process])
+
+
+def test_a_process_that_is_killed_from_outside_is_always_restarted() -> None:
+    process = supervised(SLEEP)
+    for _ in range(5):
+        process.process.kill()
+        assert message(process) == "worker was killed by signal 9; started again"
+    assert process.failures == 0
+    stop([process.process])
+
+
+def test_a_crash_long_after_the_start_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "_SOON_SECONDS", 0.0)
+    process = supervised("import os; os.abort()")
+    for _ in range(5):
+        assert message(process) == "worker was killed by signal 6; started again"
+    stop([process.process])
+
+
+@pytest.mark.parametrize("status", [STOPPED, RANK_LOST])
+def test_statuses_of_a_learner_are_failures_of_another_process(status: int) -> None:
+    process = supervised(f"raise SystemExit({status})", no_fault={})
+    assert [message(process), message(process)] == [f"worker failed with status {status}; started again"] * 2
+    with pytest.raises(FailedError, match="worker failed 3 times"):
+        message(process)
+    stop([process.process])
+
+
+def test_an_actor_fails_for_the_reason_that_it_prints() -> None:
+    said = {"actor-0": "daedalus actor: environment Mine-v0: step raises ValueError: no map (mine.py, line 3)"}
+    actor = supervised_actor("actor-0", "tcp/127.0.0.1:1", last_error=lambda name: said[name])
+    try:
+        assert actor.no_fault == {}
+        assert actor.reason(1) == "environment Mine-v0: step raises ValueError: no map (mine.py, line 3)"
+        crashed = "the environment ends the process ({}): play it with `daedalus check`"
+        assert [actor.reason(5), actor.reason(-11)] == [crashed.format("status 5"), crashed.format("signal 11")]
+    finally:
+        stop([actor.process])
 
 
 def test_a_learner_that_a_signal_stopped_has_not_failed() -> None:
@@ -110,9 +157,10 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
     evaluator.name = "evaluator"
     processes = [*actors, evaluator, learner]
     try:
-        with pytest.raises(FailedError, match="worker failed 3 times"):
+        failed = "all actors failed: see the error above" if continues else "worker failed 3 times"
+        with pytest.raises(FailedError, match=failed):
             watch(learner, [evaluator, *actors], spec, threading.Event())
-        continued = "worker failed 3 times; see the error above; training continues without this process"
+        continued = "worker failed 3 times: see the error above; training continues without this process"
         assert any(continued in message for message in caplog.messages) == continues
     finally:
         stop([each.process for each in processes])

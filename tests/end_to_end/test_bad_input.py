@@ -29,7 +29,8 @@ Start = Callable[..., Running]
         (["train", "cartpole", "--actors", "0"], 2, r"collection.actors .* at least 1"),
         (["train", "nothing.toml"], 2, r"nothing.toml: No such file"),
         (["resume", "nowhere"], 2, r"nowhere is not a run directory"),
-        (["evaluate", "nowhere"], 1, r"nowhere has no checkpoints"),
+        (["train", "cartpole", "--init-from", "nowhere"], 2, r"--init-from: nowhere does not exist"),
+        (["evaluate", "nowhere"], 1, r"nowhere does not exist: name a run directory"),
         (["plot", "nowhere", "--output", "x.png"], 1, r"nowhere does not exist: name a run directory"),
         (["status", "--connect", "tcp/127.0.0.1:1"], 1, r"nothing answers at tcp/127.0.0.1:1"),
         (
@@ -101,7 +102,7 @@ def test_an_existing_run_directory_is_refused_and_not_changed(start: Start, tmp_
     (tmp_path / "run" / "precious").write_text("kept")
     running = start("train", "cartpole", "--run-dir", "run")
     assert running.wait() == 2
-    running.expect("run directory run exists: continue the run with `daedalus resume run`")
+    running.expect(r"run directory run is not empty, and has no config\.toml: choose another directory")
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["precious"]
 
 

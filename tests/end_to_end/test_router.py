@@ -37,6 +37,17 @@ def test_a_run_works_over_two_routers_that_start_in_any_order(start: Start, addr
     assert learner.wait() == 3, learner.output
 
 
+def test_a_learner_that_waits_for_a_router_is_alive_and_leaves_no_directory(
+    start: Start, address: str, tmp_path: Path
+) -> None:
+    learner = start("learner", "cartpole", "--connect", address, "--run-dir", "run")
+    learner.expect("waiting for it")
+    assert start("status", "--alive", "run").wait() == 0
+    learner.process.terminate()
+    assert learner.wait() == 0
+    assert not (tmp_path / "run").exists()
+
+
 def test_router_and_exporter_accept_only_certificates_of_their_ca(start: Start, address: str, tmp_path: Path) -> None:
     certificates = make_certificates(tmp_path / "certs")
     tls = address.replace("tcp/", "tls/")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from gateways import CARTPOLE, JsonClient, RunningGateway
 from processes import LIMIT, until
-from scripted_learner import SPEC, ScriptedLearner, acknowledge
+from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
-from daedalus.gateway import connection, policy_versions
+from daedalus.gateway import connection, policy_versions, server
 from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.messages import Act
@@ -21,6 +21,8 @@ from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.transport.interface import TransportError
 from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
@@ -224,6 +226,32 @@ def test_clients_join_the_learner_that_returns(
         returned.transport.close()
 
 
+def test_client_whose_presence_cannot_be_declared_is_refused(
+    network: MemoryNetwork,
+    learner: ScriptedLearner,
+    gateway: RunningGateway,
+    connect: Connect,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client = connect()
+    client.hello("arm-1")
+
+    def fail(key: str) -> None:
+        raise TransportError(f"cannot declare presence under {key}")
+
+    monkeypatch.setattr(gateway.gateway._transport, "declare_presence", fail)
+    learner.transport.close()
+    other = ScriptedLearner(network, epoch=2, run="other")
+    try:
+        error = client.receive()
+        assert error["code"] == "refused"
+        assert "cannot declare presence under daedalus/other" in error["reason"]
+        assert ended(client) == 1008
+        assert connect().hello("arm-2")["code"] == "refused"
+    finally:
+        other.transport.close()
+
+
 @pytest.mark.parametrize(
     ("verdict", "text"),
     [("quarantined", "the learner quarantined this client: why"), ("drained", "an operator drained this client")],
@@ -379,6 +407,41 @@ def test_wrong_message_is_answered_and_nothing_is_lost(
     assert rollout.rewards[:, 0].tolist() == [1.0] * ROWS
 
 
+def test_reward_of_a_refused_message_does_not_count(network: MemoryNetwork, connect: Connect) -> None:
+    spaces = {
+        "observations": {
+            "action_mask": {"kind": "array", "shape": [2], "dtype": "float32"},
+            "place": {"kind": "array", "shape": [1], "dtype": "float32"},
+        },
+        "actions": CARTPOLE["actions"],
+    }
+    spec = SPEC.model_copy(update={"environment": SPEC.environment.model_copy(update={"bootstrap_terminations": True})})
+    choice = DiscreteSpace(counts=(2,), masked=True)
+    seen = Spaces(observations={"place": ArraySpace(shape=(1,), dtype="float32")}, actions={"action": choice})
+    learner = ScriptedLearner(network, spec, policy=Policy.of(spec.policy, seen))
+    learner.publish(0)
+    try:
+        client = connect()
+        client.hello("arm-1", spaces)
+
+        def act(place: float, mask: tuple[int, int] = (1, 1), **fields: Any) -> dict[str, Any]:
+            return client.act({"place": [place], "action_mask": list(mask)}, **fields)
+
+        act(0.0)
+        assert "forbids every choice" in act(1.0, (0, 0), reward=1.0)["reason"]
+        act(1.0, reward=1.0)
+        client.send("end_episode", terminated=True, reward=1.0)
+        assert "pass the last observation" in client.receive()["reason"]
+        client.send("end_episode", terminated=True, reward=1.0, observation={"place": [2.0], "action_mask": [0, 0]})
+        for place in (5.0, 6.0):
+            act(place)
+        rollout, _ = learner.receive()
+        assert rollout.rewards[:, 0].tolist() == [1.0, 1.0, 0.0, 0.0]
+        assert rollout.episode_returns.tolist() == [2.0]
+    finally:
+        learner.transport.close()
+
+
 def test_client_with_many_faults_is_disconnected(learner: ScriptedLearner, connect: Connect) -> None:
     client = connect()
     client.hello("arm-1")
@@ -402,6 +465,18 @@ def test_message_larger_than_the_spaces_need_ends_the_connection(learner: Script
     client = connect()
     client.hello("arm-1")
     client.socket.send(" " * 10_000)
+    assert ended(client) == 1009
+
+
+def test_message_of_too_many_fragments_ends_the_connection(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_MAX_FRAGMENTS", 10)
+    client = connect()
+    client.hello("arm-1")
+    client.socket.send(["{", *[""] * 7, "}"])  # the library adds an empty fragment, the last
+    assert client.receive()["code"] == "malformed"
+    client.socket.send(["{", *[""] * 8, "}"])
     assert ended(client) == 1009
 
 

@@ -167,8 +167,22 @@ def test_wrong_spaces_are_named(observations: Any, actions: Any, text: str) -> N
         ({**OBSERVATION, "mode": 4}, "mode of the observation is outside its space"),
         ({**OBSERVATION, "mode": 1.5}, "mode of the observation is not an array of integers"),
         ({**OBSERVATION, "camera.image": [[0] * 3, [0, 0, 256]]}, "not from 0 to 255"),
+        ({**OBSERVATION, "camera.image": [[0] * 3, [0, 0, -1]]}, "not from 0 to 255"),
         ({**OBSERVATION, "camera.image": b"12345"}, "has 5 bytes"),
-        ({**OBSERVATION, "sensors.level": [10**400, 0]}, "not an array of numbers"),
+        ({**OBSERVATION, "mode": -1}, "mode of the observation is outside its space"),
+        ({**OBSERVATION, "mode": 10**400}, "mode of the observation is outside its space"),
+        ({**OBSERVATION, "mode": "1"}, "mode of the observation is not an array of integers"),
+        ({**OBSERVATION, "camera.image": [[0.0] * 3] * 2}, "not an array of integers"),
+        ({**OBSERVATION, "camera.image": [[0, 0], [0], [0, 0, 0]]}, "not an array of integers"),
+        ({**OBSERVATION, "camera.image": [[0] * 3, b"123"]}, "not an array of integers"),
+        ({**OBSERVATION, "camera.image": [[0] * 3]}, "has 3 values, but its space is"),
+        ({**OBSERVATION, "sensors.level": ["1.5", "2"]}, "not an array of numbers"),
+        ({**OBSERVATION, "sensors.level": [1.5, b"2"]}, "not an array of numbers"),
+        ({**OBSERVATION, "sensors.level": [1.5, None]}, "not an array of numbers"),
+        ({**OBSERVATION, "sensors.level": {"0": 1, "1": 2}}, "not an array of numbers"),
+        ({**OBSERVATION, "sensors.level": []}, "has 0 values, but its space is"),
+        ({**OBSERVATION, "sensors.level": [[], []]}, "has 0 values, but its space is"),
+        ({**OBSERVATION, "sensors.level": [10**400, 0]}, "beyond"),
         ({**OBSERVATION, "sensors.level": [1e16, 0]}, "beyond"),
         ({**OBSERVATION, "sensors.level": [1e300, 0]}, "beyond"),
         ({**OBSERVATION, "sensors.level": [float("nan"), 0]}, "not finite"),
@@ -181,6 +195,34 @@ def test_wrong_observations_are_named(value: Any, text: str) -> None:
     spaces = ClientSpaces(STATED["observations"], STATED["actions"])
     with pytest.raises(ClientError, match=text):
         spaces.observation(value)
+
+
+@pytest.mark.parametrize(
+    "image", [[1, 2, 3, 4, 5, 255], [[[1, 2], [3, 4], [5, 255]]], [[[[1]], [[2]], [[3]], [[4]], [[5]], [[255]]]]]
+)
+def test_observation_may_have_any_nesting(image: Any) -> None:
+    spaces = ClientSpaces(STATED["observations"], STATED["actions"])
+    observed = spaces.observation({**OBSERVATION, "camera.image": image, "mode": [[True]]})
+    assert observed["camera"]["image"].tolist() == [[1, 2, 3], [4, 5, 255]]
+    assert observed["mode"] == 1
+
+
+@pytest.mark.parametrize("is_override", [False, True])
+def test_long_text_among_numbers_takes_no_memory(is_override: bool) -> None:
+    """numpy.asarray would allocate the size of the longest text for each element."""
+    size = 2000
+    value = ["x" * size, *[0] * (size - 1)]
+    observations = {"observation": {"kind": "array", "shape": [size], "dtype": "float32"}}
+    actions = {"action": {"kind": "continuous", "low": [-1.0] * size, "high": [1.0] * size}}
+    spaces = ClientSpaces(observations, actions)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ClientError, match="numbers"):
+            (spaces.check_action if is_override else spaces.observation)(value)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 @pytest.mark.parametrize(
@@ -235,8 +277,12 @@ def test_override_is_an_action_of_the_space(value: Any) -> None:
         (CHOICE, {"action": 99}, "action of the override is outside its space"),
         (CHOICE, {"more": 1}, "the override must be a map with action"),
         (CHOICE, 10**400, "must have 1 integers"),
+        (CHOICE, "1", "must have 1 integers"),
+        (CHOICE, [True], "must have 1 integers"),
         (CHOICE, [[1], [1, 2]], "must have 1 integers"),
         ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5], "must have 2 numbers"),
+        ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5, "1"], "must have 2 numbers"),
+        ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5, 10**400], "must have 2 numbers"),
         ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [1.5, 0], "outside its space"),
         ({"kind": "continuous", "low": [-1.0, None], "high": [1.0, None]}, [0.5, math.inf], "outside its space"),
     ],

@@ -13,7 +13,7 @@ from processes import LIMIT, until
 
 from daedalus.gateway.raw import clients, packet_socket
 from daedalus.gateway.raw.clients import ClientTable
-from daedalus.gateway.raw.connection import ClientConnection
+from daedalus.gateway.raw.connection import RawConnection
 from daedalus.gateway.raw.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -64,7 +64,7 @@ class Scene:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
         self._table = ClientTable()
-        self._clients: list[tuple[ClientConnection, threading.Thread]] = []
+        self._clients: list[tuple[RawConnection, threading.Thread]] = []
         self._accepting = threading.Thread(target=self._accept, daemon=True)
         self._accepting.start()
         self.callers: list[Caller] = []
@@ -73,13 +73,13 @@ class Scene:
         with contextlib.suppress(OSError):  # the listener was shut down
             while True:
                 connection, _ = self._listener.accept()
-                client = ClientConnection(connection, lambda: self.open(), self._table)
+                client = RawConnection(connection, lambda: self.open(), self._table)
                 self._table.connect(client)
                 thread = threading.Thread(target=self._run, args=(client,), daemon=True)
                 self._clients.append((client, thread))
                 thread.start()
 
-    def _run(self, client: ClientConnection) -> None:
+    def _run(self, client: RawConnection) -> None:
         logging.getLogger("daedalus.raw").warning("disconnected: %s", client.run())
 
     def call(self) -> Caller:
@@ -302,7 +302,7 @@ def use(scene: Scene, caller: Caller) -> None:
 
 
 def test_clients_beyond_the_limit_are_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clients, "MAX_CLIENTS", 1)
+    monkeypatch.setattr(clients, "MAX_RAW_CLIENTS", 1)
     first, late = scene.call(), scene.call()
     use(scene, first)
     late.send(Kind.QUERY, 1, "daedalus/r/status")
@@ -313,7 +313,7 @@ def test_clients_beyond_the_limit_are_refused(scene: Scene, monkeypatch: pytest.
 
 
 def test_new_client_takes_the_place_of_the_longest_silent_one(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clients, "MAX_CLIENTS", 2)
+    monkeypatch.setattr(clients, "MAX_RAW_CLIENTS", 2)
     monkeypatch.setattr(clients, "IDLE_SECONDS", 0.0)
     silent, busy, new = scene.call(), scene.call(), scene.call()
     for caller in (silent, busy, new):
@@ -327,7 +327,7 @@ def test_new_client_takes_the_place_of_the_longest_silent_one(scene: Scene, monk
 def test_connections_without_a_packet_take_no_place(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, greeting: bytes
 ) -> None:
-    monkeypatch.setattr(clients, "MAX_CLIENTS", 1)
+    monkeypatch.setattr(clients, "MAX_RAW_CLIENTS", 1)
     monkeypatch.setattr(clients, "_MAX_NEW_CONNECTIONS", 4)
     with contextlib.ExitStack() as stack:
         address = ("127.0.0.1", scene.port)

@@ -185,6 +185,73 @@ def test_connection_without_a_request_is_closed(
         assert silent.recv(1) == b""
 
 
+def test_connection_without_a_further_request_is_closed(
+    learner: ScriptedLearner, gateway: RunningGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = f"HEAD / HTTP/1.1\r\nHost: localhost:{gateway.port}\r\n\r\n".encode()
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 1e6)
+    with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as slow, slow.makefile("rb") as answers:
+
+        def ask() -> None:
+            slow.sendall(request)
+            assert answers.readline().startswith(b"HTTP/1.1 200")
+            while answers.readline().strip():
+                pass
+
+        ask()
+        monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
+        ask()
+        slow.sendall(b"G")  # uvicorn's own deadline ends with it
+        with contextlib.suppress(ConnectionResetError):
+            assert answers.read(1) == b""
+
+
+def deaf_socket(port: int) -> socket.socket:
+    """Return a connection that takes few bytes until somebody reads."""
+    made = socket.socket()
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    made.settimeout(LIMIT)
+    made.connect(("127.0.0.1", port))
+    return made
+
+
+def send_for_ever(client: socket.socket, data: bytes) -> None:
+    while True:
+        client.sendall(data)
+
+
+def test_connection_whose_answers_nobody_reads_is_closed(
+    learner: ScriptedLearner, gateway: RunningGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
+    requests = f"GET /page/style.css HTTP/1.1\r\nHost: localhost:{gateway.port}\r\n\r\n".encode() * 100
+    with deaf_socket(gateway.port) as deaf, pytest.raises(ConnectionError):
+        send_for_ever(deaf, requests)
+
+
+def test_client_that_reads_neither_answers_nor_pings_is_disconnected(
+    learner: ScriptedLearner, gateway: RunningGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gateway.listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    made: list[server.OurWebSocket] = []
+    connection_made = server.OurWebSocket.connection_made
+    monkeypatch.setattr(
+        server.OurWebSocket,
+        "connection_made",
+        lambda channel, transport: made.append(channel) or connection_made(channel, transport),
+    )
+    client = JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1)
+    try:
+        assert client.hello("deaf")["type"] == "welcome"
+        for _ in range(1000):
+            client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
+        until(lambda: gateway.call(lambda: made[0].transport.get_write_buffer_size()) > 0)
+        gateway.call(made[0].keepalive_timeout)
+        until(lambda: not gateway.call(lambda: gateway.gateway._seats))
+    finally:
+        client.close()
+
+
 def test_ended_connections_are_forgotten(
     learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:

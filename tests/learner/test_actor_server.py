@@ -110,7 +110,7 @@ def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken
         *(("started", 1), ("joined", 1), ("rejected", 2), ("ended", 1))
     ]
     assert events[2].text.startswith("rollout rejected as unfit: policy version 1 is newer than")
-    assert events[3].text == "stopped: the test is over"
+    assert events[3].text == "the test is over"
 
 
 @pytest.mark.parametrize(("state_size", "updates"), [(0, 3 * 4), (5, 3 * ENVIRONMENTS)])

@@ -30,7 +30,7 @@ def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
         learner,
         b"program",
         counters=lambda: RunCounters(10).state(0.0),
-        evaluations=Evaluations(EPOCH),
+        evaluations=Evaluations(EPOCH, RunCounters(10)),
         health=Health(started=0.0, updated=0.0, actor_seen=0.0),
         events=EventLog(),
     )
@@ -57,7 +57,7 @@ def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatc
         Learner(TrainingSpec(), POLICY, SPACES),
         b"program",
         counters=lambda: RunCounters(10).state(0.0),
-        evaluations=Evaluations(EPOCH),
+        evaluations=Evaluations(EPOCH, RunCounters(10)),
         health=health,
         events=events,
     )

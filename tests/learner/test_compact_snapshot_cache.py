@@ -113,6 +113,29 @@ def test_parts_belong_to_one_version_when_newer_versions_arrive() -> None:
     assert second.policy_version == 3
 
 
+def test_parts_are_of_one_whole_snapshot_when_the_base_was_never_held_and_newer_versions_arrive() -> None:
+    cache = CompactSnapshotCache(5)
+    first = ask(cache, snapshot(3), held_version=1)
+    fetch(cache, snapshot(4), held=3, actor="b")
+    fetch(cache, snapshot(5), held=1, actor="c")
+    assert isinstance(first, SnapshotPart)
+    parts = [ask(cache, b"unused", held_version=1, policy_version=3, part=part) for part in range(1, first.parts)]
+    whole = decode(b"".join(part.data.tobytes() for part in [first, *parts]), Limits())  # type: ignore[union-attr]
+    assert isinstance(whole, CompactSnapshot)
+    assert (whole.policy_version, whole.base_version) == (3, None)
+
+
+def test_a_request_under_the_name_of_another_actor_does_not_end_its_fetch() -> None:
+    """No key has the name, so that nobody checks it."""
+    cache = CompactSnapshotCache(5)
+    first = ask(cache, snapshot(3), "honest")
+    ask(cache, snapshot(4), "honest", held_version=3)
+    assert isinstance(first, SnapshotPart)
+    part = ask(cache, snapshot(4), "honest", policy_version=3, part=1)
+    assert isinstance(part, SnapshotPart)
+    assert (part.policy_version, part.parts) == (3, first.parts)
+
+
 @pytest.mark.parametrize(("version", "part"), [(4, 1), (3, 10**6)])
 def test_unknown_version_or_part_is_refused(version: int, part: int) -> None:
     cache = CompactSnapshotCache(5)
@@ -132,9 +155,44 @@ def test_message_in_place_of_a_snapshot_is_passed_on(instead: Message) -> None:
 
 def test_cache_size_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compact_cache, "_HELD_BYTES", 4 * 2 * (60_000 + 7))
-    monkeypatch.setattr(compact_cache, "_MAX_READERS", 3)
+    monkeypatch.setattr(compact_cache, "_PREPARED_BYTES", 3 * 2 * (60_000 + 7))
     cache = CompactSnapshotCache(5)
     for version in range(10):
         fetch(cache, snapshot(version), actor=f"a{version}")
     assert list(cache._held) == [6, 7, 8, 9]
-    assert list(cache._prepared) == ["a7", "a8", "a9"]
+    assert 3 <= len(cache._prepared) < 10
+    assert list(cache._prepared)[-1] == (9, None)
+    assert sum(len(each.encoded) for each in cache._prepared.values()) <= 3 * 2 * (60_000 + 7)
+
+
+def test_the_newest_snapshot_is_kept_however_large_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compact_cache, "_PREPARED_BYTES", 1)
+    cache = CompactSnapshotCache(5)
+    for version in range(3):
+        fetch(cache, snapshot(version))
+    assert list(cache._prepared) == [(2, None)]
+
+
+def test_held_versions_that_are_not_held_here_share_one_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compact_cache, "_MAX_PREPARED", 5)
+    cache = CompactSnapshotCache(5)
+    for held in range(100, 200):
+        ask(cache, snapshot(3), held_version=held)
+    assert list(cache._prepared) == [(3, held) for held in range(195, 200)]
+    assert len({id(each.encoded) for each in cache._prepared.values()}) == 1
+    monkeypatch.setattr(compact_cache, "_PREPARED_BYTES", len(cache._prepared[3, 199].encoded))
+    ask(cache, snapshot(3), held_version=200)
+    assert len(cache._prepared) == 5  # their bytes count once
+
+
+def test_a_fetch_in_progress_is_kept_and_others_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(compact_cache.time, "monotonic", lambda: now)
+    cache = CompactSnapshotCache(5)
+    ask(cache, snapshot(3), "slow")
+    fetch(cache, snapshot(4), held=3, actor="left")
+    for part, now in ((1, 159.0), (2, 218.0)):  # noqa: B007 - the clock reads it
+        ask(cache, b"unused", "slow", policy_version=3, part=part)
+    now = 277.0
+    fetch(cache, snapshot(5), held=4)
+    assert list(cache._prepared) == [(3, None), (5, 4)]

@@ -97,6 +97,13 @@ def test_component_that_breaks_the_spaces_is_named(change: Any, reason: str) -> 
     assert reason in verdict_on(given)
 
 
+def test_long_names_are_cut_so_that_the_expected_ones_are_readable() -> None:
+    given = content()
+    given["frames"]["x" * 250_000] = given["frames"]["numbers"]
+    reason = verdict_on(given)
+    assert reason == f"frames has the components goal, numbers, {'x' * 64}, expected goal, numbers"
+
+
 @pytest.mark.parametrize(("value", "accepted"), [(40.0, True), (40.1, False)])
 def test_density_of_two_numbers_is_limited_to_twice_that_of_one(value: float, accepted: bool) -> None:
     log_probs = np.full(CELLS, value, np.float32)

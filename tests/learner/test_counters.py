@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import make_rollout
+from building import make_rollout, run_spec
 
 from daedalus.learner.run.counters import RunCounters
 from daedalus.protocol.uploads import Rollout
@@ -59,6 +59,26 @@ def test_target_is_reached_only_with_enough_episodes() -> None:
     assert not counters.reached(None)
 
 
+def test_an_evaluation_solves_a_run_only_where_actors_explore() -> None:
+    counters = RunCounters(2)
+    target: dict[str, Any] = {"target_return": 5.0, "target_episodes": 2}
+    exploring, others = run_spec(algorithm="one_step_q", **target).training, run_spec(**target).training
+    for mean, solved in ((4.9, False), (5.0, True), (2.0, True)):
+        counters.evaluated(mean)
+        assert (counters.is_solved(exploring), counters.is_solved(others)) == (solved, False)
+    assert not counters.is_solved(run_spec(algorithm="one_step_q").training)
+    counters.trained([rollout(returns=(9.0, 9.0))], 0, 1)
+    assert counters.is_solved(others)
+
+
+def test_counters_of_an_earlier_release_are_restored() -> None:
+    state = RunCounters(3).state(1.0)
+    del state["best_evaluation"], state["accepted_env_steps"]
+    counters = RunCounters(3)
+    counters.restore(state)
+    assert (counters.best_evaluation, counters.accepted_env_steps) == (None, 0)
+
+
 def with_info(**values: tuple[float, ...]) -> Rollout:
     info = {name: np.array(each, np.float32) for name, each in values.items()}
     return make_rollout(
@@ -91,6 +111,7 @@ def test_counters_restored_from_json_continue_equally() -> None:
         through.accepted(rollout(seed=number), 100)
         through.rollouts_rejected["stale"] += 1
         through.snapshots_published += 1
+        through.evaluated(0.1 * number)
     first.restore(json.loads(json.dumps(through.state(12.5))))
     assert first.wall_seconds == 12.5
     through.wall_seconds = 12.5

@@ -65,7 +65,7 @@ class Scene:
         )
         self.actors.open()
         self.actors.offer_policy(b"program", 0)
-        self.evaluations = Evaluations(EPOCH)
+        self.evaluations = Evaluations(EPOCH, RunCounters(10))
         self.server = EvaluationServer(
             self.actors.evaluations, self.evaluations, self.actors.publisher, clock=lambda: self.now
         )

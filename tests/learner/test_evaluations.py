@@ -10,6 +10,7 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 
 from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -22,7 +23,7 @@ class Run:
 
     def __init__(self, directory: Path, epoch: int = EPOCH) -> None:
         self.directory = directory
-        self.evaluations = Evaluations(epoch)
+        self.evaluations = Evaluations(epoch, RunCounters(10))
 
     def save(self, version: int, keep: int = 2) -> Path:
         return save_checkpoint(
@@ -78,7 +79,7 @@ def run(tmp_path: Path) -> Run:
 
 def test_first_evaluated_checkpoint_is_kept_as_best_under_its_score(run: Run) -> None:
     assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.3 +- 1.2 over 3 episodes, the best so far"
-    assert run.names == ["0000000007", "best_2.3_0000000007"]
+    assert run.names == ["0000000007", "best_2.3333333333333335_0000000007"]
     best = best_checkpoints(run.directory)[0]
     assert read_policy(best).policy_version == 7
     assert load_checkpoint(best).policy.weights["w"].tolist() == [7.0] * 3
@@ -123,12 +124,11 @@ def test_resumed_run_compares_with_the_best_of_the_previous_process(run: Run) ->
     assert "best_5.0_0000000001" in run.names
 
 
-@pytest.mark.parametrize(("first", "second"), [(5.01, 5.04), (5.04, 5.01), (5.0, 5.0)])
-def test_score_equal_to_the_best_after_rounding_is_not_kept(run: Run, first: float, second: float) -> None:
-    """Two evaluators may play the same version: its best checkpoint is kept once."""
+@pytest.mark.parametrize("second", [5.0, 5.25, 4.75])
+def test_version_that_two_evaluators_play_is_kept_once(run: Run, second: float) -> None:
     for evaluator in ("e", "f"):
         run.begin(1, evaluator)
-    assert "the best so far" in run.report(1, first)[1]
+    assert "the best so far" in run.report(1, 5.0)[1]
     answer, text = run.report(1, second, evaluator="f")
     assert answer.verdict == "accepted"
     assert "best" not in text
@@ -264,23 +264,22 @@ def test_mean_of_returns_does_not_overflow_float32(run: Run) -> None:
 
 
 def test_number_of_checkpoints_in_use_is_bounded_when_evaluators_never_report(tmp_path: Path) -> None:
-    evaluations = Evaluations(learner_epoch=1)
+    evaluations = Evaluations(1, RunCounters(10))
     for number in range(100):
         evaluations.begin(f"evaluator-{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / str(number) for number in range(84, 100)}
 
 
 def test_evaluations_of_one_owner_do_not_displace_the_others(tmp_path: Path) -> None:
-    evaluations = Evaluations(learner_epoch=1)
+    evaluations = Evaluations(1, RunCounters(10))
     evaluations.begin("honest", tmp_path / "honest", 0, 0)
     for number in range(100):
         evaluations.begin(f"greedy.{number}", tmp_path / str(number), number, 0)
     assert evaluations.checkpoints_in_use == {tmp_path / "honest", *(tmp_path / str(n) for n in range(85, 100))}
 
 
-def test_target_is_reached_by_the_best_evaluation(run: Run) -> None:
-    assert not run.evaluations.reached(5.0)
-    for version, mean in ((1, 4.0), (2, 6.0), (3, 2.0)):
+def test_best_evaluation_is_counted(run: Run) -> None:
+    assert run.evaluations.counters.best_evaluation is None
+    for version, mean, best in ((1, 4.0, 4.0), (2, 6.0, 6.0), (3, 2.0, 6.0)):
         run.play(version, mean, mean)
-        assert run.evaluations.reached(5.0) == (version >= 2)
-    assert not run.evaluations.reached(None)
+        assert run.evaluations.counters.best_evaluation == best

@@ -104,6 +104,13 @@ def test_long_texts_are_cut(clock: Clock) -> None:
     assert (len(event.actor), len(event.text)) == (64, 300)
 
 
+def test_causes_are_kept_bounded(clock: Clock) -> None:
+    """A cause may be the text of a peer, and the newest of each is kept."""
+    log = EventLog()
+    log.add("refused", "refused", actor="arm", cause="x" * 250_000)
+    assert max(len(text) for key in log._equal for text in key) == 300
+
+
 def test_new_events_are_taken_once_and_the_counts_of_equal_ones_add_up(clock: Clock) -> None:
     log = EventLog()
 

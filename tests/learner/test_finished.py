@@ -54,6 +54,20 @@ def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:
     assert missed.missed
 
 
+def test_a_run_that_an_evaluation_solved_has_nothing_to_train(run: Path) -> None:
+    counters = RunCounters(3)
+    counters.env_steps = 5000
+    counters.evaluated(99.0)
+    write_sealed(run / "checkpoints" / "0000000008", {}, {"counters": counters.state(60.0)})
+    target = {**TARGET, "target_return": 99.0}
+    for budget in (5000, 9000):
+        end = finished(run, {}, **target, algorithm="one_step_q", env_steps=budget)
+        assert end is not None
+        assert end.reason.startswith("the target return 99 was reached")
+        assert not end.missed
+    assert finished(run, {}, **target, env_steps=9000) is None  # actors that do not explore
+
+
 def test_a_learner_that_was_killed_before_its_summary_is_started_again(run: Path) -> None:
     assert finished(run, None, env_steps=5000) is None
     assert finished(run, {"env_steps": 4000}, env_steps=5000) is None  # of an earlier end

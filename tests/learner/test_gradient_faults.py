@@ -91,6 +91,17 @@ def test_updates_are_skipped_if_all_rollouts_are_at_fault(algorithm: str, update
         np.testing.assert_array_equal(array, before[name])
 
 
+def test_a_batch_that_was_left_out_has_no_diagnostics() -> None:
+    """Those of the batch before are not left either: its memory was used for the new one."""
+    learner = Learner(TrainingSpec(algorithm="impala"), RELU, SPACES)
+    learner.step([rollout("a")], 0.0)
+    learner.step([rollout("a", **HUGE_REWARDS)], 0.0)
+    assert learner.updates_skipped == 1
+    assert learner.take_diagnostics() == {}
+    learner.step([rollout("a")], 0.0)
+    assert learner.take_diagnostics()
+
+
 def test_versions_are_as_many_as_expected_if_few_rows_are_left() -> None:
     """A batch of one row makes fewer minibatches, but actors and counters expect the versions of the whole batch."""
     learner = Learner(TrainingSpec(algorithm="appo", passes=2, minibatches=4), RELU, SPACES)

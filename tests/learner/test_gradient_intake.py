@@ -9,10 +9,12 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.intake import Intake, Rejected
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Message
+from daedalus.protocol.spaces import LARGEST_OBSERVATION
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Gradient, Upload
 
@@ -94,26 +96,38 @@ def with_bits(bits: int) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("replaced", "reason"),
     [
-        (with_bits(0x7FC0), "the norm of the gradient is nan"),
-        (with_bits(0x7F80), "the norm of the gradient is inf"),
+        (with_bits(0x7FC0), "the gradient has a value that is not finite"),
+        (with_bits(0x7F80), "the gradient has a value that is not finite"),
+        (with_bits(0x6E80), "the norm of the gradient is inf, at most 1e+12 is allowed"),
         (with_bits(0x5680), "the norm of the gradient is 7.04e+13, at most 1e+12 is allowed"),
         (changed("gradient", "value_head.bias", np.zeros(3, np.float32)), r"'value_head.bias' is [3], and in this"),
         (changed("gradient", "other", np.zeros(3, np.float32)), r"'other' is [3], and in this run's network absent"),
         ({"gradient": {"value_head.bias": np.zeros(1, np.float32)}}, "in this run's network ["),
         ({"env_steps": ROWS * ENVIRONMENTS + 1}, f"a rollout of this actor has {ROWS * ENVIRONMENTS} rows"),
-        ({"moments": {}}, "moments are of nothing, expected observations/observation [2, 3], returns [2]"),
-        (changed("moments", "returns", np.array([np.nan, 1.0])), "moments/returns has a value that no rollout has"),
+        ({"moments": {}}, "moments are of none, expected observations/observation [2, 3], returns [2]"),
+        (changed("moments", "returns", np.array([np.nan, 1.0])), "moments/returns has a value that is not finite"),
         (changed("moments", "returns", np.array([0.0, -1.0])), "moments/returns has a value that no rollout has"),
         (changed("moments", "returns", np.array([1e40, 1.0])), "moments/returns has a value that no rollout has"),
-        ({"action_counts": {}}, "action_counts are of nothing, expected action"),
+        ({"action_counts": {}}, "action_counts are of none, expected action"),
         (changed("action_counts", "action", np.full(4, 99)), "action_counts/action is not a count of 4 choices"),
         (changed("action_counts", "action", np.full(4, -1)), "action_counts/action is not a count of 4 choices"),
+        (
+            changed("action_counts", "action", np.full(4, GOOD.env_steps // 2)),
+            f"action_counts/action is not a count of 4 choices in {GOOD.env_steps} env_steps",
+        ),
         (changed("metrics", "entropy", np.array(np.nan, np.float32)), "metrics/entropy is nan"),
         (changed("metrics", "own", np.array(1.0, np.float32)), "metrics has the names"),
-        ({"metrics": {}}, "metrics has the names nothing, expected policy_loss"),
+        ({"metrics": {}}, "metrics has the names none, expected policy_loss"),
         ({"episode_lengths": np.zeros_like(GOOD.episode_lengths)}, "episode_lengths has a value below 1"),
         ({"episode_returns": np.full_like(GOOD.episode_returns, np.inf)}, "episode_returns has a value that is not"),
-        ({"env_steps": 0, "action_counts": {"action": np.zeros(4, np.int64)}}, "episodes ended in 0 env_steps"),
+        (
+            {
+                "env_steps": 0,
+                "moments": {name: np.zeros_like(values) for name, values in GOOD.moments.items()},
+                "action_counts": {"action": np.zeros(4, np.int64)},
+            },
+            "episodes ended in 0 env_steps",
+        ),
     ],
 )
 def test_an_unfit_gradient_is_rejected_with_the_reason_and_three_quarantine_its_sender(
@@ -127,6 +141,25 @@ def test_an_unfit_gradient_is_rejected_with_the_reason_and_three_quarantine_its_
         assert "\n" not in verdict.reason
     assert harness.fleet.actors["a"].rejected == {"unfit": 3}
     assert isinstance(harness.receive(replace(GOOD, identity=identity("b")), "b"), Gradient)
+
+
+def test_the_largest_observations_that_rollouts_may_have_are_accepted() -> None:
+    """The squared deviations of many rows add up."""
+    frames = np.full((ROWS + 1, ENVIRONMENTS, 3), LARGEST_OBSERVATION, np.float32)
+    frames[::2] *= -1.0
+    rollout = make_rollout(version=VERSION, frames=frames)
+    assert first_component_violation(rollout, SPACES) == ""
+    actor = RolloutGradients(SPEC, SPACES)
+    actor.load(LEARNER.weights() | LEARNER.gradient_inputs(0.0))
+    computed = replace(actor.compute(rollout), gradient=GOOD.gradient)
+    assert float(computed.moments["observations/observation"].max()) > LARGEST_OBSERVATION**2
+    harness = Harness()
+    assert isinstance(harness.receive(computed), Gradient)
+    moments = {"observations/observation": computed.moments["observations/observation"] * [[1.0], [10.0]]}
+    too_large = replace(computed, identity=identity(sequence=1), moments={**computed.moments, **moments})
+    verdict = harness.receive(too_large)
+    assert isinstance(verdict, Rejected)
+    assert "moments/observations/observation has a value that no rollout has" in verdict.reason
 
 
 @pytest.mark.parametrize(

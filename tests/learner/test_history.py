@@ -10,6 +10,8 @@ from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.metrics_file import read_rows
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import METRICS_LIMITS
 from daedalus.protocol.metrics import MAX_PAGE_VALUES, MetricsReport
 
 
@@ -77,6 +79,15 @@ def test_pages_are_bounded() -> None:
     assert len(pages) > 1
     assert all(page.values.size <= MAX_PAGE_VALUES for page in pages)
     assert column(history, "env_steps") == list(range(1900))
+
+
+def test_a_page_can_be_sent_however_many_metrics_a_program_names() -> None:
+    history = MetricsHistory()
+    for step in range(500):
+        history.add({"env_steps": step, **{f"user/{10 * step + number:0>64}": 1.0 for number in range(10)}})
+    report = decode(encode(history.page("r", 1, 0)), METRICS_LIMITS)
+    assert isinstance(report, MetricsReport)
+    assert report.page.columns[:2] == ("env_steps", f"user/{0:0>64}")
 
 
 def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:

@@ -287,6 +287,19 @@ def test_metrics_are_means_since_the_last_call() -> None:
     assert together.metrics.take_means() == {}
 
 
+def test_batches_without_a_metric_do_not_count_in_its_mean() -> None:
+    metrics = UpdateMetrics(SPACES, torch.device("cpu"))
+    terms = Terms(*[torch.zeros(()) for _ in Terms._fields])
+    metrics.add_update(terms, 1.0, clipped=False)
+    for explained in (0.5, np.nan, 0.25):
+        metrics.add_batch_metrics(torch.tensor([explained, 3.0, 4.0]))
+    means = metrics.take_means()
+    assert (means["explained_variance"], means["value_mean"]) == (0.375, 3.0)
+    metrics.add_update(terms, 1.0, clipped=False)
+    metrics.add_batch_metrics(torch.tensor([np.nan, 3.0, 4.0]))
+    assert "explained_variance" not in metrics.take_means()
+
+
 def test_advantage_std_is_the_standard_deviation_of_the_advantages() -> None:
     # With a discount factor of 0, A = r - V, and V is initially 0 for an observation of 0.
     rewards = torch.linspace(4.0, 6.0, 18).reshape(6, 3).numpy()

@@ -13,13 +13,15 @@ def row(
         "episodes": episodes,
         "episode_return_mean": returned,
         "episode_return_std": 2.0,
+        "episode_return_min": returned - 3.0,
+        "episode_return_max": returned + 3.0,
         "entropy": entropy,
         "explained_variance": explained,
     }
 
 
-def hints(*rows: dict[str, float]) -> list[str]:
-    hint, taken = LearningHint(1000), []
+def hints(*rows: dict[str, float], normalizes_rewards: bool = False) -> list[str]:
+    hint, taken = LearningHint(1000, normalizes_rewards=normalizes_rewards), []
     for each in rows:
         hint.add(each)
         taken.append(hint.take())
@@ -51,8 +53,25 @@ def test_run_whose_critic_explains_nothing_gets_a_hint() -> None:
     *before, last = hints(row(0.01, 0.0, 1.0, -5.0), *watched)
     assert set(before) == {""}
     assert "the explained variance of the value stays below 0; try training.normalize_rewards=true" in last
+    normalizing = hints(row(0.01, 0.0, 1.0, -5.0), *watched, normalizes_rewards=True)[-1]
+    assert normalizing.endswith("stays below 0; try a smaller training.learning_rate")
     watched[3]["explained_variance"] = 0.1
     assert set(hints(row(0.01, 0.0, 1.0), *watched)) == {""}
+
+
+def equal(share: float, entropy: float = 1.0) -> dict[str, float]:
+    returns = {"episode_return_std": 0.0, "episode_return_min": -200.0, "episode_return_max": -200.0}
+    return {**row(share, -200.0, entropy, -1e5), **returns}
+
+
+@pytest.mark.parametrize("entropy", [1.0, 0.01])
+def test_run_whose_returns_are_all_equal_gets_a_hint_of_its_own(entropy: float) -> None:
+    watched = [equal(0.1 + 0.02 * index, entropy) for index in range(6)]
+    *before, last = hints(equal(0.01), *watched)
+    assert set(before) == {""}
+    assert last.startswith("this run does not learn: every episode so far has the return -200, so")
+    watched[2]["episode_return_max"] = -199.0
+    assert "every episode" not in hints(equal(0.01), *watched)[-1]
 
 
 def test_run_is_not_judged_without_its_first_episodes() -> None:

@@ -1,6 +1,8 @@
 """Metrics writers: the files are readable by csv and by TensorBoard."""
 
 import csv
+import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +75,30 @@ def test_csv_that_cannot_be_written_anew_keeps_its_rows(tmp_path: Path, monkeypa
     assert sorted(tmp_path.iterdir()) == [path]
 
 
+def test_csv_continues_a_file_whose_header_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(b"wall_seconds,env_\xffsteps\r\n1,2\r\n")
+    writer = CsvWriter(path)
+    writer.write({"wall_seconds": 2.0, "env_steps": 5}, NONE)
+    writer.close()
+    assert read(path) == [
+        {"wall_seconds": "1", "env_\ufffdsteps": "2", "env_steps": ""},
+        {"wall_seconds": "2", "env_\ufffdsteps": "", "env_steps": "5"},
+    ]
+
+
+@pytest.mark.parametrize("header", [b"", b"env_steps\r\n"])
+def test_csv_without_rows_raises_os_error_that_says_what_to_do(tmp_path: Path, header: bytes) -> None:
+    """The recorder then logs it, and training continues."""
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(header + b'"' + b"x" * 200_000)
+    with (
+        pytest.raises(OSError, match=r"metrics\.csv is damaged \(field larger .*\): move it away"),
+        closing(CsvWriter(path)) as writer,
+    ):
+        writer.write({"env_steps": 1, "env/laps": 2.0}, NONE)
+
+
 def test_csv_writes_a_header_to_an_empty_file(tmp_path: Path) -> None:
     path = tmp_path / "metrics.csv"
     path.touch()
@@ -117,9 +143,23 @@ def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Pat
     (returns,) = events.Histograms("rollout/episode_return")
     assert (returns.step, returns.histogram_value.num, returns.histogram_value.sum) == (100, 3.0, 7.0)
     assert (returns.histogram_value.min, returns.histogram_value.max) == (1.0, 5.0)
-    assert events.Histograms("rollout/action")[0].histogram_value.bucket == [2.0, 0.0, 5.0]
+    actions = events.Histograms("rollout/action")[0].histogram_value
+    assert actions.bucket == [2.0, 0.0, 5.0]
+    assert (actions.min, actions.max, actions.num, actions.sum, actions.sum_squares) == (0.0, 2.0, 7.0, 10.0, 20.0)
     (image,) = events.Images("rollout/observation")
     assert (image.step, image.width, image.height) == (100, 8, 6)
+
+
+def test_histogram_of_actions_takes_no_memory_for_each_action(tmp_path: Path) -> None:
+    writer = TensorBoardWriter(tmp_path)
+    tracemalloc.start()
+    try:
+        writer.write({"env_steps": 1}, Details(action_counts={"action": [0, 1_000_000, 1_000_000]}))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+        writer.close()
+    assert peak < 1 << 20
 
 
 def test_update_metrics_are_metrics_columns() -> None:

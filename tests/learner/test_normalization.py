@@ -82,6 +82,20 @@ def test_returns_run_on_over_the_rollouts_of_a_stream(streams: list[list[Rollout
     assert float(normalizer.moments.variance) == pytest.approx(np.var(expected), rel=1e-5)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_reward_that_is_not_finite_does_not_reach_the_next_episode_or_rollout(bad: float, ends: bool) -> None:
+    """The learner rejects such a rollout; an actor that computes gradients goes on after it."""
+    nowhere, everywhere = np.zeros((6, 3), np.bool_), np.ones((6, 3), np.bool_)
+    first = replace(sent(0), valid=everywhere, terminated=nowhere.copy(), truncated=nowhere)
+    first.rewards[2] = bad
+    first.terminated[3] = ends
+    normalizer = RewardNormalizer(DISCOUNT)
+    returns = normalizer._returns(first)
+    assert np.isfinite(returns).all(1).tolist() == [True, True, False, False, ends, ends]
+    assert normalizer.moments_of([sent(1)]).squares.isfinite()
+
+
 def test_rewards_are_divided_by_the_deviation_and_clipped() -> None:
     normalizer = RewardNormalizer(DISCOUNT)
     normalizer.add([sent(0)])

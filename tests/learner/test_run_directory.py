@@ -97,8 +97,10 @@ def test_empty_directory_is_accepted_and_a_file_is_refused(tmp_path: Path) -> No
     (tmp_path / "empty").mkdir()
     run_directory.create(tmp_path / "empty", run_spec())
     (tmp_path / "file").touch()
-    with pytest.raises(SettingsError, match="exists"):
+    with pytest.raises(SettingsError, match=r"file is a file: choose a directory with --run-dir"):
         run_directory.create(tmp_path / "file", run_spec())
+    with pytest.raises(SettingsError, match=r"is not empty, and has no config\.toml: choose another directory"):
+        run_directory.create(tmp_path, run_spec())
     with pytest.raises(SettingsError, match="Not a directory"):
         run_directory.create(tmp_path / "file" / "run", run_spec())
 

@@ -14,7 +14,7 @@ from building import run_spec
 from processes import LIMIT
 
 from daedalus.learner.run import run_directory, run_lock
-from daedalus.learner.run.run_lock import LOCK, RunInUseError, RunLock
+from daedalus.learner.run.run_lock import LOCK, RunInUseError, RunLock, is_locked
 from daedalus.learner.run.settings import SettingsError
 
 
@@ -31,6 +31,16 @@ def test_a_second_lock_is_refused_with_the_holder_until_the_first_is_closed(tmp_
         "stop it first, or choose another --run-dir"
     )
     RunLock(tmp_path).close()
+
+
+def test_whether_a_run_is_locked_can_be_asked(tmp_path: Path) -> None:
+    assert not is_locked(tmp_path)
+    with RunLock(tmp_path):
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)
+    (tmp_path / LOCK).unlink()
+    os.mkfifo(tmp_path / LOCK)
+    assert not is_locked(tmp_path)  # and it returns
 
 
 def test_a_child_process_holds_the_lock_until_it_is_killed(tmp_path: Path) -> None:

@@ -10,7 +10,9 @@ from session_fleet import GatedActor, LearnerProcess
 
 from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig
+from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.serving import actor_server
+from daedalus.learner.training.checkpoint import load_newest
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
@@ -104,6 +106,26 @@ def test_actors_wait_for_a_learner_that_was_stopped_and_join_it_again(network: M
     for actor in actors:
         actor.stop.set()
         assert actor.join() is False
+
+
+def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a bug in a diagnostic of the user's algorithm")
+
+    monkeypatch.setattr(RunReporter, "details", fail)
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    actor = GatedActor(network, "actor")
+    actor.open_gate()
+    assert actor.join()
+    until(lambda: learner.ended)
+    assert isinstance(learner.error, ZeroDivisionError)
+    newest = load_newest(tmp_path / "run")
+    assert newest is not None
+    assert newest.counters["env_steps"] >= 1
 
 
 def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(

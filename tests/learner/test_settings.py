@@ -14,6 +14,10 @@ from daedalus.learner.run.settings import (
     read_preset,
     run_spec,
 )
+from daedalus.protocol.codec import decode, encode
+from daedalus.protocol.limits import LEARNER_LIMITS
+from daedalus.protocol.messages import Welcome
+from daedalus.protocol.spec import RunSpec
 
 
 def settings(*assignments: str, **sections: Any) -> dict[str, Any]:
@@ -52,6 +56,31 @@ def test_toml_file_can_be_used_as_a_preset(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text('[environment]\nid = "Own-v0"\n')
     assert read_preset(str(path)) == {"environment": {"id": "Own-v0"}}
+
+
+def test_environment_in_place_of_a_preset_is_shown_its_option() -> None:
+    for name in ("CartPole-v1", "ALE/Pong-v5", "corridor:Corridor-v0"):
+        with pytest.raises(SettingsError) as caught:
+            read_preset(name)
+        assert str(caught.value).startswith(f"unknown preset {name!r}: ")
+        assert str(caught.value).endswith(f"such as with: daedalus train --env {name}")
+
+
+def test_run_directory_in_place_of_a_preset_is_shown_its_commands(tmp_path: Path) -> None:
+    (tmp_path / "config.toml").touch()
+    with pytest.raises(SettingsError) as caught:
+        read_preset(str(tmp_path))
+    assert str(caught.value) == (
+        f"{tmp_path} is a run directory: continue it with `daedalus resume {tmp_path}`, or start a new run with its "
+        f"settings with `daedalus train {tmp_path}/config.toml`"
+    )
+
+
+def test_setting_outside_of_a_section_is_refused(tmp_path: Path) -> None:
+    for text in ("environment = 3", 'env_steps = 3\n[environment]\nid = "Own-v0"'):
+        (tmp_path / "own.toml").write_text(text)
+        with pytest.raises(SettingsError, match=r"own\.toml: \w+ is a value outside of the sections"):
+            read_preset(str(tmp_path / "own.toml"))
 
 
 def test_unreadable_file_is_named_in_the_error(tmp_path: Path) -> None:
@@ -112,6 +141,26 @@ def test_assignment_below_a_value_is_refused() -> None:
 # --------------------------------------------------------------------------------------- error messages
 
 
+def test_setting_that_no_message_to_an_actor_can_hold_is_refused_by_name() -> None:
+    def spec_of(rows: int) -> RunSpec:
+        table = [[float(row), 0.5] for row in range(rows)]
+        return run_spec(settings(environment={"id": "X-v0", "action_table": table}))
+
+    welcome = Welcome(run="r" * 64, learner_epoch=2**62, seed=2**32, spec=spec_of(13_000))
+    assert decode(encode(welcome), LEARNER_LIMITS) == welcome
+    for rows, size in ((14_000, "266,003"), (65_536, "1,245,189")):
+        with pytest.raises(SettingsError) as caught:
+            spec_of(rows)
+        assert str(caught.value).startswith(f"environment.action_table has {size} bytes, too many to send to actors: ")
+        assert "all settings together may have 253,952, and have " in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_setting_that_no_message_can_express_is_refused_by_name() -> None:
+    message = error_message(f"environment.kwargs.size={10**30}")
+    assert message.startswith("environment.kwargs cannot be sent to actors: ")
+
+
 def test_unknown_setting_error_suggests_similar_names() -> None:
     message = error_message("training.learning_rte=0.1")
     assert message.startswith("unknown setting training.learning_rte: did you mean learning_rate")
@@ -128,7 +177,7 @@ def test_unknown_setting_error_lists_the_section_when_none_is_similar() -> None:
         ("training.discount_factor=1.5", "at least 0 and at most 1"),
         ("training.discount_factor=nan", "at least 0 and at most 1"),
         ("training.learning_rate=0", "above 0 and at most 1"),
-        ("training.seed=4294967296", "at least 0 and below 4.29497e+09"),
+        ("training.seed=4294967296", "at least 0 and below 4294967296"),
         ("collection.window=65", "at least 1 and at most 64"),
         ("training.env_steps=0", "at least 1"),
     ],
@@ -165,10 +214,15 @@ def test_value_of_wrong_type_is_refused() -> None:
         assert error_message(f"environment.leave_out={shell}").endswith(
             "which is not a list: write --set \"environment.leave_out=['mission']\""
         )
+    assert error_message("policy.hidden=[64") == "setting policy.hidden is '[64': the closing bracket is missing"
     assert error_message("environment.leave_out=['a b']") == (
         "setting environment.leave_out.0 is 'a b', which is not valid. Components of the observation that the policy "
         'does not see, such as a text: `leave_out = ["mission"]`.'
     )
+    assert error_message("environment.wrap=foo") == (
+        "setting environment.wrap is 'foo', which is not valid: write module:function"
+    )
+    assert error_message("environment.id=") == "setting environment.id is empty"
     assert error_message("policy.encoder=cnn").startswith(
         "setting policy.encoder is 'cnn', which is not valid. Encoder of"
     )
@@ -206,6 +260,24 @@ def test_for_algorithm_settings_apply_only_to_the_chosen_algorithm() -> None:
 def test_for_algorithm_that_is_not_a_table_of_sections_is_refused(table: object) -> None:
     with pytest.raises(SettingsError, match="for_algorithm"):
         choose_algorithm({"training": {"algorithm": "impala"}, "for_algorithm": table}, None)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"a3d": {}}, r"^for_algorithm\.a3d must be one of .* \(did you mean a3c\?\)"),
+        ({"a3c": {"trainin": {}}}, r"unknown setting for_algorithm\.a3c\.trainin: did you mean training\?"),
+        (
+            {"a3c": {"training": {"learning_rat": 0.1}}},
+            r"unknown setting for_algorithm\.a3c\.training\.learning_rat: did you mean learning_rate",
+        ),
+    ],
+)
+def test_misspelt_for_algorithm_is_refused_whatever_the_algorithm_is(tables: dict[str, Any], message: str) -> None:
+    for algorithm in (None, "a3c", "impala"):
+        with pytest.raises(SettingsError, match=message):
+            choose_algorithm({"for_algorithm": tables}, algorithm)
+    choose_algorithm({"for_algorithm": {"mine:Algorithm": {"environment": {"id": "Any-v0"}}}}, None)
 
 
 @pytest.mark.parametrize("name", preset_names())

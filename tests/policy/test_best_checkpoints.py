@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_name, best_score, keep_if_best, rescore
@@ -19,8 +20,10 @@ def scored(run: Path) -> list[tuple[float, str]]:
 
 
 def test_scores_are_read_back_from_names(tmp_path: Path) -> None:
-    assert best_name(812.34, 12345) == "best_812.3_0000012345"
-    assert best_name(-20.5, 7) == "best_-20.5_0000000007"
+    for score, name in ((812.34, "best_812.34_0000012345"), (-20.5, "best_-20.5_0000012345")):
+        assert best_name(score, 12345) == name
+    for score in (0.0, 1e-7, -1.5e-300, 1e22, -(2.0**100), 1.0 / 3.0, np.float64(0.1)):
+        assert best_score(Path(best_name(score, 7))) == score
     with pytest.raises(ValueError, match="finite"):
         best_name(float("nan"), 1)
     assert best_checkpoints(tmp_path) == []
@@ -37,6 +40,21 @@ def test_three_highest_scores_are_kept(tmp_path: Path) -> None:
     ]
     assert best == [True, True, False, False, False, True, False]
     assert scored(tmp_path) == [(10.0, "6"), (9.0, "7"), (9.0, "2")]
+
+
+def test_small_scores_are_compared_exactly(tmp_path: Path) -> None:
+    best = [
+        keep_if_best(checkpoint(tmp_path, version), score, version)
+        for version, score in ((1, 0.001), (2, 0.002), (3, 0.003), (4, 0.02), (5, 0.04), (6, 0.03))
+    ]
+    assert best == [True, True, True, True, True, False]
+    assert scored(tmp_path) == [(0.04, "5"), (0.03, "6"), (0.02, "4")]
+
+
+def test_of_equal_scores_the_newest_are_kept(tmp_path: Path) -> None:
+    for version in (1, 2, 3, 5, 4):
+        assert keep_if_best(checkpoint(tmp_path, version), 500.0, version) == (version != 4)
+    assert scored(tmp_path) == [(500.0, "5"), (500.0, "4"), (500.0, "3")]
 
 
 def test_version_is_kept_only_once(tmp_path: Path) -> None:

@@ -174,11 +174,11 @@ def test_epsilon_falls_from_one_to_that_of_the_actor() -> None:
         assert acting.network.exploration is not None
         assert float(acting.network.exploration.epsilon(torch.tensor([[0.1]]))) == pytest.approx(expected)
     spec = TrainingSpec(algorithm="n_step_q", env_steps=1000)
-    assert [spec.exploration_annealing(progress) for progress in (0.0, 0.05, 0.1, 1.0)] == [1.0, 0.5, 0.0, 0.0]
+    assert [spec.exploration_annealing(progress, 7) for progress in (0.0, 0.05, 0.1, 1.0)] == [1.0, 0.5, 0.0, 0.0]
     spec = TrainingSpec(algorithm="a3c", env_steps=1000, exploration=(0.1,))
-    assert spec.exploration_annealing(0.0) == 0.0
+    assert spec.exploration_annealing(0.0, 0) == 0.0
     spec = TrainingSpec(algorithm="a3c", env_steps=1000, exploration=(0.1,), exploration_env_steps=500)
-    assert spec.exploration_annealing(0.25) == 0.5
+    assert [spec.exploration_annealing(0.9, env_steps) for env_steps in (0, 250, 500, 900)] == [1.0, 0.5, 0.0, 0.0]
 
 
 def test_one_legal_choice_is_taken_whatever_the_noise() -> None:

@@ -19,6 +19,7 @@ from daedalus.policy.saving.saved_policy import (
     FORMAT,
     PARAMETERS_FILE,
     PROGRAM_FILE,
+    NoPolicyError,
     OtherFormatError,
     checkpoints,
     find_policy,
@@ -52,6 +53,18 @@ def test_written_files_are_read_back(sealed: Path) -> None:
     assert read_all(sealed) == (FILES, CONTENT)
     assert sorted(entry.name for entry in sealed.iterdir()) == ["empty", "manifest.json", "program", "seal", "weights"]
     assert [entry.name for entry in sealed.parent.iterdir()] == ["0001"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs in folders")
+@pytest.mark.parametrize("name", ["empty", "manifest.json", "program", "seal", "weights"])
+def test_file_that_is_not_regular_is_damaged(sealed: Path, name: str) -> None:
+    """A checkpoint may come from another machine."""
+    (sealed / name).unlink()
+    (sealed / name).symlink_to("/dev/zero")
+    assert is_damaged(sealed)
+    (sealed / name).unlink()
+    os.mkfifo(sealed / name)
+    assert is_damaged(sealed)
 
 
 def test_missing_parents_are_created(tmp_path: Path) -> None:
@@ -252,6 +265,16 @@ def test_policy_of_another_format_is_refused_with_both_formats(tmp_path: Path, n
             OtherFormatError, match=rf"0000000002 has format {expected} of .* reads format {FORMAT} only"
         ):
             read(run if read is find_policy else directory)
+
+
+def test_a_directory_without_a_policy_is_named_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(NoPolicyError, match=r"nowhere does not exist: name a run directory or one of its checkpoints"):
+        find_policy(tmp_path / "nowhere")
+    with pytest.raises(NoPolicyError, match=r"has no checkpoints: is it a run directory\?"):
+        find_policy(tmp_path)
+    (tmp_path / "config.toml").touch()
+    with pytest.raises(NoPolicyError, match=r"has no checkpoints yet: .* service\.checkpoint_seconds"):
+        find_policy(tmp_path)
 
 
 @pytest.mark.parametrize("name", [name for name in POLICY_CONTENT if name != "format"])

@@ -48,11 +48,43 @@ def test_all_missing_modules_are_named_once() -> None:
     UserModules().check(RunSpec(environment=EnvironmentSpec(id="ALE/Pong-v5")).user_modules)
 
 
+def failure(value: str) -> str:
+    """Return the error of a module that is allowed."""
+    with pytest.raises(UserModuleError) as error:
+        UserModules(frozenset({value.rpartition(":")[0]})).attribute("environment.wrap", value)
+    return str(error.value).removeprefix(f"environment.wrap={value}: ")
+
+
 def test_a_missing_module_or_name_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "mine_with_a_gap.py").write_text("import not_installed_at_all")
     (tmp_path / "mine_without_it.py").write_text("")
-    modules = UserModules(frozenset({"mine_with_a_gap", "mine_without_it"}))
-    with pytest.raises(UserModuleError, match=r"wrap=mine_with_a_gap:f: cannot import mine_with_a_gap .*not_installed"):
-        modules.attribute("environment.wrap", "mine_with_a_gap:f")
-    with pytest.raises(UserModuleError, match=r"mine_without_it.py has no 'f'"):
-        modules.attribute("environment.wrap", "mine_without_it:f")
+    assert failure("mine_that_is_absent:f").endswith("install it, or start in the folder of mine_that_is_absent.py")
+    assert "cannot import mine_absent.part (No module" in failure("mine_absent.part:f")
+    assert failure("mine_without_it:f") == "mine_without_it.py has no 'f'"
+
+
+def test_a_module_that_imports_a_missing_one_is_not_said_to_be_missing(tmp_path: Path) -> None:
+    (tmp_path / "mine_with_a_gap.py").write_text("import not_installed_at_all.part")
+    (tmp_path / "mine_above_it.py").write_text("import mine_with_a_gap")
+    (tmp_path / "mine_with_an_old_name.py").write_text("\nfrom os import absent")
+    imports = "mine_with_a_gap.py imports not_installed_at_all, which is not installed"
+    assert failure("mine_with_a_gap:f") == failure("mine_above_it:f") == imports
+    reason = failure("mine_with_an_old_name:f")
+    assert reason.startswith(
+        "cannot import mine_with_an_old_name (mine_with_an_old_name.py, line 2: cannot import name"
+    )
+
+
+def test_the_path_of_a_file_in_place_of_a_module_is_reported() -> None:
+    write = "name the module, not its file: write "
+    assert failure("mine.py:f") == f"{write}mine:f"
+    assert failure("envs/mine.py:f") == f"{write}envs.mine:f"
+    assert failure("/srv/mine.py:f") == "name the module, not its file: start in /srv and write mine:f"
+
+
+@pytest.mark.parametrize("name", ["colorsys", "time"])  # the second has no file
+def test_a_file_with_the_name_of_a_module_of_python_is_reported(name: str, tmp_path: Path) -> None:
+    assert "this folder" not in failure(f"{name}:absent")
+    (tmp_path / f"{name}.py").write_text("absent = 1")
+    assert failure(f"{name}:absent").endswith(
+        f"; it was imported in place of {name}.py of this folder: rename your file"
+    )

@@ -76,6 +76,14 @@ SNAPSHOT_FAULTS: dict[str, tuple[Edit, str]] = {
 }
 
 
+def test_reason_is_short_and_printable_whatever_the_sender_wrote() -> None:
+    _, content, body = unwire(SAMPLES["snapshot"])
+    content["arrays"][0][0] = "\n\x1b" + "x" * 100_000
+    with pytest.raises(ProtocolError, match=r"^Snapshot has no array '\\n\\x1bxxx") as caught:
+        decode(wire(content, body), LIMITS)
+    assert len(str(caught.value).encode()) == 300
+
+
 @pytest.mark.parametrize("fault", SNAPSHOT_FAULTS)
 def test_faulty_header_is_rejected_with_the_fault(fault: str) -> None:
     edit, reason = SNAPSHOT_FAULTS[fault]

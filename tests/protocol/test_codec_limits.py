@@ -3,6 +3,7 @@
 import dataclasses
 import struct
 import tracemalloc
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -22,8 +23,8 @@ from wire_format import (
 )
 
 from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode, encode
-from daedalus.protocol.limits import Limits
-from daedalus.protocol.messages import Program, RunEnded, Snapshot
+from daedalus.protocol.limits import LEARNER_LIMITS, Limits
+from daedalus.protocol.messages import Program, Refusal, RunEnded, Snapshot
 
 
 def peak_bytes(data: bytes, limits: Limits) -> int:
@@ -125,12 +126,37 @@ def test_deep_nesting_is_decoded_or_rejected(depth: int) -> None:
         decoded_or_refused(wire_header(header))
 
 
+@pytest.mark.parametrize(
+    "spaces",
+    [
+        {"observations": {"o": {"kind": "discrete", "counts": ["x"] * 120_000}}},
+        {"observations": {"o": {"kind": "array", "shape": ["x"] * 120_000, "dtype": "uint8"}}},
+        {"actions": {"a": {"kind": "continuous", "low": ["x"] * 60_000, "high": ["x"] * 60_000}}},
+        {"observations": {f"!{index}": 1 for index in range(30_000)}},
+        {str(index): 1 for index in range(30_000)},
+    ],
+    ids=["counts", "shape", "bounds", "names", "keys"],
+)
+def test_many_faults_cost_little_memory(spaces: dict[str, Any]) -> None:
+    """A description of each would take 180 MB, and half a second in which no other thread runs."""
+    _, content, _ = unwire(SAMPLES["join"])
+    content["fields"]["spaces"] = {"observations": {}, "actions": {}} | spaces
+    assert peak_bytes(wire(content), LIMITS) < 16 << 20
+
+
 def test_header_beyond_the_limit_is_not_read() -> None:
     _, content, _ = unwire(encode(RunEnded(learner_epoch=1, outcome="finished", reason="x" * 5000)))
     with pytest.raises(ProtocolError, match=r"the header declares .* the limit is 4096"):
         decode(wire(content), SMALL)
     with pytest.raises(ProtocolError, match="the header declares 4294967295 bytes"):
         decode(PREFIX.pack(b"DAED", PROTOCOL_VERSION, 0, 2**32 - 1), SMALL)
+
+
+def test_header_that_no_reader_accepts_is_not_encoded() -> None:
+    refusal = Refusal(code="unknown", reason="x" * (LEARNER_LIMITS.max_header_bytes - 1000))
+    assert decode(encode(refusal), LEARNER_LIMITS) == refusal
+    with pytest.raises(ValueError, match=r"the header of a Refusal has 26\d,\d\d\d bytes, readers accept 262,144"):
+        encode(dataclasses.replace(refusal, reason="x" * LEARNER_LIMITS.max_header_bytes))
 
 
 def test_more_arrays_than_the_limit_are_rejected() -> None:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from daedalus.actor.session.learner_queries import ActorError, NameInUseError
+from daedalus.actor.errors import ActorError, NameInUseError
 from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.messages import Snapshot

@@ -44,10 +44,10 @@ def test_messages_above_the_limit_are_dropped_and_the_session_goes_on() -> None:
     assert sizes == [MIB // 2, 0]
 
 
-def test_small_queries_are_filtered_by_their_size() -> None:
+@pytest.mark.parametrize("key", [keys.join("r", "arm"), keys.reports("r", "arm"), keys.orders("r")])
+def test_small_queries_are_filtered_by_their_size(key: str) -> None:
     """A router does not forward 400 MB to a learner in a request to join."""
     endpoint, router = listen_somewhere()
-    key = keys.join("r", "arm")
     with closing(router), closing(connect([endpoint])) as learner, closing(connect([endpoint])) as actor:
         learner.serve(key, lambda request: request.reply(b"welcome"))
         until(lambda: actor.query(key, b"x" * JOIN_LIMITS.message_bytes, timeout=LIMIT) == [b"welcome"])

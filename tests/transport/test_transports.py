@@ -15,7 +15,7 @@ import pytest
 
 from daedalus.transport.interface import AddressInUseError, Request, Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
-from daedalus.transport.zenoh_transport import connect, listen
+from daedalus.transport.zenoh_transport import ZenohTransport, connect, listen
 
 WAIT = 30.0  # seconds; generous, so that only a real fault exceeds it
 MakeEnd = Callable[[], Transport]
@@ -411,6 +411,22 @@ def test_closed_transport_raises_transport_error(act: str, closing: Callable[[Tr
         acts[act]()
 
 
+def test_query_over_a_closed_session_either_raises_or_is_answered(closing: Callable[[Transport], Transport]) -> None:
+    end = closing(listen_somewhere()[1])
+    assert isinstance(end, ZenohTransport)
+    ends = Tape()
+    end.query_async("d/r/join", b"", timeout=WAIT, on_answer=ends)
+    assert ends.next() is None
+    end._session.close()  # as another thread that reopens the session does
+    for _ in range(20):
+        try:
+            end.query_async("d/r/join", b"", timeout=WAIT, on_answer=ends)
+        except TransportError:
+            ends("raised")
+    end._callbacks.await_release()
+    assert ends.qsize() == 20
+
+
 def raise_fault(*_arguments: object) -> None:
     raise RuntimeError("a fault of ours")
 
@@ -482,6 +498,31 @@ def test_reopened_client_repeats_its_declarations(client: tuple[Transport, Trans
     assert inbox.take() == b"7"
     end.query_async("d/r/status", b"2", timeout=WAIT, on_answer=answers)
     assert answers.next() == b"d/r/status 2"
+
+
+def test_reopened_client_has_what_other_threads_declare_and_withdraw_meanwhile(
+    client: tuple[Transport, Transport],
+) -> None:
+    router, end = client
+    seen, there = Tape(), Tape()
+    withdrawn = end.declare_presence("d/r/actors/withdrawn")
+    router.declare_presence("d/r/learner")
+
+    def on_change(_key: str, present: bool) -> None:
+        if not present:  # the declarations are being repeated
+            withdrawn.close()
+            end.declare_presence("d/r/actors/new")
+        seen(present)
+
+    end.watch_presence("d/r/learner", on_change)
+    router.watch_presence("d/r/actors/*", there)
+    assert (seen.next(), there.next()) == (True, ("d/r/actors/withdrawn", True))
+    assert end.reopen() is True
+    assert [seen.next(), seen.next()] == [False, True]
+    settle(end, router)
+    present: dict[str, bool] = {}
+    while present != {"d/r/actors/withdrawn": False, "d/r/actors/new": True}:
+        present.update([there.next()])
 
 
 def test_reachable_client_is_not_reopened(client: tuple[Transport, Transport]) -> None:

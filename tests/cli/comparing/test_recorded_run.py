@@ -9,6 +9,7 @@ from recorded_runs import TARGET, record
 
 from daedalus.cli.comparing.recorded_run import SECONDS, RunDataError, find_runs, read_run
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
+from daedalus.learner.run.run_lock import RunLock
 
 
 def refused(directory: Path, *columns: str) -> str:
@@ -56,6 +57,13 @@ class TestUnfinished:
         assert read_run(directory).unfinished == (
             f"{directory} is not finished (3,000 of 1,500,000 env_steps): continue it with: daedalus resume {directory}"
         )
+
+    def test_a_run_that_is_in_training_is_not_to_be_continued(self, tmp_path: Path) -> None:
+        directory = record(tmp_path / "run", finished=False, evaluation=None)
+        with RunLock(directory):
+            assert read_run(directory).unfinished == (
+                f"{directory} is not finished (3,000 of 1,500,000 env_steps): it is still running"
+            )
 
     def test_a_run_that_was_resumed_since_its_summary_is(self, tmp_path: Path) -> None:
         directory = record(tmp_path / "run")
@@ -110,11 +118,25 @@ class TestBadInput:
     def test_damaged_settings_and_summaries(self, tmp_path: Path) -> None:
         run = record(tmp_path / "run")
         (run / SUMMARY).write_text("{")
-        assert refused(run) == "RUN/summary.json is damaged: it is not valid JSON"
+        assert refused(run) == "RUN/summary.json is damaged: it is not valid JSON; delete the file"
         (run / SUMMARY).write_text("[]")
-        assert refused(run) == "RUN/summary.json is damaged: it is not a JSON object"
+        assert refused(run) == "RUN/summary.json is damaged: it is not a JSON object; delete the file"
         (run / CONFIG).write_text("[training")
         assert "RUN/config.toml is damaged: " in refused(run)
+
+    def test_summary_without_steps_is_that_of_the_last_row(self, tmp_path: Path) -> None:
+        directory = record(tmp_path / "run", solved=True, seconds_to_target=90.0)
+        summary = json.loads((directory / SUMMARY).read_text())
+        for changed in ({**summary, "env_steps": None}, {k: v for k, v in summary.items() if k != "env_steps"}):
+            (directory / SUMMARY).write_text(json.dumps(changed))
+            run = read_run(directory)
+            assert run.unfinished == ""
+            assert run.reached(TARGET) == (3000.0, 3.0)
+
+    def test_environment_that_is_no_text_is_left_out(self, tmp_path: Path) -> None:
+        run = record(tmp_path / "run")
+        (run / CONFIG).write_text("[environment]\nid = []\n")
+        assert read_run(run).settings == {}
 
     def test_settings_of_another_release_are_read_as_they_are(self, tmp_path: Path) -> None:
         run = record(tmp_path / "run")

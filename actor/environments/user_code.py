@@ -1,0 +1,30 @@
+"""The user's part of a traceback: where the code of an environment raised an exception."""
+
+import sys
+from collections.abc import Iterator
+from types import TracebackType
+
+from daedalus.policy.user_modules import shown_path
+
+_NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", *sys.stdlib_module_names}  # packages
+
+
+def frames_of(error: BaseException | None) -> Iterator[TracebackType]:
+    """Yield the frames of an exception's traceback, that of the innermost call last."""
+    traceback = None if error is None else error.__traceback__
+    while traceback is not None:
+        yield traceback
+        traceback = traceback.tb_next
+
+
+def is_of_user(frame: TracebackType) -> bool:
+    """Return whether a frame runs code of an environment, or of a package that it uses."""
+    return frame.tb_frame.f_globals.get("__name__", "").partition(".")[0] not in _NOT_OF_USERS
+
+
+def place_of(error: BaseException | None) -> str:
+    """Return where the user's code raised an error, as ` (FILE, line N)`, or an empty string."""
+    place = ""
+    for frame in filter(is_of_user, frames_of(error)):
+        place = f" ({shown_path(frame.tb_frame.f_code.co_filename)}, line {frame.tb_lineno})"
+    return place

@@ -1,0 +1,163 @@
+"""A check of an environment in a process of its own: the environment may print, hang, or end its process."""
+
+import faulthandler
+import json
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from daedalus.cli.processes import interrupts_held
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from daedalus.actor.checking.report import EnvironmentReport
+
+_POLL_SECONDS = 0.2
+_ALARM_SECONDS = 5  # after the limit: a process without its parent ends then, even in native code
+
+
+class CheckTimeoutError(Exception):
+    """Error of a check that did not end in time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvironmentCheck:
+    """What to check, and how long. See check_environment."""
+
+    spec: EnvironmentSpec
+    modules: UserModules
+    seconds: float
+    env_steps: int
+    seed: int = 0
+    most_seconds: float  # for the whole check
+    shown: bool = False  # show what the environment prints, on standard error, and the end of one that crashes
+    notes: bool = False  # add what gymnasium's own checker says
+
+    def run(self) -> "EnvironmentReport":
+        """Check the environment in this process."""
+        from daedalus.actor.checking.checker import gymnasium_notes
+        from daedalus.actor.checking.play import check_environment
+
+        report = check_environment(
+            self.spec, self.modules, seconds=self.seconds, env_steps=self.env_steps, seed=self.seed
+        )
+        if not self.notes or report.problems:
+            return report
+        return report.model_copy(update={"notes": gymnasium_notes(self.spec, self.modules)})
+
+    def words(self) -> str:
+        """Return the check as text, for `from_words` in another process."""
+        plain = {
+            name: getattr(self, name) for name in ("seconds", "env_steps", "seed", "most_seconds", "shown", "notes")
+        }
+        return json.dumps({**plain, "spec": self.spec.model_dump(mode="json"), "modules": sorted(self.modules.allowed)})
+
+    @classmethod
+    def from_words(cls, words: str) -> "EnvironmentCheck":
+        """Return the check of `words`."""
+        values: dict[str, Any] = json.loads(words)
+        spec = EnvironmentSpec.model_validate(values.pop("spec"))
+        return cls(**values | {"spec": spec, "modules": UserModules(frozenset(values["modules"]))})
+
+
+def check_in_process(
+    check: EnvironmentCheck, *, fork: bool = False, stop: threading.Event | None = None
+) -> "EnvironmentReport":
+    """Run a check in a process of its own, and return what was found. An environment that ends it has a problem.
+
+    Args:
+      check: what to check.
+      fork: start the process by a fork if it is safe, which takes 0.1 s instead of 0.5 s. For commands, whose process
+        has nothing that does not work after a fork. Only for a check that is not shown.
+      stop: ends the check early when it is set.
+
+    Raises CheckTimeoutError.
+    """
+    from daedalus.actor.checking.report import EnvironmentReport
+
+    reading, writing = os.pipe()
+    with open(reading, "rb", buffering=0) as results:
+        # Apple's frameworks do not work after a fork.
+        forked = fork and sys.platform == "linux" and threading.active_count() == 1
+        try:
+            pid = _forked(check, writing) if forked else _spawned(check, writing)
+        finally:
+            os.close(writing)
+        try:
+            answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds)
+            if answer:
+                os.kill(pid, signal.SIGKILL)  # threads of the environment could keep it alive
+        except BaseException:
+            os.kill(pid, signal.SIGKILL)
+            raise
+        finally:
+            _, status = os.waitpid(pid, 0)
+    if not answer:
+        ended = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
+        hint = ", as it would end an actor" if check.shown else ": see what it prints with `daedalus check`"
+        return EnvironmentReport(problems=(f"environment {check.spec.id} ended its process ({ended}){hint}",))
+    return EnvironmentReport.model_validate_json(answer)
+
+
+def _read(descriptor: int, stop: threading.Event, seconds: float) -> bytes:
+    """Read one line, or nothing if the other end closes before. Raises CheckTimeoutError."""
+    data, until = b"", time.monotonic() + seconds
+    while not data.endswith(b"\n"):  # not to the end: processes of the environment may hold the descriptor
+        if stop.is_set() or time.monotonic() > until:
+            raise CheckTimeoutError(f"not done within {seconds:g} s")
+        if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
+            continue
+        part = os.read(descriptor, 1 << 16)
+        if not part:
+            return b""
+        data += part
+    return data
+
+
+def _forked(check: EnvironmentCheck, writing: int) -> int:
+    """Return the process id of a fork that writes the report to a descriptor."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        silent = os.open(os.devnull, os.O_RDWR)
+        for standard in range(3):
+            os.dup2(silent, standard)
+        _report(check, writing)
+    finally:
+        os._exit(1)  # nothing that belongs to the parent may be closed or flushed here
+
+
+def _spawned(check: EnvironmentCheck, writing: int) -> int:
+    """Return the process id of a new interpreter that writes the report to a descriptor."""
+    os.set_inheritable(writing, True)
+    command = [sys.executable, "-P", "-m", "daedalus.cli.check_process", str(writing), check.words()]
+    silent = [(os.POSIX_SPAWN_OPEN, standard, os.devnull, os.O_RDWR, 0) for standard in range(3)]
+    shown = [(os.POSIX_SPAWN_DUP2, 2, 1)]  # a debugger of the user reads standard input
+    with interrupts_held():
+        return os.posix_spawn(sys.executable, command, os.environ, file_actions=shown if check.shown else silent)
+
+
+def _report(check: EnvironmentCheck, writing: int) -> None:
+    """Check the environment, and write the report to a descriptor."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # the parent reports Ctrl-C
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(int(check.most_seconds) + _ALARM_SECONDS)
+    if check.shown:
+        faulthandler.enable(all_threads=False)
+    report = check.run()
+    with open(writing, "w", encoding="utf-8") as stream:
+        stream.write(report.model_dump_json() + "\n")
+
+
+if __name__ == "__main__":
+    _report(EnvironmentCheck.from_words(sys.argv[2]), int(sys.argv[1]))

@@ -1,0 +1,81 @@
+"""Files of a run directory, read with limits. Nothing in them is trusted: they may come from another machine.
+
+Values are limited in depth and size too, so that others can compare and print them.
+"""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from daedalus.policy.saving.regular_files import read_regular
+
+_MAX_JSON_BYTES, _MAX_TOML_BYTES = 32 << 20, 1 << 20
+_MAX_DEPTH = 64  # of lists and maps within each other; Python's recursion limit is not far above
+_LARGEST_INTEGER = 2**64  # Python refuses to print integers of many digits
+
+
+class RunDataError(Exception):
+    """Error for a run directory that cannot be used. The message is one line."""
+
+
+def read_file(path: Path, limit: int) -> bytes | None:
+    """Return the content of a file, or None without the file.
+
+    Raises RunDataError if it is no regular file, has more than `limit` bytes or cannot be read.
+    """
+    try:
+        content = read_regular(path, limit + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RunDataError(f"{path}: {error.strerror}") from None
+    if len(content) > limit:
+        raise RunDataError(f"{path} is larger than {limit >> 20} MiB: it is not a file of a run")
+    return content
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file, or an empty dictionary without the file. Raises RunDataError."""
+    content = read_file(path, _MAX_JSON_BYTES)
+    if content is None:
+        return {}
+    try:
+        values = json.loads(content.decode())
+    except (ValueError, RecursionError):
+        raise RunDataError(f"{path} is damaged: it is not valid JSON; delete the file") from None
+    if not isinstance(values, dict):
+        raise RunDataError(f"{path} is damaged: it is not a JSON object; delete the file")
+    _check_values(values, path)
+    return values
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file, or an empty dictionary without the file. Raises RunDataError."""
+    content = read_file(path, _MAX_TOML_BYTES)
+    if content is None:
+        return {}
+    try:
+        values = tomllib.loads(content.decode())
+    except RecursionError:
+        raise RunDataError(f"{path} is damaged: its values are nested too deeply") from None
+    except ValueError as error:
+        raise RunDataError(f"{path} is damaged: {error}") from None
+    _check_values(values, path)
+    return values
+
+
+def _check_values(values: dict[str, Any], path: Path) -> None:
+    """Raise RunDataError for values that are nested too deeply, and for integers that are too large."""
+    level: list[Any] = [values]
+    for _ in range(_MAX_DEPTH):
+        if any(isinstance(value, int) and abs(value) > _LARGEST_INTEGER for value in level):
+            raise RunDataError(f"{path} is damaged: it has an integer of more than 64 bits")
+        level = [
+            child
+            for value in level
+            if isinstance(value, dict | list)
+            for child in (value.values() if isinstance(value, dict) else value)
+        ]
+    if level:
+        raise RunDataError(f"{path} is damaged: its values are nested too deeply")

@@ -1,0 +1,58 @@
+"""Ctrl-C in the first seconds of a process, which is still importing its modules then."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli.child_output import Streams
+from daedalus.cli.supervisor import start
+
+SECONDS = 60.0  # generous for slow machines
+# In place of a command: it imports until the test writes a line, then it has handlers.
+WAITING = """
+import sys
+print("importing", flush=True)
+sys.stdin.readline()
+from daedalus.cli.processes import stop_on_signals
+print("stopped" if stop_on_signals().wait(60.0) else "not stopped", flush=True)
+"""
+PROGRAM = """
+import sys
+from daedalus.cli import main
+main._MODULES["evaluate"] = "waiting"
+sys.argv[1:] = ["evaluate"]
+sys.exit(main.main())
+"""
+
+
+def of_the_shell() -> "subprocess.Popen[bytes]":
+    return subprocess.Popen([sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+
+def of_the_launcher() -> "subprocess.Popen[bytes]":
+    return start("waiting", streams=Streams(stdout=subprocess.PIPE))
+
+
+@pytest.mark.parametrize("begin", [of_the_shell, of_the_launcher])
+def test_ctrl_c_before_the_handlers_stops_the_process_in_order(
+    begin: Callable[[], "subprocess.Popen[bytes]"], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "waiting.py").write_text(WAITING)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with begin() as process:
+        try:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"importing\n"
+            process.send_signal(signal.SIGINT)
+            process.stdin.write(b"\n")
+            process.stdin.flush()
+            assert process.stdout.readline() == b"stopped\n"
+            assert process.wait(SECONDS) == 0
+        finally:
+            process.kill()
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

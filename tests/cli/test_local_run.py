@@ -1,0 +1,62 @@
+"""Test of cli/local_run.py: that no process of a run outlives it."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daedalus.cli import local_run
+from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.local_run import LocalRun, run_locally
+from daedalus.cli.supervisor import Supervised
+from daedalus.protocol.spec import RunSpec
+
+
+def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def begin(_first: bool) -> subprocess.Popen[bytes]:
+        if len(started) == 3:
+            raise BlockingIOError(11, "Resource temporarily unavailable")  # too many processes
+        started.append(subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE))
+        return started[-1]
+
+    def supervised(*_: Any) -> Supervised:
+        return Supervised("process", begin, ended={0})
+
+    monkeypatch.setattr(local_run, "_supervised_learner", supervised)
+    monkeypatch.setattr(local_run, "supervised_actor", supervised)
+    spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "collection": {"actors": 4}})
+    output = ChildOutput(tmp_path / "output.log", print, print)
+    try:
+        with pytest.raises(BlockingIOError):
+            run_locally(LocalRun(directory=tmp_path, spec=spec, started=0.0), threading.Event(), output)
+        assert [process.poll() is not None for process in started] == [True] * 3
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize(("algorithm", "played"), [("impala", ["greedy", "sampled"]), ("n_step_q", ["greedy"])])
+def test_sampled_episodes_are_played_only_if_sampled_actions_can_differ(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: str, played: list[str]
+) -> None:
+    """The greedy episodes are worse than training was. The policy of action values is greedy in both."""
+    actions = []
+
+    def play(commands: list[list[str]], *_others: object) -> list[dict[str, Any]]:
+        actions.append("sampled" if "sampled" in commands[0] else "greedy")
+        return [{"return_mean": 1.0, "return_std": 0.0, "episodes": 100, "actions": actions[-1], "notes": []}]
+
+    monkeypatch.setattr(local_run, "play", play)
+    (tmp_path / "summary.json").write_text('{"solved": false, "episode_return_mean": 9.0}')
+    spec = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "training": {"algorithm": algorithm}})
+    output = ChildOutput(tmp_path / "output.log", print, print)
+    local_run.evaluate_run(LocalRun(directory=tmp_path, spec=spec, started=0.0), threading.Event(), output)
+    assert actions == played

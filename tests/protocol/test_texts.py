@@ -1,0 +1,34 @@
+"""protocol/texts.py: foreign texts, bounded in bytes, in one line and printable."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daedalus.protocol.texts import bounded_text
+
+offline = settings(max_examples=200, deadline=None, derandomize=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "expected"),
+    [
+        ("no module named 'x'", 300, "no module named 'x'"),
+        ("x" * 5000, 300, "x" * 300),
+        ("\U0001f600" * 80, 300, "\U0001f600" * 75),
+        ("éé", 3, "é"),  # no half character
+        ("two\nlines\tand\x1b[2J\u2028more  spaces ", 300, "two lines and [2J more spaces"),
+        ("\ud800 alone", 300, "alone"),
+        ("", 300, ""),
+    ],
+)
+def test_text_is_cut_to_bytes_and_to_what_can_be_printed(text: str, most: int, expected: str) -> None:
+    assert bounded_text(text, most) == expected
+
+
+@offline
+@given(text=st.text(), most=st.integers(0, 30))
+def test_any_text_becomes_printable_and_small(text: str, most: int) -> None:
+    bounded = bounded_text(text, most)
+    assert bounded.isprintable()
+    assert len(bounded.encode()) <= most
+    assert bounded_text(bounded, most) == bounded.rstrip()
