@@ -1,13 +1,19 @@
-"""Confirmation of a solved run: new sampled episodes with the policy at which training stopped.
+"""Confirmation of a solved run: new sampled episodes with the policy of the moment at which the target was reached.
 
-Training stops as soon as the mean of the newest episodes reaches the target. This is more probable in a lucky moment,
-so the mean of that moment is too high on average. New episodes have no such bias.
+The mean of the newest training episodes reaches the target more probably in a lucky moment, and while they were played
+the policy changed. So their mean is too high on average, and the policy of that moment may be worse than those before.
+New episodes with that policy show what it can do. They are played while the learner waits.
 """
 
 import math
+import subprocess
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
+from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.evaluation_processes import EvaluationProcess, without_episodes
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.protocol.spec import RunSpec
 
 _SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run and no training uses these seeds
@@ -20,9 +26,49 @@ def confirmation_arguments(spec: RunSpec) -> list[str]:
     return [*options, "--episodes", str(training.target_episodes), "--seed", str(training.seed + _SEEDS)]
 
 
-def confirmation(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of `daedalus evaluate` with `interval`, the 95 % interval of the mean (None of one episode)."""
-    return {**result, "interval": mean_interval(result["return_mean"], result["return_std"], result["episodes"])}
+def confirmation(result: dict[str, Any], target: float) -> dict[str, Any]:
+    """Return the result of `daedalus evaluate` with two more entries.
+
+    `interval` is the 95 % interval of the mean (None of one episode). `confirmed` is False if the whole interval, or
+    the single return, is below the target.
+    """
+    interval = mean_interval(result["return_mean"], result["return_std"], result["episodes"])
+    highest = result["return_mean"] if interval is None else interval[1]
+    return {**result, "interval": interval, "confirmed": highest >= target}
+
+
+class Confirmations:
+    """Player of the new episodes of one run, for its launcher."""
+
+    def __init__(self, directory: Path, spec: RunSpec, options: list[str], output: ChildOutput) -> None:
+        """Construct without starting a process. `options` are further ones of `daedalus evaluate`."""
+        self._file, self._output = ConfirmationFile(directory), output
+        self._arguments = [str(directory), *confirmation_arguments(spec), *options]
+        self._target = spec.training.target_return
+        self._playing: EvaluationProcess | None = None
+
+    def poll(self) -> None:
+        """Start the episodes that the learner asks for, and give it their result. Raises EvaluationFailedError."""
+        if self._playing is None:
+            if self._file.asked() is not None:
+                self._playing = EvaluationProcess(self._arguments, "confirmation", self._output, shown=True)
+        elif self._playing.has_ended():
+            result = without_episodes(self._playing.result())
+            self.close()
+            if result["policy_version"] == self._file.asked():  # a learner that was restarted asks again
+                assert self._target is not None
+                self._file.answer(result["policy_version"], confirmation(result, self._target))
+
+    @property
+    def processes(self) -> list[subprocess.Popen[bytes]]:
+        """The process that plays, if there is one."""
+        return [] if self._playing is None else [self._playing.process]
+
+    def close(self) -> None:
+        """End the process that plays."""
+        if self._playing is not None:
+            self._playing.close()
+            self._playing = None
 
 
 def mean_interval(mean: float, std: float, count: int) -> tuple[float, float] | None:

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
-from daedalus.cli.confirmation import confirmation, confirmation_arguments
+from daedalus.cli.confirmation import Confirmations
+from daedalus.cli.evaluation_processes import EvaluationFailedError, play, without_episodes
 from daedalus.cli.processes import ORDERED
 from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.sampled_evaluation import is_below_training, sampled_note
-from daedalus.cli.select_best import EvaluationFailedError, play, select_best, without_episodes
+from daedalus.cli.select_best import select_best
 from daedalus.cli.supervisor import (
     GATEWAY,
     FailedError,
@@ -160,6 +161,7 @@ def _train_at(
     """Run the learner, and connect this machine's actors to it at an address."""
     spec, options = run.spec, _actor_options(run)
     listening = _listening(run, address)
+    confirmations = Confirmations(run.directory, spec, _evaluation_options(run), output)
     learner = _supervised_learner(run, listening, learner_streams)
     actors: list[Supervised] = []
     try:
@@ -182,9 +184,10 @@ def _train_at(
         if run.watch:
             page.append(supervised_gateway(address, _gateway_options(run), output.pipes))
         trackers.start()
-        return watch(learner, [*actors, *page], spec, stopping, run.observer, EventFile(run.directory))
+        return watch(learner, [*actors, *page], run, stopping, confirmations)
     finally:
-        stop([learner.process, *(actor.process for actor in actors)])
+        stop([learner.process, *(actor.process for actor in actors), *confirmations.processes])
+        confirmations.close()
 
 
 def _logging_options(level: str, as_json: bool) -> tuple[str, ...]:
@@ -196,6 +199,11 @@ def _actor_options(run: LocalRun) -> tuple[str, ...]:
     # The learner reports the progress of all actors: the records of each one are for debugging.
     level = "debug" if run.log_level == "debug" else "warning"
     return *_logging_options(level, run.log_json), *allow_settings(run.spec.actor_modules)
+
+
+def _evaluation_options(run: LocalRun) -> list[str]:
+    """Return the options of every `daedalus evaluate`."""
+    return [*_logging_options(run.log_level, run.log_json), *allow_settings(run.spec.environment.user_modules)]
 
 
 def _gateway_options(run: LocalRun) -> tuple[str, ...]:
@@ -231,6 +239,8 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
             arguments += ["--processes", str(run.processes)]
         if run.init_from is not None:
             arguments += ["--init-from", str(run.init_from)]
+        if run.spec.training.target_return is not None:
+            arguments.append("--confirm")
         if run.resume or not first:
             arguments.append("--resume")
         with open_streams("learner") as streams:
@@ -250,25 +260,26 @@ def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
 def watch(
     learner: Supervised,
     actors: list[Supervised],
-    spec: RunSpec,
+    run: LocalRun,
     stopping: threading.Event,
-    observer: RunObserver | None = None,
-    record: EventFile | None = None,
+    confirmations: Confirmations,
 ) -> int:
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
-    The log shows each restart, and `record` keeps it. Return 0 if the observer ends training. Raises FailedError if the
-    learner failed too often, or if too few actors are left.
+    The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training. Raises FailedError if
+    the learner failed too often, or if too few actors are left; EvaluationFailedError if the episodes that are to
+    confirm the target cannot be played.
     """
-    observer = observer or RunObserver()
+    record = EventFile(run.directory)
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
-        if observer.poll(learner.process) and status is None:
+        if run.observer.poll(learner.process) and status is None:
             _end(learner.process, stopping)
             return 0
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
         _warn(learner.check(), record)
+        confirmations.poll()
         for actor in list(actors):
             try:
                 _warn(actor.check(), record)
@@ -277,41 +288,33 @@ def watch(
                 stop([actor.process])
                 playing = sum(other.name not in _HELPERS for other in actors)
                 # A synchronous algorithm waits for all actors at its start.
-                needed = not playing or spec.algorithm.synchronous
+                needed = not playing or run.spec.algorithm.synchronous
                 if needed and actor.name not in _HELPERS:
                     raise (error if playing else FailedError("all actors", error.reason, "failed")) from None
                 _warn(f"{error}; training continues without this process", record)
     return 1
 
 
-def _warn(message: str | None, record: EventFile | None) -> None:
+def _warn(message: str | None, record: EventFile) -> None:
     if message:
         _logger.warning("%s", message)
-        if record is not None:
-            record.add_restart(message)
+        record.add_restart(message)
 
 
 def evaluate_run(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
     """Select the best checkpoint, play the final episodes with it, and return the summary with the results.
 
-    If training stopped at its target, the policy of that moment also plays new sampled episodes. Otherwise, if greedy
-    episodes are clearly worse than training was, the same episodes are played with sampled actions, too, unless the
-    policy is greedy anyway. Raises EvaluationFailedError.
+    If greedy episodes are clearly worse than training was, the same episodes are played with sampled actions, too,
+    unless the policy is greedy anyway, or sampled episodes have confirmed the target. Raises EvaluationFailedError.
     """
     began = time.monotonic()
     summary = run_directory.read_json(run.directory / run_directory.SUMMARY)
-    common = [*_logging_options(run.log_level, run.log_json), *allow_settings(run.spec.environment.user_modules)]
-    options = ["--episodes", str(run.spec.evaluation.final_episodes), *common]
+    options = ["--episodes", str(run.spec.evaluation.final_episodes), *_evaluation_options(run)]
     chosen = select_best(run.directory, run.spec, options, stopping, output)
-    evaluations = [options]
-    if summary.get("solved") and run.spec.training.stop_when_solved:
-        evaluations.append([*confirmation_arguments(run.spec), *common])
-    evaluation, *confirmations = play([[str(run.directory), *each] for each in evaluations], stopping, output)
-    for confirmed in confirmations:
-        summary["confirmation"] = confirmation(without_episodes(confirmed))
-        summary["confirmation_return_mean"] = confirmed["return_mean"]
+    (evaluation,) = play([[str(run.directory), *options]], stopping, output)
+    confirmed = summary.get("confirmation") is not None  # by sampled episodes
     can_differ = run.spec.algorithm.heads == "policy_and_value"  # the policy of action values is always greedy
-    if not confirmations and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
+    if not confirmed and can_differ and is_below_training(evaluation, summary.get("episode_return_mean")):
         (sampled,) = play([[str(run.directory), *options, "--actions", "sampled"]], stopping, output)
         evaluation["notes"].append(sampled_note(evaluation, sampled))
         summary["sampled_evaluation"] = without_episodes(sampled)

@@ -3,29 +3,19 @@
 The highest of many scores over a few episodes is partly luck. All candidates play the same number of new episodes.
 """
 
-import json
 import logging
-import subprocess
-import tempfile
 import threading
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.child_output import STREAMS, ChildOutput
-from daedalus.cli.supervisor import start, stop
+from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.evaluation_processes import play
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
 
 _logger = logging.getLogger(__name__)
 
-_POLL_SECONDS = 0.05
 _SEEDS = 2**33  # added to the seed of the run, so that neither training nor the final evaluation uses these seeds
-
-
-class EvaluationFailedError(Exception):
-    """Error of an evaluation that failed or was stopped. The message holds output that was not printed yet."""
 
 
 def select_best(
@@ -70,36 +60,3 @@ def select_best(
             _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror)
         scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)
-
-
-def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutput) -> list[dict[str, Any]]:
-    """Run `daedalus evaluate` once for each list of arguments, all at the same time, and return the results.
-
-    Raises EvaluationFailedError.
-    """
-    with ExitStack() as stack:
-        files = [stack.enter_context(tempfile.TemporaryFile()) for _ in commands]
-        processes: dict[str, subprocess.Popen[bytes]] = {}
-        try:
-            for arguments, file in zip(commands, files, strict=True):
-                name = f"evaluation-{len(processes)}"
-                with output.pipes(name, shown=() if processes else STREAMS) as streams:
-                    own = replace(streams, stdout=file.fileno())
-                    processes[name] = start("daedalus.cli.commands.evaluate", *arguments, "--json", streams=own)
-            while any(process.poll() is None for process in processes.values()) and not stopping.wait(_POLL_SECONDS):
-                pass
-        finally:
-            stop(list(processes.values()))
-        failed = [name for name, process in processes.items() if process.returncode != 0]
-        if failed:
-            # The environment may have printed much: the error is at the end.
-            unshown = [] if stopping.is_set() else [line for name in failed for line in output.unshown(name)]
-            raise EvaluationFailedError("\n".join(unshown))
-        for file in files:
-            file.seek(0)
-        return [json.load(file) for file in files]
-
-
-def without_episodes(result: dict[str, Any]) -> dict[str, Any]:
-    """Return a result of `daedalus evaluate` without the lists of the episodes' returns and lengths."""
-    return {name: value for name, value in result.items() if name not in ("returns", "lengths")}

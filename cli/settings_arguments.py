@@ -292,6 +292,7 @@ def learner_parser() -> argparse.ArgumentParser:
     options.add_argument("--started", type=float, help=argparse.SUPPRESS)
     options.add_argument("--no-progress", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
+    options.add_argument("--confirm", action="store_true", help=argparse.SUPPRESS)
     options.add_argument("--spaces", type=Spaces.model_validate_json, help=argparse.SUPPRESS)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
     return options

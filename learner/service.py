@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.ranks.errors import RankLostError
 from daedalus.learner.ranks.opening import OpenRanks, one_process
@@ -22,6 +22,7 @@ from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.heartbeat import Heartbeat
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
 _logger = logging.getLogger(__name__)
+
+_CONFIRMATION_POLL_SECONDS = 0.05
 
 # Reasons for actors.
 _FINISHED, _STOPPED = "the learner has finished", "the learner was stopped"
@@ -83,6 +86,7 @@ class LearnerService:
         certificate_days_left: Callable[[], float | None] = lambda: None,
         user_metrics: UserMetrics | None = None,
         open_ranks: OpenRanks = one_process,
+        confirms: bool = False,
     ) -> None:
         """Construct the service.
 
@@ -101,10 +105,13 @@ class LearnerService:
           certificate_days_left: function that returns the days until the certificate of this process expires.
           user_metrics: metrics of the program that started the run.
           open_ranks: connects the other processes of the learner.
+          confirms: whether a launcher plays new episodes to confirm that the target is reached.
         """
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._modules = open_writers, modules
         self._open_ranks = open_ranks
+        self._confirmation_file = ConfirmationFile(directory) if confirms else None
+        self._confirmation: dict[str, Any] | None = None  # result of the new episodes that confirmed the target
         self._ranks: Distribution | None = None  # None: not connected yet
         self._restored, self._initial = restored, initial if restored is None else None
         self._counters = RunCounters(spec.training.target_episodes)
@@ -246,22 +253,25 @@ class LearnerService:
         """Run the main loop, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
-        finished, saved, seconds_to_target = False, None, None
+        finished, saved, reached_at = False, None, None
         try:
-            seconds_to_target = self._loop(learner, checkpointer, recorder)
-            finished = self._is_finished(seconds_to_target)
+            reached_at = self._loop(learner, checkpointer, recorder)
+            finished = self._is_finished(solved=reached_at is not None)
         except RankLostError:
             if not self._stop.is_set():  # a signal may end all processes of the learner at once
                 raise
         finally:
             ended = time.monotonic()
+            if reached_at is not None and self._spec.training.stop_when_solved:
+                ended = reached_at  # what follows is the confirmation, and no training
             try:
                 self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
                 self._record(recorder, learner, ended, last=True)
                 recorder.close()
             finally:
                 saved = checkpointer.save()
-        solved = seconds_to_target is not None
+        solved = reached_at is not None
+        seconds_to_target = None if reached_at is None else self._reporter.wall_seconds(reached_at)
         self._write_summary(solved, finished, seconds_to_target, ended)
         env_steps = f"{self._counters.env_steps:,} env_steps"
         if finished:
@@ -278,16 +288,15 @@ class LearnerService:
             ordered=self._orders.stopped,
         )
 
-    def _is_finished(self, seconds_to_target: float | None) -> bool:
+    def _is_finished(self, *, solved: bool) -> bool:
         """Return whether the run is over, rather than stopped."""
         training = self._spec.training
-        solved = seconds_to_target is not None
         return self._counters.env_steps >= training.env_steps or (solved and training.stop_when_solved)
 
     def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
-        """Train until the run ends. Return the seconds until the target was reached, or None if it was not."""
+        """Train until the run ends. Return when the target was reached, on the monotonic clock; None if it was not."""
         training, service = self._spec.training, self._spec.service
-        seconds_to_target = None
+        reached_at = None
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
         while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
@@ -295,10 +304,11 @@ class LearnerService:
             self._update(learner)
             self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
             now = time.monotonic()
-            if seconds_to_target is None and self._counters.is_solved(training):
-                seconds_to_target = self._reporter.wall_seconds(now)
-            if seconds_to_target is not None and training.stop_when_solved:
-                break
+            if reached_at is None and self._counters.is_solved(training):
+                if not training.stop_when_solved:
+                    reached_at = now
+                elif self._is_confirmed(learner, checkpointer):
+                    return now
             if now >= log_at:
                 self._record(recorder, learner, now)
                 log_at = now + service.log_seconds
@@ -307,7 +317,40 @@ class LearnerService:
             if now >= save_at or self._orders.take_checkpoint():
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds
-        return seconds_to_target
+        return reached_at
+
+    def _is_confirmed(self, learner: "Learner", checkpointer: "Checkpointer") -> bool:
+        """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
+
+        Otherwise the newest returns are forgotten: the target has to be reached again. Without a launcher, and if
+        nothing can be written to the disk, the target counts as confirmed.
+        """
+        file, version = self._confirmation_file, learner.policy_version
+        if file is None or checkpointer.save() is None:
+            return True
+        _logger.info(
+            "target %g reached: the policy of this moment plays %d new episodes to confirm it",
+            self._spec.training.target_return,
+            self._spec.training.target_episodes,
+        )
+        try:
+            file.ask(version)
+            while (result := file.answered(version)) is None and not self._stop.wait(_CONFIRMATION_POLL_SECONDS):
+                self._beat()
+                self._health.updated = time.monotonic()  # no update is missing
+        except OSError as error:
+            _logger.warning("the target cannot be confirmed: %s", error.strerror)
+            return True
+        finally:
+            file.clear()
+        if result is not None and result["confirmed"]:
+            self._confirmation = result
+            return True
+        with self._server.lock:
+            self._counters.forget_returns()
+        if result is not None:
+            _logger.info("not confirmed: return %.1f; training continues", result["return_mean"])
+        return False
 
     def _record(self, recorder: Recorder, learner: "Learner", now: float, *, last: bool = False) -> None:
         row = self._reporter.row(learner, now, last=last)
@@ -356,6 +399,9 @@ class LearnerService:
 
     def _write_summary(self, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> None:
         content = self._reporter.summary(solved=solved, finished=finished, seconds_to_target=seconds_to_target, now=now)
+        if self._confirmation is not None:
+            content["confirmation"] = self._confirmation
+            content["confirmation_return_mean"] = self._confirmation["return_mean"]
         try:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:

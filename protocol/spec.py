@@ -163,8 +163,9 @@ class TrainingSpec(Specification):
     env_steps: PositiveInt = 1_000_000
     """Budget: env_steps over all actors."""
     target_return: float | None = None
-    """The run is solved when the mean return of the last `target_episodes` episodes reaches this value. Where actors
-    explore, it is also solved when the mean return of an evaluation does."""
+    """The target is reached when the mean return of the last `target_episodes` episodes reaches this value. Where
+    actors explore, it is also reached when the mean return of an evaluation does. `daedalus train` confirms it with as
+    many new episodes."""
     target_episodes: PositiveInt = 100
     """Number of newest training episodes in the mean return."""
     stop_when_solved: bool = True

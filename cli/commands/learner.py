@@ -190,6 +190,7 @@ def _serve(
             certificate_days_left=partial(certificate_days_left, credentials),
             user_metrics=user_metrics,
             open_ranks=ranks.open,
+            confirms=arguments.confirm,
         )
         context["epoch"] = f"{service.learner_epoch:x}"
         announce(run, arguments, credentials)

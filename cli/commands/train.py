@@ -47,11 +47,11 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_listen
 
 _TRAIN = """\
-Starts a learner and actors as processes of this machine and shows their progress. Training stops when the target is
-reached or the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes). If the run was
-evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as many new episodes
-each to select the best. Otherwise the newest policy is used. If the target was reached, the policy of that moment also
-plays 100 new sampled episodes (training.target_episodes) to confirm it."""
+Starts a learner and actors as processes of this machine and shows their progress. When the training episodes reach the
+target, the policy of that moment plays 100 new sampled episodes (training.target_episodes). Training stops if they
+confirm the target, or when the budget is used up. Then the best policy plays 100 episodes (evaluation.final_episodes).
+If the run was evaluated on a schedule (evaluation.seconds), the three best checkpoints and the newest first play as
+many new episodes each to select the best. Otherwise the newest policy is used."""
 
 _TRAIN_EXAMPLES = """\
 examples:

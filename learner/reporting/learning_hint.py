@@ -33,19 +33,20 @@ class LearningHint:
         progress = row["env_steps"] / self._budget
         if self._judged:
             return
-        if row["episodes"]:
+        has_returns = "episode_return_mean" in row  # not before the first episode, and after a target not confirmed
+        if has_returns:
             self._lowest = min(self._lowest, row["episode_return_min"])
             self._highest = max(self._highest, row["episode_return_max"])
         if self._first_entropy is None:
             self._first_entropy = row.get("entropy")
-        if self._first_return is None and row["episodes"] >= _BASELINE_EPISODES:
+        if self._first_return is None and has_returns and row["episodes"] >= _BASELINE_EPISODES:
             if progress > _BASELINE_PROGRESS:
                 self._judged = True
                 return
             self._first_return = row["episode_return_mean"], row["episode_return_std"]
         if progress >= _WATCHED_PROGRESS and "explained_variance" in row:
             self._explained.append(row["explained_variance"])
-        if progress >= _JUDGED_PROGRESS:
+        if progress >= _JUDGED_PROGRESS and has_returns:
             self._judged = True
             self._due = self._judgement(row)
 

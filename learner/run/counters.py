@@ -109,6 +109,12 @@ class RunCounters:
             return True
         return self.reached(target)
 
+    def forget_returns(self) -> None:
+        """Forget the newest episodes and the best evaluation, so that the target has to be reached again."""
+        self.returns.clear()
+        self.lengths.clear()
+        self.best_evaluation = None
+
     def state(self, wall_seconds: float) -> dict[str, Any]:
         """Return all counters as plain JSON values; `wall_seconds` is the duration of the whole run so far."""
         return {

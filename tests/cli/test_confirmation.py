@@ -30,8 +30,18 @@ def test_interval_contains_the_mean_of_the_distribution_in_95_of_100_cases() -> 
     assert 0.93 < contained / 2000 < 0.96  # a little less than 0.95, because the distribution is skewed
 
 
-def test_single_episode_has_no_interval() -> None:
-    assert confirmation({"return_mean": 3.0, "return_std": 0.0, "episodes": 1})["interval"] is None
+@pytest.mark.parametrize(("mean", "target", "confirmed"), [(3.0, 3.0, True), (3.0, 3.1, False)])
+def test_single_episode_has_no_interval_and_decides_alone(mean: float, target: float, confirmed: bool) -> None:
+    result = confirmation({"return_mean": mean, "return_std": 0.0, "episodes": 1}, target)
+    assert (result["interval"], result["confirmed"]) == (None, confirmed)
+
+
+@pytest.mark.parametrize(("target", "confirmed"), [(9.0, True), (11.9, True), (12.1, False), (50.0, False)])
+def test_target_is_not_confirmed_if_the_whole_interval_is_below_it(target: float, confirmed: bool) -> None:
+    """The interval of 100 episodes of mean 10 and standard deviation 9.95 is 10 +- 1.984 x 9.95 / sqrt(99)."""
+    result = confirmation({"return_mean": 10.0, "return_std": 9.95, "episodes": 100}, target)
+    assert result["interval"] == pytest.approx((8.016, 11.984), abs=1e-3)
+    assert result["confirmed"] is confirmed
 
 
 def test_confirmation_plays_the_newest_policy_as_in_training() -> None:

@@ -5,13 +5,16 @@ import subprocess
 import sys
 import threading
 from collections.abc import Set
+from pathlib import Path
 from typing import Any
 
 import pytest
 from processes import LIMIT, until
 
 from daedalus.cli import supervisor
-from daedalus.cli.local_run import watch
+from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.confirmation import Confirmations
+from daedalus.cli.local_run import LocalRun, watch
 from daedalus.cli.processes import RANK_LOST, STOPPED
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import RunSpec
@@ -149,9 +152,11 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
 
 @pytest.mark.parametrize(("algorithm", "continues"), [("impala", True), ("a2c", False)])
 def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synchronous(
-    algorithm: str, continues: bool, caplog: pytest.LogCaptureFixture
+    algorithm: str, continues: bool, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "training": {"algorithm": algorithm}})
+    run = LocalRun(directory=tmp_path, spec=spec, started=0.0)
+    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
     learner, actors = supervised(SLEEP), [supervised("raise SystemExit(7)") for _ in range(2)]
     evaluator = supervised("raise SystemExit(7)")
     evaluator.name = "evaluator"
@@ -159,7 +164,7 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
     try:
         failed = "all actors failed: see the error above" if continues else "worker failed 3 times"
         with pytest.raises(FailedError, match=failed):
-            watch(learner, [evaluator, *actors], spec, threading.Event())
+            watch(learner, [evaluator, *actors], run, threading.Event(), confirmations)
         continued = "worker failed 3 times: see the error above; training continues without this process"
         assert any(continued in message for message in caplog.messages) == continues
     finally:

@@ -16,17 +16,19 @@ import safetensors.numpy
 from counting_environment import Counting
 from PIL import Image
 from plain import act
-from processes import Running, processes_mentioning
+from processes import Running, processes_mentioning, until
 from saved_runs import CARTPOLE, COUNTING, RACING, save, score
 
 from daedalus.actor.environments.make import make_environments
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.comparing.recorded_run import read_run
+from daedalus.cli.confirmation import Confirmations
+from daedalus.cli.evaluation_processes import EvaluationFailedError
 from daedalus.cli.local_run import LocalRun, evaluate_run
 from daedalus.cli.reports.run_record import read_record
 from daedalus.cli.run_report import report as report_of
-from daedalus.cli.select_best import EvaluationFailedError
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
@@ -375,21 +377,26 @@ def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path,
     run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 10}, training=training)
     score(run, 77.0, 4)
     spec = read_policy(run / "checkpoints" / "0000000005").spec
-    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 1000.5}
-    write_json(run / "summary.json", solved)
-    local_run = LocalRun(directory=run, spec=spec, started=0.0)
-    summary = evaluate_run(local_run, threading.Event(), output)
-    confirmation = read_json(run / "summary.json")["confirmation"]
+    file, confirmations = ConfirmationFile(run), Confirmations(run, spec, [], output)
+    confirmations.poll()
+    file.ask(5)
+    until(lambda: confirmations.poll() or file.answered(5))
+    confirmation = file.answered(5)
+    assert confirmation is not None
     assert (confirmation["policy_version"], confirmation["best_checkpoint"]) == (5, False)
     assert (confirmation["episodes"], confirmation["actions"], confirmation["seed"]) == (40, "sampled", 1 + 2**34)
     low, high = confirmation["interval"]
-    mean = summary["confirmation_return_mean"]
-    assert mean == confirmation["return_mean"]
+    mean = confirmation["return_mean"]
+    assert confirmation["confirmed"] is (high >= 20.0)
     assert (
         high - mean
         == pytest.approx(mean - low)
         == pytest.approx(2.0227 * confirmation["return_std"] / 39**0.5, rel=1e-4)
     )
+    solved = {"solved": True, "seconds_to_target": 1.0, "env_steps": 9, "updates": 5, "episode_return_mean": 1000.5}
+    write_json(run / "summary.json", {**solved, "confirmation": confirmation})
+    local_run = LocalRun(directory=run, spec=spec, started=0.0)
+    summary = evaluate_run(local_run, threading.Event(), output)
     report = report_of(local_run, summary)
     assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
     assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 1000.5")

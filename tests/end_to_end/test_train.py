@@ -72,7 +72,7 @@ def test_cartpole_is_solved_and_evaluated(solved: tuple[Path, str]) -> None:
     assert result["snapshots_published"] == result["updates"] + 1
     assert "solved: mean return 475 reached" in output
     assert result["confirmation"]["episodes"] == 100
-    assert result["confirmation_return_mean"] > 100  # the newest policy may be worse than earlier ones
+    assert result["confirmation"]["interval"][1] >= 475
     assert "over 100 new sampled episodes of the policy at that moment, 95 % interval" in output
     assert "evaluation: return" in output
 

@@ -74,6 +74,14 @@ def test_run_whose_returns_are_all_equal_gets_a_hint_of_its_own(entropy: float) 
     assert "every episode" not in hints(equal(0.01), *watched)[-1]
 
 
+def test_rows_without_returns_are_no_reason_for_a_hint_and_delay_it() -> None:
+    """Before the first episode, and after a target that new episodes did not confirm, there are no newest returns."""
+    without = {name: value for name, value in row(0.2, 0.0, 0.1).items() if not name.startswith("episode_return")}
+    first, second, third = hints(row(0.01, -200.0, 1.4), without, row(0.21, -200.0, 0.1))
+    assert (first, second) == ("", "")
+    assert "the entropy fell from 1.4 to 0.1" in third
+
+
 def test_run_is_not_judged_without_its_first_episodes() -> None:
     assert hints(row(0.06, -200.0, 1.4), row(0.2, -200.0, 0.1)) == ["", ""]  # resumed, or very long episodes
     assert hints(row(0.01, -200.0, 1.4, episodes=19), row(0.2, -200.0, 0.1, episodes=19)) == ["", ""]

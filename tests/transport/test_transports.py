@@ -252,8 +252,7 @@ def test_only_the_newest_value_is_kept(pair: tuple[Transport, Transport]) -> Non
     assert inbox.take() is None
     for value in (b"1", b"2", b"3" * 100_000):
         publisher.publish("d/r/snapshots", value)
-    for _ in range(3):
-        news.next()
+        news.next()  # one by one: on a busy machine a value may be dropped if another is on its way
     assert inbox.take() == b"3" * 100_000
     assert inbox.take() is None
     publisher.publish("d/r/snapshots", b"4")

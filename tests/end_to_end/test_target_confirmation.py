@@ -1,0 +1,82 @@
+"""A target that is reached has to be confirmed by new episodes, with real processes."""
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lucky_environment import UNLUCKY, WAITING
+from processes import Running, processes_mentioning, until
+
+Start = Callable[..., Running]
+SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
+TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=5")
+WORDS = [word for each in (*SIZES, *TARGET) for word in ("--set", each)]
+
+
+@pytest.fixture
+def train(start: Start, tmp_path: Path) -> Callable[..., Running]:
+    """Function that trains in an environment whose evaluations are as bad as files in `tmp_path` say."""
+    shutil.copy(Path(__file__).parent.parent / "lucky_environment.py", tmp_path)
+    return lambda: start("train", "--env", "lucky_environment:Lucky-v0", "--run-dir", "run", *WORDS)
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "run" / "summary.json").read_text())
+
+
+def test_training_continues_until_new_episodes_confirm_the_target(
+    train: Callable[..., Running], tmp_path: Path
+) -> None:
+    (tmp_path / UNLUCKY).touch()
+    running = train()
+    assert running.wait() == 0, running.output
+    first, second = (index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: "))
+    assert "not confirmed: return 0.0; training continues" in running.lines[first:second]
+    result = summary(tmp_path)
+    assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
+    confirmation = result["confirmation"]
+    assert (confirmation["confirmed"], confirmation["actions"], confirmation["episodes"]) == (True, "sampled", 10)
+    assert confirmation["policy_version"] == result["updates"]  # the last one, at which training stopped
+    assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
+    assert not (tmp_path / "run" / "confirmation.json").exists()
+    running.expect("confirmation: return 1.0 over 10 new sampled episodes of the policy at that moment")
+
+
+def test_run_that_is_stopped_during_the_confirmation_is_not_solved_and_resumes(
+    train: Callable[..., Running], start: Start, tmp_path: Path
+) -> None:
+    (tmp_path / WAITING).touch()
+    running = train()
+    running.expect("target 1 reached: ")
+    until((tmp_path / "run" / "confirmation.json").exists)
+    running.process.terminate()
+    assert running.wait() == 1, running.output
+    stopped = summary(tmp_path)
+    assert (stopped["solved"], stopped["finished"], "confirmation" in stopped) == (False, False, False)
+    (tmp_path / WAITING).unlink()
+    resumed = start("resume", "run", "--allow-module", "lucky_environment")
+    assert resumed.wait() == 0, resumed.output
+    result = summary(tmp_path)
+    assert result["env_steps"] > stopped["env_steps"]
+    assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
+
+
+def test_learner_that_crashes_during_the_confirmation_asks_again(train: Callable[..., Running], tmp_path: Path) -> None:
+    (tmp_path / WAITING).touch()
+    running = train()
+    running.expect("target 1 reached: ")
+    until((tmp_path / "run" / "confirmation.json").exists)
+    address = running.expect(r"at (unixsock-stream/\S+);").group(1)
+    (victim,) = set(processes_mentioning("commands.learner")) & set(processes_mentioning(address))
+    os.kill(victim, signal.SIGKILL)
+    until(lambda: running.output.count("target 1 reached: ") == 2)
+    (tmp_path / WAITING).unlink()
+    assert running.wait() == 0, running.output
+    result = summary(tmp_path)
+    assert (result["solved"], result["confirmation_return_mean"]) == (True, 1.0)
+    assert result["confirmation"]["policy_version"] == result["updates"]
