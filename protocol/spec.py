@@ -43,6 +43,8 @@ class EnvironmentSpec(Specification):
     """Implementation of the environment. `fast` is gymnasium's CarRacing-v3 with a cheaper renderer."""
     kwargs: dict[str, JsonValue] = Field(default_factory=dict)
     """Further arguments of the environment's constructor."""
+    training_kwargs: dict[str, JsonValue] = Field(default_factory=dict)
+    """The same in training only, such as those of a shaped reward or of an easier task. Evaluations go without them."""
     processes: bool = False
     """Run each environment in its own process, for slow environments. The gymnasium backend only."""
     max_episode_steps: PositiveInt | None = None
@@ -81,14 +83,20 @@ class EnvironmentSpec(Specification):
     """Bootstrap at the environment's terminations as if they were truncations."""
 
     @property
+    def constructor_kwargs(self) -> dict[str, JsonValue]:
+        """Arguments of the environment's constructor: `kwargs` and `training_kwargs`."""
+        return {**self.kwargs, **self.training_kwargs}
+
+    @property
     def user_modules(self) -> dict[str, str]:
         """Settings that name a module as `module:name`, with their values."""
         named = {"environment.id": self.id, "environment.wrap": self.wrap}
         return {setting: value for setting, value in named.items() if value is not None and ":" in value}
 
     def as_evaluated(self, backend: Backend | None = None) -> "EnvironmentSpec":
-        """Return the environment for evaluations: without `no_reward_limit`, on another backend if one is named."""
-        return self.model_copy(update={"no_reward_limit": None, "backend": backend or self.backend})
+        """Return the environment for evaluations: the true task, on another backend if one is named."""
+        true_task = {"training_kwargs": {}, "no_reward_limit": None}
+        return self.model_copy(update={**true_task, "backend": backend or self.backend})
 
 
 class PolicySpec(Specification):

@@ -80,7 +80,7 @@ def make_ale(spec: EnvironmentSpec, count: int) -> tuple[AleEnvironments, Enviro
             maxpool=True,
             autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
             **limit,
-            **spec.kwargs,
+            **spec.constructor_kwargs,
         )
     except Exception as error:  # broad: ALE's options raise many kinds of exception without a common base
         raise EnvironmentSetupError(f"environment {spec.id} of ale cannot be created: {first_line(error)}") from error

@@ -16,6 +16,8 @@ _WIDTH, _HEIGHT = 250, 200  # of the fast renderer's canvas: a quarter of the or
 _GRASS = np.array([(x, y) for x in range(-20, 20, 2) for y in range(-20, 20, 2)]) * car_racing.GRASS_DIM
 _CORNERS = np.array([[(1, 0)], [(0, 0)], [(0, 1)], [(1, 1)]])
 _PATCHES = _GRASS + car_racing.GRASS_DIM * _CORNERS  # [4, 400, xy]
+_BEHIND = 5  # tiles behind the wheel that is farthest ahead are passed: no other wheel touches them any more
+_SHORT_CUT = 40  # a car that is so many tiles ahead has not driven there
 _FIELD = car_racing.PLAYFIELD * (2 * _CORNERS - 1)  # [4, 1, xy]
 
 
@@ -23,6 +25,49 @@ class LateRenderedCarRacing(car_racing.CarRacing):
     """A CarRacing whose steps observe None; `draw` returns the frame that gymnasium's own would have."""
 
     _score = 0.0  # shown in the frame: the score before this step's reward
+
+    def __init__(self, *, missed_tile_reward: float | None = None, **kwargs: Any) -> None:
+        """Construct the environment.
+
+        gymnasium's ends a lap only when every tile of the track was touched. A car that has missed one, usually by
+        cutting a corner, drives on until the time is over, which costs up to 40 of 1000 points; but nothing tells it
+        when it misses the tile.
+
+        Args:
+          missed_tile_reward: reward at each tile that the car passes without touching it; the lap then ends after its
+            last tile, whether all were touched or not. None: as gymnasium's.
+          kwargs: of gymnasium's environment.
+        """
+        self._missed_tile_reward = missed_tile_reward
+        self._passed = 0  # tiles from the start that the car has touched or passed
+        super().__init__(**kwargs)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env."""
+        self._passed = 0
+        return super().reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        """See gymnasium.Env."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        if self._missed_tile_reward is not None:
+            road = self.road
+            assert road is not None
+            reward += self._missed_tile_reward * self._pass_tiles(road)
+            terminated = terminated or self._passed == len(road)
+        return observation, reward, terminated, truncated, info
+
+    def _pass_tiles(self, road: list[Any]) -> int:
+        """Return how many tiles of the road the car has missed since the last step."""
+        assert self.car is not None
+        count = len(road)
+        touched = (tile.idx for wheel in self.car.wheels for tile in wheel.tiles)
+        ahead = max(((index - self._passed) % count for index in touched), default=0)
+        if ahead >= _SHORT_CUT:  # another part of the track, or before the start
+            return 0
+        passed = road[self._passed : self._passed + max(ahead - _BEHIND, 0)]
+        self._passed += len(passed)
+        return sum(not tile.road_visited for tile in passed)
 
     def _render(self, mode: str) -> Any:
         if mode != "state_pixels":
@@ -44,8 +89,9 @@ class LateRenderedCarRacing(car_racing.CarRacing):
 class FastCarRacing(LateRenderedCarRacing):
     """A CarRacing drawn on a smaller canvas, without the parts out of sight and without the score."""
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
+    def __init__(self, *, missed_tile_reward: float | None = None, **kwargs: Any) -> None:
+        """See LateRenderedCarRacing."""
+        super().__init__(missed_tile_reward=missed_tile_reward, **kwargs)
         self._canvas = Surface((_WIDTH, _HEIGHT))
         self._frame = Surface((car_racing.STATE_W, car_racing.STATE_H))
 

@@ -186,12 +186,12 @@ def _colour(observations: np.ndarray) -> np.ndarray:
 def _options(spec: EnvironmentSpec, count: int, ours: dict[str, Any]) -> dict[str, Any]:
     """Return a pool's options: the user's and ours. Raises EnvironmentSetupError if both name the same one."""
     ours = {**ours, "num_envs": count, "batch_size": count, "num_threads": 1}
-    if conflicting := sorted(ours.keys() & spec.kwargs.keys()):
+    if conflicting := sorted(ours.keys() & spec.constructor_kwargs.keys()):
         raise EnvironmentSetupError(
             f"environment.kwargs of envpool's {spec.id} names {' and '.join(conflicting)}, "
             "but other settings decide that: leave it out of kwargs"
         )
-    return {**spec.kwargs, **ours}
+    return {**spec.constructor_kwargs, **ours}
 
 
 @contextmanager

@@ -204,7 +204,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:
     limit = {} if spec.max_episode_steps is None else {"max_episode_steps": spec.max_episode_steps}
-    return {**spec.kwargs, **limit}
+    return {**spec.constructor_kwargs, **limit}
 
 
 def _wrapped(environment: gymnasium.Env, wrap: str, modules: UserModules) -> gymnasium.Env:

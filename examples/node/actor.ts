@@ -248,12 +248,13 @@ export class Actor {
 
 /** Return the environment of a run. Throw RefusedError for another one, kwargs and transforms: this actor has none. */
 function supported(spec: link.EnvironmentSpec, upload: string): Kind {
-  const { id, kwargs, wrap, action_table, action_repeat, no_reward_limit, leave_out } = spec;
+  const { id, kwargs, training_kwargs, wrap, action_table, action_repeat, no_reward_limit, leave_out } = spec;
   const { crop, grey, resize, frame_stack } = spec;
   const kind = kindOf(id);
   const settings = {
     id: kind === undefined,
     kwargs: Object.keys(kwargs).length > 0,
+    training_kwargs: Object.keys(training_kwargs).length > 0,
     action_repeat: action_repeat !== 1,
     leave_out: leave_out.length > 0,
     frame_stack: frame_stack !== 1,

@@ -7,6 +7,7 @@ import { encode, type Message, tryDecode } from "./wire.ts";
 export interface EnvironmentSpec {
   id: string;
   kwargs: Record<string, unknown>;
+  training_kwargs: Record<string, unknown>;
   max_episode_steps: number | null;
   wrap: string | null;
   action_table: unknown;

@@ -2,15 +2,20 @@
 
 import itertools
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
+from gymnasium.envs.box2d.car_dynamics import Car
 from plain import PlainEnvironments
 
 from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.environments.car_racing import FastCarRacing
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory
 from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -142,3 +147,74 @@ def test_user_wrapper_receives_the_frames() -> None:
 def test_gymnasiums_checker_sees_frames(backend: str) -> None:
     """Late rendering returns no frame before the wrapper that draws it."""
     assert not [note for note in gymnasium_notes(_spec(backend=backend), TEST_MODULES) if "Error" in note]
+
+
+# ------------------------------------------------------------------------------------------ missed tiles
+
+
+class Placed:
+    """A car that is put on one tile after another, beside one whose tiles have no other rewards than gymnasium's."""
+
+    def __init__(self) -> None:
+        self.shaped: Any = FastCarRacing(missed_tile_reward=-10.0)
+        self.plain: Any = FastCarRacing()
+        for environment in (self.shaped, self.plain):
+            environment.reset(seed=3)
+        self.tiles = len(self.shaped.track)
+        self.shaping, self.ended = 0.0, False
+
+    def drive(self, *tiles: int) -> None:
+        """Put the car on these tiles, with some steps on each."""
+        for tile in tiles:
+            for environment in (self.shaped, self.plain):
+                environment.car.destroy()
+                environment.car = Car(environment.world, *environment.track[tile % self.tiles][1:4])
+            for _ in range(3):
+                _, shaped, self.ended, *_ = self.shaped.step(np.zeros(3))
+                _, plain, ended, *_ = self.plain.step(np.zeros(3))
+                self.shaping += float(shaped) - float(plain)
+                assert not ended
+
+    @property
+    def missed(self) -> list[int]:
+        return [tile.idx for tile in self.shaped.road if not tile.road_visited]
+
+
+@pytest.fixture
+def placed() -> Iterator[Placed]:
+    placed = Placed()
+    yield placed
+    placed.shaped.close()
+    placed.plain.close()
+
+
+def test_each_tile_that_the_car_passes_without_touching_it_has_its_reward(placed: Placed) -> None:
+    placed.drive(*range(40))
+    assert (placed.shaping, placed.ended) == (0.0, False)
+    placed.drive(*range(52, 70))
+    missed = [tile for tile in placed.missed if tile < 60]
+    assert set(missed) >= {44, 45, 46}
+    assert placed.shaping == pytest.approx(-10.0 * len(missed))
+    placed.drive(*range(45, 70))  # a missed tile that the car returns to has cost its reward all the same
+    assert placed.shaping == pytest.approx(-10.0 * len(missed))
+
+
+def test_lap_with_missed_tiles_ends_after_its_last_tile(placed: Placed) -> None:
+    placed.drive(*range(40), *range(52, placed.tiles))
+    assert not placed.ended
+    placed.drive(*range(placed.tiles, placed.tiles + 8))
+    assert placed.ended
+    assert placed.missed
+    assert placed.shaping == pytest.approx(-10.0 * len(placed.missed))
+
+
+def test_another_part_of_the_track_and_the_road_behind_the_start_are_no_missed_tiles(placed: Placed) -> None:
+    placed.drive(0, -1, -2, -3, 0, 1, 2, *range(100, 110))
+    assert (placed.shaping, placed.ended) == (0.0, False)
+
+
+@pytest.mark.parametrize("backend", ["fast", "gymnasium"])
+def test_missed_tiles_have_a_reward_in_training_only(backend: str) -> None:
+    spec = _spec(backend=backend, training_kwargs={"missed_tile_reward": -10.0})
+    environments: list[Any] = [EnvironmentFactory(spec=each)().unwrapped for each in (spec, spec.as_evaluated())]
+    assert [environment._missed_tile_reward for environment in environments] == [-10.0, None]

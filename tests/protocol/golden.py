@@ -137,7 +137,7 @@ MESSAGES: dict[str, Message] = {
         learner_epoch=9,
         seed=3,
         epsilon=0.125,
-        spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1})),
+        spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1", kwargs={"a": 1}, training_kwargs={"b": 2.5})),
     ),
     "refusal": Refusal(code="mismatch", reason="other spaces"),
     "program": Program(hash="0" * 64, model=np.zeros(400, np.uint8)),

@@ -331,7 +331,7 @@ def test_images_are_told_from_other_arrays(shape: tuple[int, ...], dtype: str, i
     assert ArraySpace.model_validate({"shape": shape, "dtype": dtype}).is_image is image
 
 
-def test_evaluations_are_not_cut_by_the_no_reward_limit() -> None:
-    trained = EnvironmentSpec(id="A-v0", no_reward_limit=5, action_repeat=2)
+def test_evaluations_play_the_true_task() -> None:
+    trained = EnvironmentSpec(id="A-v0", no_reward_limit=5, training_kwargs={"easy": True}, action_repeat=2)
     assert trained.as_evaluated() == EnvironmentSpec(id="A-v0", action_repeat=2)
     assert trained.as_evaluated("envpool") == EnvironmentSpec(id="A-v0", action_repeat=2, backend="envpool")
