@@ -17,6 +17,7 @@ _GRASS = np.array([(x, y) for x in range(-20, 20, 2) for y in range(-20, 20, 2)]
 _CORNERS = np.array([[(1, 0)], [(0, 0)], [(0, 1)], [(1, 1)]])
 _PATCHES = _GRASS + car_racing.GRASS_DIM * _CORNERS  # [4, 400, xy]
 _BEHIND = 5  # tiles behind the wheel that is farthest ahead are passed: no other wheel touches them any more
+_OFF_ROAD_FRAMES = 60  # a car that slides over the grass in a bend is back on the road before
 _SHORT_CUT = 40  # a car that is so many tiles ahead has not driven there
 _FIELD = car_racing.PLAYFIELD * (2 * _CORNERS - 1)  # [4, 1, xy]
 
@@ -26,42 +27,53 @@ class LateRenderedCarRacing(car_racing.CarRacing):
 
     _score = 0.0  # shown in the frame: the score before this step's reward
 
-    def __init__(self, *, missed_tile_reward: float | None = None, **kwargs: Any) -> None:
-        """Construct the environment.
+    def __init__(
+        self, *, missed_tile_reward: float | None = None, off_road_reward: float | None = None, **kwargs: Any
+    ) -> None:
+        """Construct the environment. Both rewards are for training: they change the task.
 
         gymnasium's ends a lap only when every tile of the track was touched. A car that has missed one, usually by
         cutting a corner, drives on until the time is over, which costs up to 40 of 1000 points; but nothing tells it
-        when it misses the tile.
+        when it misses the tile. And a car that has left the road has a long time before it is known to be lost.
 
         Args:
-          missed_tile_reward: reward at each tile that the car passes without touching it; the lap then ends after its
-            last tile, whether all were touched or not. None: as gymnasium's.
+          missed_tile_reward: reward at each tile that the car passes without touching it. The lap then ends after its
+            last tile, whether all were touched or not, and its end is a truncation, because it is no loss. None: as
+            gymnasium's.
+          off_road_reward: reward of a car that has had no wheel on the road for 1.2 s; the episode then terminates.
+            None: as gymnasium's.
           kwargs: of gymnasium's environment.
         """
-        self._missed_tile_reward = missed_tile_reward
+        self._missed_tile_reward, self._off_road_reward = missed_tile_reward, off_road_reward
         self._passed = 0  # tiles from the start that the car has touched or passed
+        self._off_road = 0  # frames in a row
         super().__init__(**kwargs)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """See gymnasium.Env."""
-        self._passed = 0
+        self._passed = self._off_road = 0
         return super().reset(**kwargs)
 
     def step(self, action: Any) -> Any:
         """See gymnasium.Env."""
         observation, reward, terminated, truncated, info = super().step(action)
+        assert self.car is not None
+        touched = {tile.idx for wheel in self.car.wheels for tile in wheel.tiles}
         if self._missed_tile_reward is not None:
             road = self.road
             assert road is not None
-            reward += self._missed_tile_reward * self._pass_tiles(road)
-            terminated = terminated or self._passed == len(road)
+            reward += self._missed_tile_reward * self._pass_tiles(road, touched)
+            if info.get("lap_finished") or self._passed == len(road):
+                terminated, truncated = False, True
+        self._off_road = 0 if touched else self._off_road + 1
+        if self._off_road_reward is not None and self._off_road >= _OFF_ROAD_FRAMES and not truncated:
+            reward += self._off_road_reward
+            terminated = True
         return observation, reward, terminated, truncated, info
 
-    def _pass_tiles(self, road: list[Any]) -> int:
-        """Return how many tiles of the road the car has missed since the last step."""
-        assert self.car is not None
+    def _pass_tiles(self, road: list[Any], touched: set[int]) -> int:
+        """Return how many tiles of the road the car has missed since the last step; `touched` are those under it."""
         count = len(road)
-        touched = (tile.idx for wheel in self.car.wheels for tile in wheel.tiles)
         ahead = max(((index - self._passed) % count for index in touched), default=0)
         if ahead >= _SHORT_CUT:  # another part of the track, or before the start
             return 0
@@ -89,9 +101,9 @@ class LateRenderedCarRacing(car_racing.CarRacing):
 class FastCarRacing(LateRenderedCarRacing):
     """A CarRacing drawn on a smaller canvas, without the parts out of sight and without the score."""
 
-    def __init__(self, *, missed_tile_reward: float | None = None, **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         """See LateRenderedCarRacing."""
-        super().__init__(missed_tile_reward=missed_tile_reward, **kwargs)
+        super().__init__(**kwargs)
         self._canvas = Surface((_WIDTH, _HEIGHT))
         self._frame = Surface((car_racing.STATE_W, car_racing.STATE_H))
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from gymnasium.envs.box2d.car_dynamics import Car
+from gymnasium.envs.box2d.car_racing import PLAYFIELD
 from plain import PlainEnvironments
 
 from daedalus.actor.checking.checker import gymnasium_notes
@@ -156,12 +157,12 @@ class Placed:
     """A car that is put on one tile after another, beside one whose tiles have no other rewards than gymnasium's."""
 
     def __init__(self) -> None:
-        self.shaped: Any = FastCarRacing(missed_tile_reward=-10.0)
+        self.shaped: Any = FastCarRacing(missed_tile_reward=-10.0, off_road_reward=-70.0)
         self.plain: Any = FastCarRacing()
         for environment in (self.shaped, self.plain):
             environment.reset(seed=3)
         self.tiles = len(self.shaped.track)
-        self.shaping, self.ended = 0.0, False
+        self.shaping, self.terminated, self.truncated = 0.0, False, False
 
     def drive(self, *tiles: int) -> None:
         """Put the car on these tiles, with some steps on each."""
@@ -169,11 +170,20 @@ class Placed:
             for environment in (self.shaped, self.plain):
                 environment.car.destroy()
                 environment.car = Car(environment.world, *environment.track[tile % self.tiles][1:4])
-            for _ in range(3):
-                _, shaped, self.ended, *_ = self.shaped.step(np.zeros(3))
-                _, plain, ended, *_ = self.plain.step(np.zeros(3))
-                self.shaping += float(shaped) - float(plain)
-                assert not ended
+            self.stand(3)
+
+    def stand(self, frames: int) -> None:
+        """Take steps without gas."""
+        for _ in range(frames):
+            _, shaped, self.terminated, self.truncated, _ = self.shaped.step(np.zeros(3))
+            _, plain, self.plainly_terminated, *_ = self.plain.step(np.zeros(3))
+            self.shaping += float(shaped) - float(plain)
+
+    def leave_the_road(self) -> None:
+        """Put the car on the grass, away from the track."""
+        for environment in (self.shaped, self.plain):
+            environment.car.destroy()
+            environment.car = Car(environment.world, 0.0, *(2 * [0.9 * PLAYFIELD]))
 
     @property
     def missed(self) -> list[int]:
@@ -190,7 +200,7 @@ def placed() -> Iterator[Placed]:
 
 def test_each_tile_that_the_car_passes_without_touching_it_has_its_reward(placed: Placed) -> None:
     placed.drive(*range(40))
-    assert (placed.shaping, placed.ended) == (0.0, False)
+    assert (placed.shaping, placed.truncated) == (0.0, False)
     placed.drive(*range(52, 70))
     missed = [tile for tile in placed.missed if tile < 60]
     assert set(missed) >= {44, 45, 46}
@@ -199,18 +209,37 @@ def test_each_tile_that_the_car_passes_without_touching_it_has_its_reward(placed
     assert placed.shaping == pytest.approx(-10.0 * len(missed))
 
 
-def test_lap_with_missed_tiles_ends_after_its_last_tile(placed: Placed) -> None:
+def test_lap_with_missed_tiles_is_truncated_after_its_last_tile(placed: Placed) -> None:
     placed.drive(*range(40), *range(52, placed.tiles))
-    assert not placed.ended
+    assert not placed.truncated
     placed.drive(*range(placed.tiles, placed.tiles + 8))
-    assert placed.ended
+    assert (placed.terminated, placed.truncated, placed.plainly_terminated) == (False, True, False)
     assert placed.missed
     assert placed.shaping == pytest.approx(-10.0 * len(placed.missed))
 
 
 def test_another_part_of_the_track_and_the_road_behind_the_start_are_no_missed_tiles(placed: Placed) -> None:
     placed.drive(0, -1, -2, -3, 0, 1, 2, *range(100, 110))
-    assert (placed.shaping, placed.ended) == (0.0, False)
+    assert (placed.shaping, placed.truncated) == (0.0, False)
+
+
+def test_lap_without_missed_tiles_is_truncated_and_not_terminated(placed: Placed) -> None:
+    placed.drive(*range(placed.tiles))
+    assert not placed.missed
+    assert (placed.terminated, placed.truncated, placed.plainly_terminated) == (False, True, True)
+
+
+def test_car_that_stays_off_the_road_is_lost(placed: Placed) -> None:
+    placed.leave_the_road()
+    placed.stand(59)
+    placed.drive(0)  # it is back
+    assert (placed.shaping, placed.terminated) == (0.0, False)
+    placed.leave_the_road()
+    placed.stand(59)
+    assert (placed.shaping, placed.terminated) == (0.0, False)
+    placed.stand(1)
+    assert placed.shaping == pytest.approx(-70.0)
+    assert (placed.terminated, placed.truncated, placed.plainly_terminated) == (True, False, False)
 
 
 @pytest.mark.parametrize("backend", ["fast", "gymnasium"])
