@@ -12,7 +12,7 @@ from statistics import NormalDist
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.evaluation_processes import EvaluationProcess, without_episodes
+from daedalus.cli.evaluation_processes import EvaluationFailedError, EvaluationProcess, without_episodes
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.protocol.spec import RunSpec
 
@@ -57,7 +57,10 @@ class Confirmations:
             self.close()
             if result["policy_version"] == self._file.asked():  # a learner that was restarted asks again
                 assert self._target is not None
-                self._file.answer(result["policy_version"], confirmation(result, self._target))
+                try:
+                    self._file.answer(result["policy_version"], confirmation(result, self._target))
+                except OSError as error:  # the learner would wait for ever
+                    raise EvaluationFailedError(f"the confirmation cannot be saved: {error.strerror}") from None
 
     @property
     def processes(self) -> list[subprocess.Popen[bytes]]:

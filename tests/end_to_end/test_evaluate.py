@@ -403,6 +403,22 @@ def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path,
     assert "sampled_evaluation" not in summary  # the confirmation has sampled episodes already
 
 
+def test_confirmation_that_cannot_be_saved_is_an_error(
+    tmp_path: Path, output: ChildOutput, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = {"target_return": 20.0, "target_episodes": 2}
+    run = save(tmp_path / "run", CARTPOLE, 5, training=training)
+    confirmations = Confirmations(run, read_policy(run / "checkpoints" / "0000000005").spec, [], output)
+    ConfirmationFile(run).ask(5)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ConfirmationFile, "answer", fail)
+    with pytest.raises(EvaluationFailedError, match="the confirmation cannot be saved: No space left on device"):
+        until(confirmations.poll)
+
+
 @pytest.mark.parametrize(("training_mean", "plays_again"), [(1000.0, True), (1.0, False), (None, False)])
 def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_sampled_actions(
     tmp_path: Path, output: ChildOutput, training_mean: float | None, plays_again: bool
