@@ -28,9 +28,9 @@ class LateRenderedCarRacing(car_racing.CarRacing):
     _score = 0.0  # shown in the frame: the score before this step's reward
 
     def __init__(
-        self, *, missed_tile_reward: float | None = None, off_road_reward: float | None = None, **kwargs: Any
+        self, *, missed_tile_reward: float | None = None, lost_share: float | None = None, **kwargs: Any
     ) -> None:
-        """Construct the environment. Both rewards are for training: they change the task.
+        """Construct the environment. Both settings are for training: they change the task.
 
         gymnasium's ends a lap only when every tile of the track was touched. A car that has missed one, usually by
         cutting a corner, drives on until the time is over, which costs up to 40 of 1000 points; but nothing tells it
@@ -40,11 +40,12 @@ class LateRenderedCarRacing(car_racing.CarRacing):
           missed_tile_reward: reward at each tile that the car passes without touching it. The lap then ends after its
             last tile, whether all were touched or not, and its end is a truncation, because it is no loss. None: as
             gymnasium's.
-          off_road_reward: reward of a car that has had no wheel on the road for 1.2 s; the episode then terminates.
-            None: as gymnasium's.
+          lost_share: a car that has had no wheel on the road for 1.2 s is lost. Its episode terminates, and takes back
+            this share of its return so far. A fixed loss would be too much for a policy that has just begun, which
+            then avoids the road's bends, or too little for one that is nearly done. None: as gymnasium's.
           kwargs: of gymnasium's environment.
         """
-        self._missed_tile_reward, self._off_road_reward = missed_tile_reward, off_road_reward
+        self._missed_tile_reward, self._lost_share = missed_tile_reward, lost_share
         self._passed = 0  # tiles from the start that the car has touched or passed
         self._off_road = 0  # frames in a row
         super().__init__(**kwargs)
@@ -66,8 +67,8 @@ class LateRenderedCarRacing(car_racing.CarRacing):
             if info.get("lap_finished") or self._passed == len(road):
                 terminated, truncated = False, True
         self._off_road = 0 if touched else self._off_road + 1
-        if self._off_road_reward is not None and self._off_road >= _OFF_ROAD_FRAMES and not truncated:
-            reward += self._off_road_reward
+        if self._lost_share is not None and self._off_road >= _OFF_ROAD_FRAMES and not truncated:
+            reward -= self._lost_share * max(self.reward, 0.0)
             terminated = True
         return observation, reward, terminated, truncated, info
 

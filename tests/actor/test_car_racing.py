@@ -157,7 +157,7 @@ class Placed:
     """A car that is put on one tile after another, beside one whose tiles have no other rewards than gymnasium's."""
 
     def __init__(self) -> None:
-        self.shaped: Any = FastCarRacing(missed_tile_reward=-10.0, off_road_reward=-70.0)
+        self.shaped: Any = FastCarRacing(missed_tile_reward=-10.0, lost_share=0.5)
         self.plain: Any = FastCarRacing()
         for environment in (self.shaped, self.plain):
             environment.reset(seed=3)
@@ -229,7 +229,8 @@ def test_lap_without_missed_tiles_is_truncated_and_not_terminated(placed: Placed
     assert (placed.terminated, placed.truncated, placed.plainly_terminated) == (False, True, True)
 
 
-def test_car_that_stays_off_the_road_is_lost(placed: Placed) -> None:
+def test_car_that_stays_off_the_road_is_lost_and_loses_half_of_its_return(placed: Placed) -> None:
+    placed.drive(*range(30))
     placed.leave_the_road()
     placed.stand(59)
     placed.drive(0)  # it is back
@@ -238,8 +239,17 @@ def test_car_that_stays_off_the_road_is_lost(placed: Placed) -> None:
     placed.stand(59)
     assert (placed.shaping, placed.terminated) == (0.0, False)
     placed.stand(1)
-    assert placed.shaping == pytest.approx(-70.0)
+    assert placed.plain.reward > 50.0
+    assert placed.shaping == pytest.approx(-0.5 * placed.plain.reward)
     assert (placed.terminated, placed.truncated, placed.plainly_terminated) == (True, False, False)
+
+
+def test_lost_car_whose_return_is_negative_loses_nothing(placed: Placed) -> None:
+    placed.stand(300)
+    placed.leave_the_road()
+    placed.stand(60)
+    assert placed.plain.reward < 0.0
+    assert (placed.shaping, placed.terminated) == (0.0, True)
 
 
 @pytest.mark.parametrize("backend", ["fast", "gymnasium"])

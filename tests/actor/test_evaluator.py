@@ -135,10 +135,9 @@ def test_policy_of_another_learner_epoch_is_not_evaluated_before_joining_it(
 def test_evaluator_looks_for_a_learner_that_went_away(
     network: MemoryNetwork, learner: ScriptedLearner, evaluator: RunningEvaluator
 ) -> None:
-    learner.give(learner.snapshot(9))
-    asked = learner.receive()
+    _, request_for_a_policy = learner.receive()
     learner.transport.close()
-    asked[1].reply(b"a dying learner's answer")
+    request_for_a_policy.reply(b"a dying learner's answer")
     while not any(text.startswith("ignored a damaged message") for text in LINES):
         evaluator.stop.wait(0.001)
     second = ScriptedLearner(network, run_spec(), epoch=2)
