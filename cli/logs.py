@@ -66,8 +66,8 @@ def configure_logging(
 
 
 def _needs_attention(record: logging.LogRecord) -> bool:
-    """Return whether a person who watches a command should see a record: it is no ordinary event of a run."""
-    return record.name != EVENTS or record.levelno >= logging.WARNING
+    """Return whether a person who watches a command should see a record: of the events of a run, not the usual ones."""
+    return record.name != EVENTS or record.levelno >= logging.WARNING or getattr(record, "event", "") == "target"
 
 
 def _print(line: str) -> None:

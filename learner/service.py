@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from daedalus.learner.ranks.errors import RankLostError
 from daedalus.learner.ranks.opening import OpenRanks, one_process
@@ -22,7 +22,6 @@ from daedalus.learner.reporting.report import Health
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.heartbeat import Heartbeat
@@ -32,6 +31,7 @@ from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
 from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.orders import Orders
+from daedalus.learner.target_confirmation import TargetConfirmation
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.saving.saved_policy import SavedPolicy
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
 _logger = logging.getLogger(__name__)
-
-_CONFIRMATION_POLL_SECONDS = 0.05
 
 # Reasons for actors.
 _FINISHED, _STOPPED = "the learner has finished", "the learner was stopped"
@@ -110,8 +108,6 @@ class LearnerService:
         self._spec, self._directory, self._stop, self._progress = spec, directory, stop, progress
         self._open_writers, self._modules = open_writers, modules
         self._open_ranks = open_ranks
-        self._confirmation_file = ConfirmationFile(directory) if confirms else None
-        self._confirmation: dict[str, Any] | None = None  # result of the new episodes that confirmed the target
         self._ranks: Distribution | None = None  # None: not connected yet
         self._restored, self._initial = restored, initial if restored is None else None
         self._counters = RunCounters(spec.training.target_episodes)
@@ -138,6 +134,17 @@ class LearnerService:
             spaces=restored.policy.spaces if restored else spaces,
             orders=self._orders,
         )
+        self._confirmation = None
+        if confirms:
+            self._confirmation = TargetConfirmation(
+                directory,
+                spec.training,
+                self._counters,
+                self._server.events,
+                stop,
+                lock=self._server.lock,
+                beat=self._beat_without_updates,
+            )
         self._evaluation_server = EvaluationServer(self._server.evaluations, self._evaluations, self._server.publisher)
         self._reporter = RunReporter(
             directory.name,
@@ -320,37 +327,13 @@ class LearnerService:
         return reached_at
 
     def _is_confirmed(self, learner: "Learner", checkpointer: "Checkpointer") -> bool:
-        """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
+        """Return whether new episodes confirm the target, as far as there is a launcher that plays them."""
+        return self._confirmation is None or self._confirmation.confirm(learner.policy_version, checkpointer)
 
-        Otherwise the newest returns are forgotten: the target has to be reached again. Without a launcher, and if
-        nothing can be written to the disk, the target counts as confirmed.
-        """
-        file, version = self._confirmation_file, learner.policy_version
-        if file is None or checkpointer.save() is None:
-            return True
-        _logger.info(
-            "target %g reached: the policy of this moment plays %d new episodes to confirm it",
-            self._spec.training.target_return,
-            self._spec.training.target_episodes,
-        )
-        try:
-            file.ask(version)
-            while (result := file.answered(version)) is None and not self._stop.wait(_CONFIRMATION_POLL_SECONDS):
-                self._beat()
-                self._health.updated = time.monotonic()  # no update is missing
-        except OSError as error:
-            _logger.warning("the target cannot be confirmed: %s", error.strerror)
-            return True
-        finally:
-            file.clear()
-        if result is not None and result["confirmed"]:
-            self._confirmation = result
-            return True
-        with self._server.lock:
-            self._counters.forget_returns()
-        if result is not None:
-            _logger.info("not confirmed: return %.1f; training continues", result["return_mean"])
-        return False
+    def _beat_without_updates(self) -> None:
+        """Show that this process works, although it does not train."""
+        self._beat()
+        self._health.updated = time.monotonic()
 
     def _record(self, recorder: Recorder, learner: "Learner", now: float, *, last: bool = False) -> None:
         row = self._reporter.row(learner, now, last=last)
@@ -399,9 +382,9 @@ class LearnerService:
 
     def _write_summary(self, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> None:
         content = self._reporter.summary(solved=solved, finished=finished, seconds_to_target=seconds_to_target, now=now)
-        if self._confirmation is not None:
-            content["confirmation"] = self._confirmation
-            content["confirmation_return_mean"] = self._confirmation["return_mean"]
+        if self._confirmation is not None and (result := self._confirmation.result) is not None:
+            content["confirmation"] = result
+            content["confirmation_return_mean"] = result["return_mean"]
         try:
             write_json(self._directory / SUMMARY, content)
         except OSError as error:

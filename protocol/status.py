@@ -51,7 +51,9 @@ class RefusedJoin(Specification):
     seconds_since_last: float
 
 
-EventKind = Literal["started", "joined", "left", "refused", "failed", "rejected", "quarantined", "checkpoint", "ended"]
+EventKind = Literal[
+    "started", "joined", "left", "refused", "failed", "rejected", "quarantined", "target", "checkpoint", "ended"
+]
 
 
 class Event(Specification):

@@ -6,7 +6,7 @@ const KINDS = {
   "all events": null,
   "joins and losses": ["joined", "left"],
   problems: ["refused", "failed", "rejected", "quarantined"],
-  "the run": ["started", "checkpoint", "ended"],
+  "the run": ["started", "target", "checkpoint", "ended"],
 };
 const BAD = new Set(["failed", "quarantined"]);
 const WARN = new Set(["refused", "rejected", "left"]);

@@ -12,6 +12,8 @@ import pytest
 from lucky_environment import UNLUCKY, WAITING
 from processes import Running, processes_mentioning, until
 
+from daedalus.learner.run.event_file import read_events
+
 Start = Callable[..., Running]
 SIZES = ("collection.actors=1", "collection.envs_per_actor=2", "collection.rollout_length=8", "training.minibatches=1")
 TARGET = ("training.target_return=1", "training.target_episodes=10", "evaluation.final_episodes=5")
@@ -44,6 +46,9 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert confirmation["policy_version"] == result["updates"]  # the last one, at which training stopped
     assert result["episodes"] >= 20  # as many new training episodes as the target asks for, before the second attempt
     assert not (tmp_path / "run" / "confirmation.json").exists()
+    asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
+    assert asked == confirmed == running.lines[first]
+    assert refused == "not confirmed: return 0.0; training continues"
     running.expect("confirmation: return 1.0 over 10 new sampled episodes of the policy at that moment")
 
 

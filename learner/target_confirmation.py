@@ -1,0 +1,87 @@
+"""Confirmation of a target that was reached: the learner waits while its launcher plays new episodes."""
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daedalus.learner.run.confirmation_file import ConfirmationFile
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving.events import EventLog
+from daedalus.protocol.spec import TrainingSpec
+
+if TYPE_CHECKING:
+    from daedalus.learner.training.checkpointer import Checkpointer
+
+_POLL_SECONDS = 0.05
+
+_logger = logging.getLogger(__name__)
+
+
+class TargetConfirmation:
+    """The new episodes of one run, from the learner's side."""
+
+    def __init__(
+        self,
+        directory: Path,
+        training: TrainingSpec,
+        counters: RunCounters,
+        events: EventLog,
+        stop: threading.Event,
+        *,
+        lock: threading.Condition,
+        beat: Callable[[], None],
+    ) -> None:
+        """Construct the confirmation.
+
+        Args:
+          directory: the run directory.
+          training: the target, and the number of episodes.
+          counters: their newest returns are forgotten when the target is not confirmed.
+          events: receives each target that was reached, and what came of it.
+          stop: event that ends the run, and the wait.
+          lock: guards the counters.
+          beat: called again and again during the wait, to show that this process works.
+        """
+        self._file, self._training, self._counters = ConfirmationFile(directory), training, counters
+        self._events, self._stop, self._lock, self._beat = events, stop, lock, beat
+        self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
+
+    def confirm(self, policy_version: int, checkpointer: "Checkpointer") -> bool:
+        """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
+
+        Otherwise the newest returns are forgotten: the target has to be reached again. If nothing can be written to
+        the disk, the target counts as confirmed.
+        """
+        if checkpointer.save() is None:
+            return True
+        episodes = f"{self._training.target_episodes} new episodes"
+        text = (
+            f"target {self._training.target_return:g} reached: the policy of this moment plays {episodes} to confirm it"
+        )
+        self._events.add("target", text, cause=f"version {policy_version}")
+        try:
+            result = self._played_with(policy_version)
+        except OSError as error:
+            _logger.warning("the target cannot be confirmed: %s", error.strerror)
+            return True
+        if result is not None and result["confirmed"]:
+            self.result = result
+            return True
+        with self._lock:
+            self._counters.forget_returns()
+        if result is not None:
+            text = f"not confirmed: return {result['return_mean']:.1f}; training continues"
+            self._events.add("target", text, cause=f"result of version {policy_version}")
+        return False
+
+    def _played_with(self, policy_version: int) -> dict[str, Any] | None:
+        """Return the launcher's result, or None if the run is stopped first. Raises OSError."""
+        try:
+            self._file.ask(policy_version)
+            while (result := self._file.answered(policy_version)) is None and not self._stop.wait(_POLL_SECONDS):
+                self._beat()
+            return result
+        finally:
+            self._file.clear()
