@@ -66,7 +66,7 @@ def configure_logging(
 
 
 def _needs_attention(record: logging.LogRecord) -> bool:
-    """Return whether a person who watches a command should see a record: of the events of a run, not the usual ones."""
+    """Return whether a person who watches a command should see a record: any but the usual events of a run."""
     return record.name != EVENTS or record.levelno >= logging.WARNING or getattr(record, "event", "") == "target"
 
 

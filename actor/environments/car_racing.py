@@ -41,8 +41,8 @@ class LateRenderedCarRacing(car_racing.CarRacing):
             last tile, whether all were touched or not, and its end is a truncation, because it is no loss. None: as
             gymnasium's.
           lost_share: a car that has had no wheel on the road for 1.2 s is lost. Its episode terminates, and takes back
-            this share of its return so far. A fixed loss would be too much for a policy that has just begun, which
-            then avoids the road's bends, or too little for one that is nearly done. None: as gymnasium's.
+            this share of its return so far. A fixed loss that matters to a good policy delays the learning of one that
+            has just begun (docs/results.md, "Cars off the road"). None: as gymnasium's.
           kwargs: of gymnasium's environment.
         """
         self._missed_tile_reward, self._lost_share = missed_tile_reward, lost_share
