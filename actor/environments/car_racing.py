@@ -13,6 +13,7 @@ from gymnasium.envs.box2d import car_racing  # first: its error names the packag
 from pygame import Surface, draw, surfarray, transform
 
 _WIDTH, _HEIGHT = 250, 200  # of the fast renderer's canvas: a quarter of the original's
+_FARTHEST = math.hypot(_WIDTH / 2, _HEIGHT * 3 / 4)  # pixels from the car to the corners of the canvas
 _GRASS = np.array([(x, y) for x in range(-20, 20, 2) for y in range(-20, 20, 2)]) * car_racing.GRASS_DIM
 _CORNERS = np.array([[(1, 0)], [(0, 0)], [(0, 1)], [(1, 1)]])
 _PATCHES = _GRASS + car_racing.GRASS_DIM * _CORNERS  # [4, 400, xy]
@@ -125,17 +126,21 @@ class FastCarRacing(LateRenderedCarRacing):
         zoom *= _WIDTH / car_racing.WINDOW_W
         cos, sin = math.cos(-hull.angle), math.sin(-hull.angle)
         turn = zoom * np.array([(cos, sin), (-sin, cos)])  # row vectors: metres -> pixels of the canvas
-        shift = np.array((_WIDTH / 2, _HEIGHT / 4)) - np.array(hull.position) @ turn
+        position = np.array(hull.position)
+        shift = np.array((_WIDTH / 2, _HEIGHT / 4)) - position @ turn
 
-        self._canvas.fill((0, 0, 0))
-        self._draw_polygons(_FIELD @ turn + shift, [self.bg_color])
+        if np.abs(position).max() + _FARTHEST / zoom < car_racing.PLAYFIELD:
+            self._canvas.fill(self.bg_color)
+        else:
+            self._canvas.fill((0, 0, 0))
+            self._draw_polygons(_FIELD @ turn + shift, [self.bg_color])
         self._draw_polygons(_PATCHES @ turn + shift, [self.grass_color] * len(_GRASS))
         self._draw_polygons(self._road @ turn + shift, self._road_colours)
         self.car.draw(self._canvas, zoom, shift, -hull.angle, draw_particles=False)
         self.surf = transform.flip(self._canvas, False, True)
         self._render_indicators(_WIDTH, _HEIGHT)
         transform.smoothscale(self.surf, self._frame.get_size(), self._frame)
-        return _with_fewer_shades(surfarray.array3d(self._frame).swapaxes(0, 1))
+        return _with_fewer_shades(np.ascontiguousarray(surfarray.pixels3d(self._frame).swapaxes(0, 1)))
 
     def _draw_polygons(self, polygons: np.ndarray, colours: list[Any]) -> None:
         """Draw those of `polygons` [4, N, xy] that reach into the canvas, in their order."""

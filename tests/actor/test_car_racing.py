@@ -14,7 +14,7 @@ from gymnasium.envs.box2d.car_racing import PLAYFIELD
 from plain import PlainEnvironments
 
 from daedalus.actor.checking.checker import gymnasium_notes
-from daedalus.actor.environments.car_racing import FastCarRacing
+from daedalus.actor.environments.car_racing import FastCarRacing, LateRenderedCarRacing
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory
 from daedalus.actor.environments.make import make_environments
@@ -105,6 +105,23 @@ def test_fast_camera_is_neither_ahead_nor_late(accelerating: dict[str, np.ndarra
 
     assert difference(0) < 0.5 * min(difference(-1), difference(1))
     assert difference(0) < 0.8
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.85, 0.0), (0.0, -0.95), (0.9, 0.9), (-0.99, 0.5)])
+@pytest.mark.parametrize("angle", [0.0, 2.0])
+def test_fast_renderer_shows_the_edge_of_the_field(place: tuple[float, float], angle: float) -> None:
+    """Beyond the edge it is black."""
+    frames = []
+    for kind in (FastCarRacing, LateRenderedCarRacing):
+        environment = kind()
+        environment.reset(seed=3)
+        environment.t = 2.0  # the camera is near
+        assert environment.car is not None
+        environment.car.destroy()
+        environment.car = Car(environment.world, angle, *(PLAYFIELD * part for part in place))
+        frames.append(environment.draw()[ROAD].astype(int))
+        environment.close()
+    assert np.abs(frames[0] - frames[1]).mean() < 2.0
 
 
 def test_fast_backend_supports_car_racing_only() -> None:
