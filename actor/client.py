@@ -75,7 +75,8 @@ class Client:
           run: the run to join, if several share a network.
           tls: folder of this actor's certificate (`daedalus certs`), for addresses that begin with tls/.
           link: see `daedalus actor --help`.
-          timeout: seconds to wait for a learner and its first policy.
+          timeout: seconds to wait for a learner and its first policy. A learner that goes away later is waited for
+            as long as the client is open.
           action_mask: an example of the masks that `act` gets, if some discrete actions are not always legal: an array
             over all choices, or a map of arrays by action component.
           safe_action: what to play while the policy is too old or untrained: an action, or a function that returns one
@@ -99,6 +100,7 @@ class Client:
             run=run,
             link=link,
             timeout=timeout,
+            waits_for_return=True,  # the caller's loop goes on meanwhile
             max_policy_age=guard.max_age if guard.enabled else None,
         )
         self._config = config

@@ -16,6 +16,7 @@ from daedalus.cli.evaluation_processes import EvaluationFailedError, EvaluationP
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.protocol.spec import RunSpec
 
+_NAME = "confirmation"  # of the process
 _SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run and no training uses these seeds
 
 
@@ -48,19 +49,31 @@ class Confirmations:
         self._playing: EvaluationProcess | None = None
 
     def poll(self) -> None:
-        """Start the episodes that the learner asks for, and give it their result. Raises EvaluationFailedError."""
+        """Start the episodes that the learner asks for, and give it their result, or say that they cannot be played.
+
+        Raises EvaluationFailedError if the result cannot be saved.
+        """
         if self._playing is None:
             if self._file.asked() is not None:
-                self._playing = EvaluationProcess(self._arguments, "confirmation", self._output, shown=True)
+                self._playing = EvaluationProcess(self._arguments, _NAME, self._output, shown=True)
         elif self._playing.has_ended():
-            result = without_episodes(self._playing.result())
+            asked = self._file.asked()
+            result = self._result(asked)
             self.close()
-            if result["policy_version"] == self._file.asked():  # a learner that was restarted asks again
-                assert self._target is not None
+            if asked is not None and result["policy_version"] == asked:  # a learner that was restarted asks again
                 try:
-                    self._file.answer(result["policy_version"], confirmation(result, self._target))
+                    self._file.answer(asked, result)
                 except OSError as error:  # the learner would wait for ever
                     raise EvaluationFailedError(f"the confirmation cannot be saved: {error.strerror}") from None
+
+    def _result(self, asked: int | None) -> dict[str, Any]:
+        """Return the result for the learner. It has the entry `failed` if the episodes could not be played."""
+        assert self._playing is not None
+        assert self._target is not None
+        try:
+            return confirmation(without_episodes(self._playing.result()), self._target)
+        except EvaluationFailedError:
+            return {"policy_version": asked, "failed": self._output.last_error(_NAME)}
 
     @property
     def processes(self) -> list[subprocess.Popen[bytes]]:

@@ -51,8 +51,8 @@ class TargetConfirmation:
     def confirm(self, policy_version: int, checkpointer: "Checkpointer") -> bool:
         """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
 
-        Otherwise the newest returns are forgotten: the target has to be reached again. If nothing can be written to
-        the disk, the target counts as confirmed.
+        Otherwise the newest returns are forgotten: the target has to be reached again. If the episodes cannot be
+        played, or nothing can be written to the disk, the target counts as reached without them.
         """
         if checkpointer.save() is None:
             return True
@@ -65,6 +65,10 @@ class TargetConfirmation:
             result = self._played_with(policy_version)
         except OSError as error:
             _logger.warning("the target cannot be confirmed: %s", error.strerror)
+            return True
+        if result is not None and "failed" in result:  # such as a simulator of which only one runs at a time
+            text = f"the target cannot be confirmed: {result['failed']}"
+            self._events.add("target", text, cause=f"result of version {policy_version}")
             return True
         if result is not None and result["confirmed"]:
             self.result = result

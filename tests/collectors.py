@@ -9,6 +9,7 @@ from daedalus.actor.collecting import environment_collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.policy.acting.runtime import PolicyRuntime
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.messages import Snapshot
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
@@ -25,10 +26,11 @@ def started_collector(
     seed: int = 1,
     weights: dict[str, np.ndarray] | None = None,
     environments: VectorEnvironment | None = None,
+    modules: UserModules = TEST_MODULES,
 ) -> EnvironmentCollector:
     """A collector at the start of its first rollout; it steps `environments` instead of its own if they are given."""
     run = RunSpec(environment=spec, collection=CollectionSpec(envs_per_actor=count, rollout_length=rollout_length))
-    collector = EnvironmentCollector(modules=TEST_MODULES)
+    collector = EnvironmentCollector(modules=modules)
     if environments is None:
         collector.prepare(run)
     else:

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Discrete
 
 UNLUCKY = Path("unlucky")  # is removed by the next evaluation, whose episodes all have a return of 0
 WAITING = Path("waiting")  # evaluations wait as long as it exists
+BUSY = Path("busy")  # is removed by the next evaluation, which cannot create its environments
 
 
 class Lucky(gymnasium.Env[Any, Any]):
@@ -22,6 +23,9 @@ class Lucky(gymnasium.Env[Any, Any]):
     def __init__(self, **_arguments: Any) -> None:
         self._evaluated = Path(sys.argv[0]).name == "evaluate.py"
         self._unlucky = self._evaluated and UNLUCKY.exists()
+        if self._evaluated and BUSY.exists():
+            BUSY.unlink()
+            raise OSError("all 1 ports are in use")
         self._step = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:

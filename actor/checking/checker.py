@@ -7,7 +7,6 @@ from contextlib import suppress
 from typing import Any
 
 import gymnasium
-import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from daedalus.actor.checking.random_actions import RandomActions
@@ -48,7 +47,8 @@ def gymnasium_notes(spec: EnvironmentSpec, modules: UserModules) -> tuple[str, .
         except (Exception, SystemExit) as error:  # of its assertions, or of the user's code
             failed = (f"gymnasium's checker: {first_line(error)}",)
         finally:
-            environment.close()
+            with suppress(Exception, SystemExit):  # of the user's code
+                environment.close()
     said = dict.fromkeys(_plain(str(each.message)) for each in caught)
     return (*(f"gymnasium's checker: {text}" for text in said), *failed)
 
@@ -83,7 +83,7 @@ class _Masks:
 
     def __init__(self, environment: gymnasium.Env, observation: Any, info: dict[str, Any]) -> None:
         given = environment.get_wrapper_attr("action_masks")() if hasattr(environment, "action_masks") else None
-        mask = info.get(MASK_KEY) if given is None else np.asarray(given, np.bool_)
+        mask = info.get(MASK_KEY) if given is None else given
         space = environment.observation_space
         spec = EnvironmentSpec(id="Any-v0", leave_out=Texts(space, ()).names)
         example = None if mask is None else mask_of_one(mask)

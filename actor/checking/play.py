@@ -13,6 +13,7 @@ from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.report import EnvironmentReport
 from daedalus.actor.checking.single import make_one
 from daedalus.actor.checking.texts import Texts
+from daedalus.actor.checking.vectorized import vectorized_problem
 from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
@@ -29,7 +30,7 @@ class _ProblemError(Exception):
 def check_environment(
     spec: EnvironmentSpec, modules: UserModules, *, seconds: float, env_steps: int, seed: int = 0
 ) -> EnvironmentReport:
-    """Make one environment, play it with random actions, and close it.
+    """Make one environment, play it with random actions, and close it; then the same with its vector entry point.
 
     Texts of the observation that never change are left out, and reported.
 
@@ -40,6 +41,17 @@ def check_environment(
       env_steps: the most steps.
       seed: of the environment and the actions.
     """
+    report = _check_one(spec, modules, seconds, env_steps, seed)
+    if report.problems or report.spaces is None or seconds == 0.0:
+        return report
+    left_out = spec.model_copy(update={"leave_out": (*spec.leave_out, *report.constant_texts)})
+    problem = vectorized_problem(left_out, modules, report.spaces, seed)
+    return report.model_copy(update={"problems": (problem,)}) if problem else report
+
+
+def _check_one(
+    spec: EnvironmentSpec, modules: UserModules, seconds: float, env_steps: int, seed: int
+) -> EnvironmentReport:
     try:
         environment, rest = make_one(spec, modules)
     except EnvironmentSetupError as error:
@@ -57,7 +69,7 @@ def check_environment(
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:
-        with suppress(Exception):  # of the user's code
+        with suppress(Exception, SystemExit):  # of the user's code
             environment.close()
 
 

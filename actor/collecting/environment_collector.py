@@ -14,6 +14,8 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
+_SEEDS = 2**31  # every seed of an environment is below it: many environments pass theirs to a C int
+
 
 class EnvironmentCollector:
     """A Collector that creates environments as the run specifies and steps them.
@@ -60,7 +62,7 @@ class EnvironmentCollector:
             random=np.random.default_rng(action_seed),
             epsilon=epsilon,
         )
-        self._writer.start(environments.reset(int(environment_seed)))
+        self._writer.start(environments.reset(int(environment_seed) % (_SEEDS - environments.count)))
 
     def load(self, snapshot: Snapshot) -> None:
         """See Collector."""

@@ -100,10 +100,11 @@ class EnvironmentProcesses(AsyncVectorEnv):
         options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
         try:
             super().__init__(makers, **options)
-        except ValueError as error:
-            if not isinstance(error.__cause__, CustomSpaceError):
+        except (TypeError, ValueError) as error:
+            if not isinstance(error.__cause__, CustomSpaceError) and "dynamic shape" not in str(error):
                 raise
-            super().__init__(makers, **options, shared_memory=False)  # such as a text of a class of its own
+            # A space of a class of its own, or one such as Sequence: the run may leave it out.
+            super().__init__(makers, **options, shared_memory=False)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         """See AsyncVectorEnv. Raises EnvironmentSetupError if an environment fails or its process has died."""

@@ -67,7 +67,7 @@ class EpisodeInfo:
             known = name in self._values or len(self._values) < MAX_INFO_NAMES
             if not known or not _is_scalars_name(name):
                 continue
-            given = ended & info.get(f"_{name}", True)
+            given = ended & np.asarray(info.get(f"_{name}", True), np.bool_)
             with np.errstate(over="ignore"):
                 scalars = values[given].astype(np.float32)
             scalars = scalars[np.isfinite(scalars)]

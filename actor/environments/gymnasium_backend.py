@@ -79,9 +79,11 @@ class EnvironmentFactory:
             environment = RenderObservation(environment)
         return OneEpisode(environment) if self.one_episode else environment
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether no wrapper is needed, so that the environment's own vector entry point can be used."""
+    def uses_vector_entry_point(self, registered: EnvSpec) -> bool:
+        """Return whether the environment's own vector entry point can be used: it has one, and needs no wrapper."""
+        # ALE's vector entry point is another environment: it stacks, resizes and clips by itself (see backend=ale).
+        if registered.vector_entry_point is None or registered.namespace == "ALE":
+            return False
         spec = self.spec
         wrappers = (spec.no_reward_limit, spec.wrap, self.render_mode, self.camera)
         return spec.action_repeat == 1 and not spec.processes and all(wrapper is None for wrapper in wrappers)
@@ -134,6 +136,13 @@ def make_single(spec: EnvironmentSpec, modules: UserModules) -> gymnasium.Env | 
         _check_backend(spec, modules)
         single = registration(spec.id, modules).entry_point is not None
         return EnvironmentFactory(spec=spec, modules=modules)() if single else None
+
+
+def uses_vector_entry_point(spec: EnvironmentSpec, modules: UserModules) -> bool:
+    """Return whether training plays the environment by a vector entry point of its own."""
+    if spec.backend != "gymnasium":
+        return False
+    return EnvironmentFactory(spec=spec, modules=modules).uses_vector_entry_point(registration(spec.id, modules))
 
 
 def _check_backend(spec: EnvironmentSpec, modules: UserModules) -> None:
@@ -191,8 +200,7 @@ def _late_rendered(registered: EnvSpec, backend: str) -> EnvSpec:
 
 def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
     spec, registered = factory.spec, registration(factory.spec.id, factory.modules)
-    # ALE's vector entry point is another environment: it stacks, resizes and clips by itself (see backend=ale).
-    if registered.vector_entry_point is not None and registered.namespace != "ALE" and factory.is_plain:
+    if factory.uses_vector_entry_point(registered):
         if not factory.one_episode:
             return gymnasium.make_vec(registered, count, "vector_entry_point", **_kwargs(spec))
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do

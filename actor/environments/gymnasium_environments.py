@@ -1,5 +1,6 @@
 """Environments of a gymnasium vector environment, as the actor steps them."""
 
+import logging
 from typing import Any
 
 import gymnasium
@@ -7,10 +8,13 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from daedalus.actor.checking.violations import observation_violations
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line, playing_error
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
+from daedalus.actor.environments.user_code import place_of
+
+_logger = logging.getLogger(__name__)
 
 
 class GymnasiumEnvironments:
@@ -60,6 +64,7 @@ class GymnasiumEnvironments:
         except (Exception, SystemExit) as error:  # of the user's code
             raise self._failure("step", error) from error
         self.action_mask = info.get(MASK_KEY)
+        terminated, truncated = np.asarray(terminated, np.bool_), np.asarray(truncated, np.bool_)
         if info:
             self._episode_info.add(info, terminated | truncated)
         return observations, rewards, terminated, truncated
@@ -93,5 +98,8 @@ class GymnasiumEnvironments:
         return self._episode_info.take()
 
     def close(self) -> None:
-        """See BackendEnvironments."""
-        self._environment.close()
+        """See BackendEnvironments. An exception of an environment is only logged: it has done its work."""
+        try:
+            self._environment.close()
+        except (Exception, SystemExit) as error:  # of the user's code
+            _logger.warning("environment %s: close raises %s%s", self._name, first_line(error), place_of(error))

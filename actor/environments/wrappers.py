@@ -38,8 +38,8 @@ class MaskInInfo(gymnasium.Wrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated, {**info, MASK_KEY: self._mask()}
 
-    def _mask(self) -> np.ndarray:
-        return np.asarray(self.env.get_wrapper_attr("action_masks")(), np.bool_)
+    def _mask(self) -> Any:
+        return self.env.get_wrapper_attr("action_masks")()
 
 
 class RepeatedSteps(gymnasium.Wrapper):

@@ -10,7 +10,7 @@ from daedalus.actor.environments.interface import Observed, VectorEnvironment
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
 from daedalus.protocol.frames import ObservationStacks
-from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec
 
 _MAX_ENVIRONMENTS = 100
 _SEEDS = 2**30  # seeds of environments are below it plus the number of episodes: every backend takes them
@@ -27,11 +27,14 @@ class Evaluation:
     cut: np.ndarray  # [episodes] bool, whether the episode was cut: its return is that of the part that was played
 
 
-def environments_for(episodes: int, spec: EnvironmentSpec | None = None) -> int:
-    """Return how many environments to create for so many episodes."""
-    most = _MAX_ENVIRONMENTS
-    if spec is not None and spec.processes and spec.backend == "gymnasium":
-        most = _ENVIRONMENTS_PER_PROCESSOR * (os.cpu_count() or 1)
+def environments_for(episodes: int, spec: EnvironmentSpec, collection: CollectionSpec) -> int:
+    """Return how many environments to create for so many episodes: at most as many as play in training.
+
+    A simulator may allow no more, for its memory, ports or licences.
+    """
+    most = min(_MAX_ENVIRONMENTS, collection.actors * collection.envs_per_actor)
+    if spec.processes and spec.backend == "gymnasium":
+        most = min(most, _ENVIRONMENTS_PER_PROCESSOR * (os.cpu_count() or 1))
     return min(episodes, most)
 
 

@@ -74,7 +74,7 @@ class Evaluator:
             "run %r: %d %s episodes of %s every %g s", welcome.run, episodes, actions, spec.environment.id, interval
         )
         environment = spec.environment.as_evaluated()
-        count = environments_for(episodes, environment)
+        count = environments_for(episodes, environment, spec.collection)
         environments = make_environments(environment, count, modules=self._config.modules, for_evaluation=True)
         try:
             due = time.monotonic() + interval

@@ -58,6 +58,7 @@ class ActorConfig:
     modules: UserModules = NO_MODULES  # that may be imported for environments
     link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
+    waits_for_return: bool = False  # whether to look for ever for a learner that has gone, whatever the timeout
     max_policy_age: float | None = None  # seconds within which the learner must confirm the policy; None: no limit
     any_run: bool = False  # whether the actor may change to another run when its learner has gone
 
@@ -139,9 +140,15 @@ class ActorService:
 
     def _find_learner(self) -> Welcome:
         run = self._config.run_to_join(self._end.run)
-        welcome = self._queries.join_learner(run, self._join, self._config.timeout, self._end)
+        welcome = self._queries.join_learner(run, self._join, self._timeout, self._end)
         self._presence.joined()
         return welcome
+
+    @property
+    def _timeout(self) -> float | None:
+        """Seconds to look for a learner."""
+        has_joined = self._learner_epoch >= 0
+        return None if has_joined and self._config.waits_for_return else self._config.timeout
 
     def _join_run(self, welcome: Welcome) -> None:
         """Prepare the environments, join with their spaces, then collect until the learner or the run ends."""
@@ -154,7 +161,7 @@ class ActorService:
         if self._reports is not None:
             self._reports.begin()
         join = replace(self._join, spaces=spaces, environments=count)
-        confirmed = self._queries.join_learner(welcome.run, join, self._config.timeout, self._end)
+        confirmed = self._queries.join_learner(welcome.run, join, self._timeout, self._end)
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         if welcome.learner_epoch == self._learner_epoch:  # the network failed, not the learner

@@ -156,7 +156,7 @@ def _play(
     watched = arguments.render or video is not None
     environments = make_environments(
         spec,
-        1 if watched else min(arguments.envs or environments_for(episodes, spec), episodes),
+        1 if watched else min(arguments.envs or environments_for(episodes, spec, policy.spec.collection), episodes),
         modules=modules,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,

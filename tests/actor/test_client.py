@@ -1,6 +1,7 @@
 """Client: what its own thread reports to the caller's thread."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -125,6 +126,23 @@ def test_safe_action_while_the_learner_is_gone_and_recovery(network: MemoryNetwo
         rollout, _ = back.receive()
         assert (rollout.policy_version, rollout.identity.learner_epoch, rollout.overridden) == (4, 2, None)
         assert client.dropped > 0
+        back.transport.close()
+
+
+def test_client_waits_for_its_learner_longer_than_for_the_first_one(
+    network: MemoryNetwork, learner: ScriptedLearner
+) -> None:
+    learner.publish(3)
+    with Client("tcp/127.0.0.1:1", **SPACES, timeout=3.0, safe_action=1, max_policy_age=0.5) as client:
+        acts_until(client, lambda: client.safe_reason == "")
+        learner.transport.close()
+        gone = time.monotonic()
+        acts_until(client, lambda: time.monotonic() > gone + 8.0)
+        assert not client.is_over
+        assert client.safe_reason
+        back = ScriptedLearner(network, epoch=2)
+        back.publish(4)
+        acts_until(client, lambda: client.safe_reason == "")
         back.transport.close()
 
 

@@ -12,7 +12,7 @@ from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
 from daedalus.policy.acting.noise import Noise
-from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
 
@@ -136,9 +136,15 @@ def test_progress_may_end_the_evaluation() -> None:
 
 
 def test_environments_in_processes_are_limited_per_processor() -> None:
-    processes = EnvironmentSpec(id="CarRacing-v3", processes=True)
-    assert environments_for(7) == environments_for(7, COUNTING) == 7
-    assert environments_for(1000, COUNTING) == 100
-    assert environments_for(1000, processes) == 4 * (os.cpu_count() or 1)
-    assert environments_for(2, processes) == 2
-    assert environments_for(1000, processes.model_copy(update={"backend": "envpool"})) == 100
+    processes, many = EnvironmentSpec(id="CarRacing-v3", processes=True), CollectionSpec(actors=64, envs_per_actor=64)
+    assert environments_for(7, COUNTING, many) == 7
+    assert environments_for(1000, COUNTING, many) == 100
+    assert environments_for(1000, processes, many) == 4 * (os.cpu_count() or 1)
+    assert environments_for(2, processes, many) == 2
+    assert environments_for(1000, processes.model_copy(update={"backend": "envpool"}), many) == 100
+
+
+def test_evaluation_has_no_more_environments_than_training() -> None:
+    few = CollectionSpec(actors=2, envs_per_actor=3)
+    assert environments_for(1000, COUNTING, few) == 6
+    assert environments_for(1000, EnvironmentSpec(id="A-v0", processes=True), few) == min(6, 4 * (os.cpu_count() or 1))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lucky_environment import UNLUCKY, WAITING
+from lucky_environment import BUSY, UNLUCKY, WAITING
 from processes import Running, processes_mentioning, until
 
 from daedalus.learner.run.event_file import read_events
@@ -50,6 +50,18 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert asked == confirmed == running.lines[first]
     assert refused == "not confirmed: return 0.0; training continues"
     running.expect("confirmation: return 1.0 over 10 new sampled episodes of the policy at that moment")
+
+
+def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable[..., Running], tmp_path: Path) -> None:
+    (tmp_path / BUSY).touch()
+    running = train()
+    assert running.wait() == 0, running.output
+    reason = running.expect("the target cannot be confirmed: (.+)").group(1)
+    assert "all 1 ports are in use" in reason
+    result = summary(tmp_path)
+    assert (result["solved"], result["finished"], "confirmation" in result) == (True, True, False)
+    assert result["evaluation_return_mean"] == 1.0  # played after the actors have left
+    assert reason in [each.text for each in read_events(tmp_path / "run") if each.kind == "target"][-1]
 
 
 def test_run_that_is_stopped_during_the_confirmation_is_not_solved_and_resumes(

@@ -1,0 +1,53 @@
+"""Plays an environment by its own vector entry point, as training does. No threads."""
+
+import time
+
+import numpy as np
+
+from daedalus.actor.checking.random_actions import RandomActions
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.gymnasium_backend import uses_vector_entry_point
+from daedalus.actor.environments.make import make_environments
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import Spaces
+from daedalus.protocol.spec import EnvironmentSpec
+
+_COUNT, _STEPS, _SECONDS = 2, 50, 1.0  # few: one environment was played before
+
+
+def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spaces, seed: int) -> str:
+    """Return what is wrong with the vector entry point, or an empty string, also if training does not use one.
+
+    Args:
+      spec: the environment and its transforms.
+      modules: the modules that may be imported for it.
+      spaces: of one environment that was made without the vector entry point.
+      seed: of the environments and the actions.
+    """
+    try:
+        if not uses_vector_entry_point(spec, modules):
+            return ""
+        environments = make_environments(spec, _COUNT, modules=modules)
+        try:
+            if environments.spaces != spaces:
+                return (
+                    f"environment {spec.id}: its vector entry point has {environments.spaces}, "
+                    f"but its entry point has {spaces}"
+                )
+            random, until = RandomActions(spaces.actions, seed), time.monotonic() + _SECONDS
+            masks = environments.reset(seed).masks
+            for _ in range(_STEPS):
+                masks = environments.step(_chosen(random, masks))[0].masks
+                if time.monotonic() > until:
+                    break
+        finally:
+            environments.close()
+    except EnvironmentSetupError as error:
+        return f"{error} (training uses its vector entry point)"
+    return ""
+
+
+def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return an action for each environment, {name: [E, D]}, given the masks {name: [E, choices]}."""
+    rows = [random.choose({name: mask[row][None] for name, mask in masks.items()}) for row in range(_COUNT)]
+    return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}

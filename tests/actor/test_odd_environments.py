@@ -1,0 +1,108 @@
+"""Environments of users that keep to gymnasium's interface in ways that few do: they are checked and played."""
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+from collectors import collect, started_collector
+from plain import PlainPolicy
+
+from daedalus.actor.checking.checker import gymnasium_notes
+from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.make import make_environments
+from daedalus.policy.acting.noise import Noise
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spec import EnvironmentSpec
+
+MODULES = UserModules(frozenset({"odd_environment"}))
+
+
+def spec(name: str = "Odd-v0", **kwargs: Any) -> EnvironmentSpec:
+    return EnvironmentSpec(id=f"odd_environment:{name}", kwargs=kwargs)
+
+
+def problems(checked: EnvironmentSpec) -> tuple[str, ...]:
+    return check_environment(checked, MODULES, seconds=60.0, env_steps=10).problems
+
+
+class First(PlainPolicy):
+    """A policy that always makes the first choice."""
+
+    def choose(
+        self, observations: np.ndarray, state: np.ndarray, noise: Noise
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
+
+
+@pytest.mark.parametrize("flags", ["", "int flags", "float flags"])
+def test_flags_of_a_vector_environment_may_be_numbers(flags: str) -> None:
+    checked = spec("OddVector-v0", oddity=flags)
+    assert problems(checked) == ()
+    rollout = collect(started_collector(checked, First(), count=2, rollout_length=8, modules=MODULES))
+    assert rollout.terminated.tolist() == [[row in (2, 6)] * 2 for row in range(8)]
+    assert rollout.terminated.dtype == np.bool_
+    np.testing.assert_array_equal(rollout.episode_lengths, [3] * 4)
+    np.testing.assert_array_equal(rollout.episode_info["score"], [30.0, 31.0] * 2)
+
+
+@pytest.mark.parametrize(
+    ("oddity", "text"),
+    [
+        ("constructor", "cannot be created: TypeError: unexpected argument"),
+        ("autoreset", "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"),
+        ("step", "step raises ValueError: no such vector"),
+        ("space", "its vector entry point has "),
+    ],
+)
+def test_faults_of_a_vector_entry_point_are_found_by_the_check(oddity: str, text: str) -> None:
+    (problem,) = problems(spec("OddVector-v0", oddity=oddity))
+    assert text in problem
+    assert "\n" not in problem
+    (other,) = {*problems(spec("OddVector-v0", oddity=oddity).model_copy(update={"action_repeat": 2})), "none"}
+    assert other == "none"  # a wrapper is needed, so training does not use the vector entry point
+
+
+@pytest.mark.parametrize("masks", ["lists", "map"])
+def test_action_masks_may_be_lists_of_different_lengths_or_a_map(masks: str) -> None:
+    checked = spec(masks=masks)
+    assert problems(checked) == ()
+    assert not [note for note in gymnasium_notes(checked, MODULES) if "Error" in note]
+    environments = make_environments(checked, 2, modules=MODULES)
+    try:
+        observed = environments.reset(1)
+        for _ in range(5):
+            assert observed.masks["arm"].tolist() == [[True, False]] * 2
+            assert observed.masks["legs"].tolist() == [[False, True, True, True, False]] * 2
+            observed, *_ = environments.step(
+                {"arm": np.zeros((2, 1), np.int64), "legs": np.array([[1, 0]] * 2)},
+            )
+    finally:
+        environments.close()
+
+
+def test_close_that_fails_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    checked = spec(close_fails=True)
+    assert problems(checked) == ()
+    gymnasium_notes(checked, MODULES)
+    with caplog.at_level(logging.WARNING):
+        make_environments(checked, 2, modules=MODULES).close()
+    (record,) = caplog.records
+    assert "close raises ConnectionError: already disconnected" in record.getMessage()
+    assert "odd_environment.py, line " in record.getMessage()
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_component_without_a_fixed_shape_can_be_left_out(processes: bool) -> None:
+    checked = spec(extra=True).model_copy(update={"leave_out": ("notes",), "processes": processes})
+    environments = make_environments(checked, 2, modules=MODULES)
+    try:
+        assert environments.reset(1).frames["seen"].tolist() == [[0.0, 0.0]] * 2
+        assert environments.step({"action": np.array([[0], [1]])})[1].tolist() == [1.0, 1.0]
+    finally:
+        environments.close()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_seeds_of_training_fit_an_int_of_c(seed: int) -> None:
+    collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
