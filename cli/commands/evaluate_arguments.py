@@ -70,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
         "--envs",
         type=int,
         metavar="E",
-        help="number of environments to step together (default: chosen from the number of episodes)",
+        help="number of environments to step together (default: as many as training had, at most one for each episode)",
     )
     options.add_argument(
         "--wrap",
