@@ -16,7 +16,7 @@ def is_mixed(precision: Literal["auto", "float32", "bfloat16"], device: torch.de
 
 def _multiplies_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     try:
         flags = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:

@@ -54,7 +54,7 @@ class ObservationNormalizer(nn.Module):
         rest = mean.to(torch.float64)
         for part in self.means[index]:
             part.copy_(rest.to(torch.bfloat16))
-            rest = rest - part.to(torch.float64)
+            rest = rest - part.to("cpu", torch.float64)
         self.scales[index].copy_((variance + _SMALLEST_VARIANCE).rsqrt().to(torch.bfloat16))
 
 

@@ -25,6 +25,7 @@ IMAGES = Spaces(
 )
 KINDS: dict[str, tuple[PolicySpec, Spaces]] = {
     "mlp": (PolicySpec(hidden=(8,)), SPACES),
+    "normalized": (PolicySpec(hidden=(8,), normalize_observations=True), SPACES),
     "gru": (PolicySpec(hidden=(8,), memory="gru", memory_units=5), SPACES),
     "small": (PolicySpec(encoder="small"), IMAGES),
     "article, gru": (PolicySpec(encoder="article", memory="gru", memory_units=5), IMAGES),

@@ -184,6 +184,33 @@ def test_mean_of_a_skewed_kumaraswamy_is_not_its_median() -> None:
     assert 0.5 * (float(neutral) + 1.0) == pytest.approx(0.25, abs=1e-3)
 
 
+@pytest.mark.parametrize("name", ["gaussian", "gaussian, state", "squashed", "mixture"])
+@pytest.mark.parametrize(("outside", "sign"), [(-6.0, -1.0), (2.5, 1.0)])
+def test_standard_deviation_comes_back_from_beyond_its_limits(name: str, outside: float, sign: float) -> None:
+    """A loss that pulls it inside moves it; one that pushes it further outside does not."""
+    family = FAMILIES[name]()
+    assert isinstance(family, Gaussian | GaussianMixture)
+    with torch.no_grad():
+        family.log_std.fill_(outside)
+    optimizer = torch.optim.SGD(family.parameters(), lr=0.05)
+    parameters = torch.zeros(4, family.parameter_count)
+    actions = torch.zeros(4, BOX.size)
+
+    def step(inwards: float) -> None:
+        loss = inwards * sign * -family.log_prob(parameters, actions).mean()  # the most probable: the least deviation
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    step(inwards=-1.0)
+    np.testing.assert_array_equal(family.log_std.detach(), np.full(family.log_std.shape, outside, np.float32))
+    for _ in range(200):
+        step(inwards=1.0)
+        if ((family.log_std > -5.0) & (family.log_std < 2.0)).any():
+            return
+    pytest.fail(f"log_std is still {family.log_std}")
+
+
 def test_neutral_noise_gives_the_mean_of_the_most_probable_component() -> None:
     family = GaussianMixture(ContinuousSpace(low=(None,), high=(None,)), initial_std=0.4, components=2)
     parameters = torch.tensor([[0.0, 2.0, 1.0, 3.0]])  # logits 0 and 2, means 1 and 3

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from daedalus.policy.network.distributions.bounding import bounded
 from daedalus.policy.network.distributions.distribution import Distribution, expectation
 from daedalus.protocol.spaces import ContinuousSpace
 
@@ -49,9 +50,9 @@ class Gaussian(Distribution):
 
     def _mean_and_log_std(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         if not self._state_dependent:
-            return parameters, self.log_std.clamp(*_LOG_STD_RANGE)
+            return parameters, bounded(self.log_std, *_LOG_STD_RANGE)
         mean, relative = parameters.split(self._size, -1)
-        return mean, (self.log_std + relative).clamp(*_LOG_STD_RANGE)
+        return mean, bounded(self.log_std + relative, *_LOG_STD_RANGE)
 
 
 class SquashedGaussian(Gaussian):

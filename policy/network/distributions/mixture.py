@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.distributions.bounding import bounded
 from daedalus.policy.network.distributions.distribution import Distribution, expectation
 from daedalus.protocol.spaces import ContinuousSpace
 
@@ -55,7 +56,7 @@ class GaussianMixture(Distribution):
     def _mixture(self, parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log w [..., D, K], mu [..., D, K] and log sigma [D, K]."""
         logits, means = parameters.unflatten(-1, (2, self._size, self._components)).unbind(-3)
-        return logits.log_softmax(-1), means + self.offsets, self.log_std.clamp(*_LOG_STD_RANGE)
+        return logits.log_softmax(-1), means + self.offsets, bounded(self.log_std, *_LOG_STD_RANGE)
 
 
 def _log_density(points: Tensor, log_weights: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
