@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from daedalus.learner.serving.components import listed_names
+from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.compact import bits_of, float32
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.spaces import LARGEST_OBSERVATION, ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import MAX_NAME, bounded_text
 from daedalus.protocol.uploads import (
@@ -44,11 +45,10 @@ def gradient_limits(spec: RunSpec, shapes: Shapes, spaces: Spaces, environments:
 
 def expected_moments(spec: RunSpec, spaces: Spaces) -> dict[str, tuple[int, ...]]:
     """Return the names and shapes of the moments in a gradient."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    if spec.policy.normalize_observations:
-        for name, space in spaces.observations.items():
-            if isinstance(space, ArraySpace) and not space.is_image:
-                shapes[f"observations/{name}"] = (2, *space.stacked_shape)
+    normalized = normalized_components(spec.policy, spaces.observations)
+    shapes: dict[str, tuple[int, ...]] = {
+        f"observations/{name}": (2, *space.stacked_shape) for name, space in normalized.items()
+    }
     if spec.training.normalize_rewards:
         shapes["returns"] = (2,)
     return shapes

@@ -11,6 +11,7 @@ from daedalus.policy.network.exploration import Exploration
 from daedalus.policy.network.layers import orthogonal
 from daedalus.policy.network.memory import Gru, NoMemory
 from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -44,7 +45,7 @@ class ActorCritic(nn.Module):
         super().__init__()
         self.distribution = ActionDistribution(spec, spaces, modules, training)
         self.exploration = Exploration(spaces) if training is not None and training.explores else None
-        self.normalizer = ObservationNormalizer(spaces.observations if spec.normalize_observations else {})
+        self.normalizer = ObservationNormalizer(normalized_components(spec, spaces.observations))
         self.encoder = build_encoder(spec, spaces.observations, modules)
         features = self.encoder.features
         self.memory = Gru(features, spec.memory_units) if spec.memory == "gru" else NoMemory(features)

@@ -1,9 +1,10 @@
 """An encoder supplied by the user as `module:Class`: any torch.nn.Module that can be exported to ONNX.
 
 The class is constructed with one argument, the shape of an observation, frame stack included. It is called with
-observations [N, *shape] as the environment returns them, float32 or uint8, and returns features [N, F] float32. If the
-observation has several components, it is constructed with a map of shapes, and called with a map of tensors; discrete
-components are int64 [N, D].
+observations [N, *shape], float32 or uint8, and returns features [N, F] float32. They are as the environment returns
+them, but `policy.normalize_observations` normalises float32 that are no image. If the observation has several
+components, it is constructed with a map of shapes, and called with a map of tensors; discrete components are int64
+[N, D].
 """
 
 import torch
@@ -71,9 +72,9 @@ def _described(space: ArraySpace | DiscreteSpace) -> str:
     sizes = ", ".join(map(str, space.stacked_shape))
     if isinstance(space, DiscreteSpace):
         return f"[N, {sizes}] of {space.dtype}, numbers of choices from 0 on"
-    scale = "uint8 from 0 to 255" if space.dtype == "uint8" else "float32"
+    scale = "uint8 from 0 to 255, not scaled" if space.dtype == "uint8" else "float32"
     stacked = f", {space.frames} frames first" if space.frames > 1 else ""
-    return f"[N, {sizes}] of {scale}, not scaled, axes as in the environment{stacked}"
+    return f"[N, {sizes}] of {scale}, axes as in the environment{stacked}"
 
 
 def _checked_features(module: nn.Module, zeros: Tensor | dict[str, Tensor]) -> int:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spaces import ArraySpace
 
 _LARGEST = 10.0  # normalised values are clipped to +- this value
 _SMALLEST_VARIANCE = 1e-8
@@ -11,7 +11,7 @@ _PARTS = 3  # bfloat16 numbers, of 8 bits each, that make a float32
 
 
 class ObservationNormalizer(nn.Module):
-    """Shift and scale of every array that is not an image: (x - mean) / std, clipped to +-10.
+    """Shift and scale of arrays: (x - mean) / std, clipped to +-10.
 
     The statistics are parameters without gradients: they travel in snapshots and are saved in checkpoints like
     weights, so that actors and evaluations use exactly those that their snapshot was made with. Compact snapshots have
@@ -19,12 +19,11 @@ class ObservationNormalizer(nn.Module):
     one that bfloat16 can represent, and a mean is the sum of three.
     """
 
-    def __init__(self, spaces: dict[str, ArraySpace | DiscreteSpace]) -> None:
+    def __init__(self, spaces: dict[str, ArraySpace]) -> None:
+        """Construct the statistics of these components; see normalized_components."""
         super().__init__()
-        self._names = tuple(
-            name for name, space in spaces.items() if isinstance(space, ArraySpace) and not space.is_image
-        )
-        shapes = [spaces[name].stacked_shape for name in self._names]
+        self._names = tuple(spaces)
+        shapes = [space.stacked_shape for space in spaces.values()]
         self.means = nn.ParameterList([_constant(torch.zeros(_PARTS, *shape)) for shape in shapes])  # summands
         self.scales = nn.ParameterList([_constant(torch.ones(shape)) for shape in shapes])  # 1 / std
 
@@ -34,7 +33,7 @@ class ObservationNormalizer(nn.Module):
         return self._names
 
     def forward(self, observations: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Normalise observations {name: [..., *stacked_shape]}; images and discrete components are left as they are."""
+        """Normalise observations {name: [..., *stacked_shape]}; other components are left as they are."""
         normalized = dict(observations)
         for name, mean, scale in zip(self._names, self.means, self.scales, strict=True):
             centred = observations[name].to(torch.float32) - mean.sum(0)

@@ -12,7 +12,9 @@ from daedalus.algorithms import normalization
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec
 from daedalus.protocol.uploads import Rollout
 
 DISCOUNT = 0.9
@@ -122,7 +124,7 @@ def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None
         "image": ArraySpace(shape=(16, 16), dtype="uint8"),
         "choice": DiscreteSpace(counts=(3,)),
     }
-    normalizer = ObservationNormalizer(spaces)
+    normalizer = ObservationNormalizer(normalized_components(PolicySpec(normalize_observations=True), spaces))
     assert normalizer.names == (NAME, "bytes")
     statistics = ObservationStatistics(normalizer)
     random, seen = np.random.default_rng(2), {NAME: [], "bytes": []}

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,9 +46,10 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Building]
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
-    def from_source(source: str, where: Spaces = SPACES) -> ActorCritic:
+    def from_source(source: str, where: Spaces = SPACES, **policy: Any) -> ActorCritic:
         (tmp_path / "users_own.py").write_text(PREAMBLE + source)
-        return ActorCritic(PolicySpec(encoder="users_own:Net"), where, UserModules(frozenset({"users_own"})))
+        spec = PolicySpec(encoder="users_own:Net", **policy)
+        return ActorCritic(spec, where, UserModules(frozenset({"users_own"})))
 
     yield from_source
     sys.modules.pop("users_own", None)
@@ -83,6 +85,28 @@ class Net(Base):
     seen = torch.full((2, 4, 3, 9, 11), 7, dtype=torch.uint8)
     logits, _ = network({NAME: seen}, torch.zeros(4, 0), torch.zeros(2, 4, dtype=torch.bool))
     assert logits.shape == (2, 4, 4)
+
+
+EMBEDDING = """
+class Net(nn.Module):
+    def __init__(self, shape):
+        super().__init__()
+        self.cells = nn.Embedding(11, 4)
+
+    def forward(self, observations):
+        return self.cells(observations.long()).flatten(1)
+"""
+
+
+def test_encoder_receives_bytes_as_they_are_although_observations_are_normalised(build: Building) -> None:
+    """Such as the grid of MiniGrid, whose cells are numbers of kinds, and which is too small for an image."""
+    where = Spaces(observations={NAME: ArraySpace(shape=(7, 7, 3), dtype="uint8")}, actions=SPACES.actions)
+    network = build(EMBEDDING, where, normalize_observations=True)
+    cells = torch.randint(0, 11, (2, 1, 7, 7, 3), dtype=torch.uint8)
+    assert network.normalizer.names == ()
+    parameters, _ = network.step({NAME: cells.flatten(0, 1)}, torch.zeros(2, 0))
+    assert parameters.isfinite().all()
+    assert export_program(network, where)
 
 
 def test_encoder_of_several_components_receives_maps_and_is_exported(build: Building) -> None:

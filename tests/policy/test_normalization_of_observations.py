@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from daedalus.policy.network.normalization import ObservationNormalizer
+from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.compact import bfloat16, float32
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spec import PolicySpec
 
 
 @pytest.fixture
@@ -32,3 +34,27 @@ def test_compact_snapshot_changes_no_statistic(normalizer: ObservationNormalizer
     kept, variance = normalizer.statistics("o")
     torch.testing.assert_close(kept, mean, rtol=2**-23, atol=1e-12)
     torch.testing.assert_close(variance.sqrt(), deviation, rtol=2**-8, atol=1e-6)
+
+
+BYTES = ArraySpace(shape=(7, 7, 3), dtype="uint8")
+NUMBERS = ArraySpace(shape=(3,), dtype="float32")
+IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
+
+
+@pytest.mark.parametrize(
+    ("encoder", "spaces", "normalized"),
+    [
+        ("auto", {"bytes": BYTES}, {"bytes"}),
+        ("mlp", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),
+        ("impala", {"bytes": BYTES}, set()),  # its first convolution scales bytes itself
+        ("impala", {"numbers": NUMBERS}, {"numbers"}),
+        ("impala", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),  # the multilayer perceptron reads them
+        ("module:Own", {"bytes": BYTES}, set()),
+        ("module:Own", {"bytes": BYTES, "numbers": NUMBERS, "choice": DiscreteSpace(counts=(3,))}, {"numbers"}),
+    ],
+)
+def test_bytes_are_normalised_for_the_multilayer_perceptron_only(
+    encoder: str, spaces: dict[str, ArraySpace | DiscreteSpace], normalized: set[str]
+) -> None:
+    assert set(normalized_components(PolicySpec(encoder=encoder, normalize_observations=True), spaces)) == normalized
+    assert not normalized_components(PolicySpec(encoder=encoder), spaces)
