@@ -4,6 +4,7 @@
 """
 
 import logging
+import shlex
 import subprocess
 import threading
 import time
@@ -15,7 +16,7 @@ from typing import Any
 from daedalus.cli.child_output import ChildOutput, OpenStreams, inherited
 from daedalus.cli.confirmation import Confirmations
 from daedalus.cli.evaluation_processes import EvaluationFailedError, play, without_episodes
-from daedalus.cli.processes import ORDERED
+from daedalus.cli.processes import ORDERED, UNSAVED, UNWRITABLE
 from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.sampled_evaluation import is_below_training, sampled_note
 from daedalus.cli.select_best import select_best
@@ -51,6 +52,10 @@ class RunFailedError(Exception):
     def __init__(self, message: str = "", status: int = 1) -> None:
         super().__init__(message)
         self.status = status  # exit status for the command
+
+
+class UnsavedError(RunFailedError):
+    """Error of a run whose result could not be saved. The run can be resumed."""
 
 
 class RunStoppedError(Exception):
@@ -92,6 +97,11 @@ class RunEnd:
     summary: dict[str, Any]  # summary.json, with the evaluation
 
 
+def resume_command(run: LocalRun) -> str:
+    """Return the command line that continues a run."""
+    return shlex.join(["daedalus", "resume", str(run.directory), *allow_settings(run.spec.user_modules)])
+
+
 def run_locally(
     run: LocalRun, stopping: threading.Event, output: ChildOutput, learner_streams: OpenStreams = inherited
 ) -> RunEnd:
@@ -117,9 +127,11 @@ def run_locally(
             status = run.trained
         if stopping.is_set() or status == ORDERED:
             raise RunStoppedError
+        if status == UNSAVED:
+            raise UnsavedError(f"the last checkpoint could not be saved, so the run has no result: {_remedy(run)}")
         if status not in _FINISHED:
             raise RunFailedError(status=status)
-        return RunEnd(status=status, summary=evaluate_run(run, stopping, output))
+        return RunEnd(status=status, summary=_evaluated(run, stopping, output))
     except (FailedError, EvaluationFailedError) as error:
         if stopping.is_set():
             raise RunStoppedError from None
@@ -127,6 +139,22 @@ def run_locally(
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
         trackers.finish(stopping)
+
+
+def _remedy(run: LocalRun) -> str:
+    return f"make room on the disk, then type: {resume_command(run)}"
+
+
+def _evaluated(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:
+    """Return the summary with the evaluation. Raises UnsavedError on a full disk, and EvaluationFailedError."""
+    if not (run.directory / run_directory.SUMMARY).exists():  # the learner has said why
+        raise UnsavedError(f"the summary of the run could not be saved: {_remedy(run)}")
+    try:
+        return evaluate_run(run, stopping, output)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        raise UnsavedError(f"the evaluation could not be saved: {error.strerror}: {_remedy(run)}") from None
 
 
 def _train(
@@ -246,7 +274,7 @@ def _supervised_learner(run: LocalRun, listening: list[str], open_streams: OpenS
         with open_streams("learner") as streams:
             return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
 
-    return Supervised("the learner", begin, ended=_FINISHED | {ORDERED})
+    return Supervised("the learner", begin, ended=_FINISHED | {ORDERED, UNSAVED})
 
 
 def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
@@ -266,16 +294,16 @@ def watch(
 ) -> int:
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
-    The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training. Raises FailedError if
-    the learner failed too often, or if too few actors are left; EvaluationFailedError if the episodes that are to
-    confirm the target cannot be played.
+    The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training, or UNSAVED. Raises
+    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the episodes
+    that are to confirm the target cannot be played.
     """
     record = EventFile(run.directory)
     while not stopping.wait(_POLL_SECONDS):
         status = learner.process.poll()
         if run.observer.poll(learner.process) and status is None:
             _end(learner.process, stopping)
-            return 0
+            return UNSAVED if learner.process.returncode == UNSAVED else 0
         if status is not None and (status in learner.ended or learner.failed_at_once):
             return status
         _warn(learner.check(), record)

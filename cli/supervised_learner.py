@@ -10,6 +10,7 @@ from pathlib import Path
 
 from daedalus.cli.child_output import inherited
 from daedalus.cli.logs import configure_logging
+from daedalus.cli.processes import UNSAVED
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
@@ -17,7 +18,7 @@ from daedalus.learner.run.settings import SettingsError
 _logger = logging.getLogger(__name__)
 
 _POLL_SECONDS = 0.05
-_ENDED = {0, 3}  # exit statuses of a learner whose work is done
+_ENDED = {0, 3, UNSAVED}  # exit statuses of a learner that is not restarted
 _FAILED = 1
 _END_SECONDS = 30.0  # for the learner to save its checkpoint on a busy machine: it ends its processes within 5 s itself
 
@@ -49,7 +50,8 @@ def supervise_learner(directory: Path, arguments: argparse.Namespace, stopping: 
 
     learner = Supervised("the learner", begin, ended=_ENDED)
     try:
-        return _watched(learner, stopping)
+        status = _watched(learner, stopping)
+        return _FAILED if status == UNSAVED else status
     except FailedError as error:
         print(f"daedalus learner: {error}", file=sys.stderr)
         return _FAILED

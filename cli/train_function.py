@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, run_locally
+from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError, run_locally
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
 from daedalus.cli.settings_arguments import Choice, check_processes, named_directory
@@ -191,7 +191,7 @@ def _run(run: LocalRun, quiet: bool) -> RunEnd:
             return run_locally(run, threading.Event(), output, output.unlimited_pipes)
     except RunFailedError as error:
         failure = error
-    if not output.withheld:
+    if not (output.withheld or isinstance(failure, UnsavedError)):
         run_directory.remove_failed(run.directory)
     # A restarted process fails with the same message.
     reasons = dict.fromkeys([*errors, *str(failure).splitlines()])

@@ -276,7 +276,7 @@ class LearnerService:
                 self._record(recorder, learner, ended, last=True)
                 recorder.close()
             finally:
-                saved = checkpointer.save()
+                saved = checkpointer.save(last=True)
         solved = reached_at is not None
         seconds_to_target = None if reached_at is None else self._reporter.wall_seconds(reached_at)
         self._write_summary(solved, finished, seconds_to_target, ended)
@@ -285,8 +285,6 @@ class LearnerService:
             self._server.await_departures(self._stop)
         elif saved is not None:
             _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
-        else:
-            _logger.error("stopped; the checkpoint at %s could not be saved: %s", env_steps, self._health.save_fault)
         return Outcome(
             solved=solved,
             finished=finished,

@@ -1,9 +1,11 @@
 """`daedalus learner`: construct one learner and run it.
 
 Exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
-and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage. Under `daedalus train` a
-learner that a signal stopped exits with processes.STOPPED, and one that an operator stopped with processes.ORDERED. A
-learner of several processes that has lost one exits with processes.RANK_LOST, and is then started again.
+and its checkpoint is saved; 3 the budget was used up before the target; 1 failed, or the last checkpoint could not be
+saved; 2 bad usage. Under `daedalus train` a learner that a signal stopped exits with processes.STOPPED, and one that an
+operator stopped with processes.ORDERED. A supervised learner whose last checkpoint could not be saved exits with
+processes.UNSAVED. A learner of several processes that has lost one exits with processes.RANK_LOST, and is then started
+again.
 """
 
 import argparse
@@ -26,6 +28,7 @@ from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
     ORDERED,
     STOPPED,
+    UNSAVED,
     exit_on_thread_exceptions,
     exit_status,
     exit_with_parent,
@@ -201,7 +204,7 @@ def _serve(
         if not run.exists:
             run_directory.remove_failed(run.directory)
         raise
-    return _status(outcome, run.spec, stopped)
+    return _status(outcome, run.spec, stopped, UNSAVED if arguments.exit_with_parent else FAILED)
 
 
 def _with_spaces(
@@ -252,12 +255,15 @@ def _newest_checkpoint(directory: Path) -> "Checkpoint | None":
     return restored
 
 
-def _status(outcome: Outcome, spec: RunSpec, stopped: int) -> int:
-    """Return the exit status for the end of a run; `stopped` is that of a run that was stopped."""
+def _status(outcome: Outcome, spec: RunSpec, stopped: int, unsaved: int) -> int:
+    """Return the exit status for the end of a run.
+
+    `stopped` is that of a run that was stopped, and `unsaved` that of a run whose last checkpoint could not be saved.
+    """
+    if not outcome.saved:
+        return unsaved
     if not outcome.finished:
-        if outcome.ordered and stopped and outcome.saved:
-            return ORDERED
-        return stopped if outcome.saved else FAILED
+        return ORDERED if outcome.ordered and stopped else stopped
     wanted = spec.training.target_return is not None and spec.training.stop_when_solved
     return NOT_REACHED if wanted and not outcome.solved else REACHED
 

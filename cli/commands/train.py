@@ -17,7 +17,14 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.local_run import LocalRun, RunFailedError, RunStoppedError, run_locally
+from daedalus.cli.local_run import (
+    LocalRun,
+    RunFailedError,
+    RunStoppedError,
+    UnsavedError,
+    resume_command,
+    run_locally,
+)
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
@@ -39,7 +46,6 @@ from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
     UserModules,
-    allow_settings,
     modules_of,
 )
 from daedalus.protocol.spaces import Spaces
@@ -266,13 +272,12 @@ def _run(
         with output:
             end = run_locally(run, stopping, output, output.unlimited_pipes if live else inherited)
     except RunStoppedError:
-        options = "".join(f" {word}" for word in allow_settings(spec.user_modules))
-        print(f"stopped; continue with: daedalus resume {directory}{options}")
+        print(f"stopped; continue with: {resume_command(run)}")
         return 1
     except RunFailedError as error:
         if str(error):
             print(f"daedalus train: {str(error).rstrip()}", file=sys.stderr)
-        if not (resume or output.withheld):
+        if not (resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
         return error.status
     show(report(run, end.summary))

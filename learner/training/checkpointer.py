@@ -58,8 +58,8 @@ class Checkpointer:
                 return directory
         return self.save()
 
-    def save(self) -> Path | None:
-        """Save a checkpoint and return its directory, or None on a disk error."""
+    def save(self, *, last: bool = False) -> Path | None:
+        """Save a checkpoint and return its directory, or None on a disk error; `last` is that of this process."""
         counters = self._counters()
         try:
             directory = save_checkpoint(
@@ -75,13 +75,18 @@ class Checkpointer:
                 also_keep=self._evaluations.checkpoints_in_use,
             )
         except OSError as error:
-            if not self._health.save_fault:
+            fault = error.strerror or type(error).__name__
+            if last:
+                text = f"the last checkpoint, at {counters['env_steps']:,} env_steps, could not be saved: {fault}; "
+                text += "make room, then resume the run"
+                self._events.add("checkpoint", text, level=logging.ERROR)
+            elif not self._health.save_fault:
                 text = (
-                    f"checkpoint not saved: {error.strerror}; the previous checkpoint is kept, training continues, "
+                    f"checkpoint not saved: {fault}; the previous checkpoint is kept, training continues, "
                     f"and saving is retried every {self._spec.service.checkpoint_seconds:g} s"
                 )
                 self._events.add("checkpoint", text, level=logging.WARNING)
-            self._health.save_fault = error.strerror or type(error).__name__
+            self._health.save_fault = fault
             return None
         if self._health.save_fault:
             _logger.info("checkpoints are saved again")

@@ -1,5 +1,6 @@
 """Test of cli/supervisor.py: the processes of `daedalus train`."""
 
+import argparse
 import os
 import subprocess
 import sys
@@ -11,13 +12,14 @@ from typing import Any
 import pytest
 from processes import LIMIT, until
 
-from daedalus.cli import supervisor
+from daedalus.cli import supervised_learner, supervisor
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.confirmation import Confirmations
 from daedalus.cli.local_run import LocalRun, watch
-from daedalus.cli.processes import RANK_LOST, STOPPED
+from daedalus.cli.processes import RANK_LOST, STOPPED, UNSAVED
+from daedalus.cli.run_observer import RunObserver
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="this system has no process priorities")
@@ -169,6 +171,41 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
         assert any(continued in message for message in caplog.messages) == continues
     finally:
         stop([each.process for each in processes])
+
+
+def test_training_that_a_callback_ended_is_not_evaluated_if_its_last_checkpoint_could_not_be_saved(
+    tmp_path: Path,
+) -> None:
+    class Ending(RunObserver):
+        def poll(self, learner: subprocess.Popen[bytes]) -> bool:
+            return (tmp_path / "ready").exists()
+
+    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
+    run = LocalRun(directory=tmp_path, spec=spec, started=0.0, observer=Ending())
+    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
+    learner = supervised(
+        f"import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit({UNSAVED})); "
+        f"open({str(tmp_path / 'ready')!r}, 'x'); {SLEEP}"
+    )
+    try:
+        assert watch(learner, [], run, threading.Event(), confirmations) == UNSAVED
+    finally:
+        stop([learner.process])
+
+
+def test_a_learner_of_several_processes_is_not_restarted_if_its_last_checkpoint_could_not_be_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+
+    def begin(*_: object, **_others: object) -> subprocess.Popen[bytes]:
+        started.append(subprocess.Popen([sys.executable, "-S", "-c", f"raise SystemExit({UNSAVED})"]))
+        return started[-1]
+
+    monkeypatch.setattr(supervised_learner, "start", begin)
+    arguments = argparse.Namespace(log_level="info", log_json=False, run_dir=tmp_path)
+    assert supervised_learner.supervise_learner(tmp_path, arguments, threading.Event()) == 1
+    assert len(started) == 1
 
 
 def test_a_learner_that_has_lost_one_of_its_processes_is_restarted_and_has_not_failed() -> None:

@@ -19,6 +19,7 @@ from daedalus.learner.run.event_file import read_events
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 
 Start = Callable[..., Running]
+SHORT = ("--set", "collection.envs_per_actor=2", "--set", "evaluation.final_episodes=1")
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 
 
@@ -45,6 +46,21 @@ def is_free(directory: Path) -> bool:
     except RunInUseError:
         return False
     return True
+
+
+def test_a_run_whose_last_checkpoint_cannot_be_saved_fails_and_resumes(start: Start, tmp_path: Path) -> None:
+    running = start("train", "cartpole", "--actors", 1, "--env-steps", 500, *SHORT, "--run-dir", "a run")
+    running.expect("run directory")
+    in_the_way = tmp_path / "a run" / "checkpoints"
+    in_the_way.write_text("")
+    assert running.wait() == 1, running.output
+    running.expect(r"the last checkpoint, at [\d,]+ env_steps, could not be saved: ")
+    running.expect("so the run has no result: make room on the disk, then type: daedalus resume 'a run'$")
+    assert "evaluat" not in running.output
+    in_the_way.unlink()
+    resumed = start("resume", "a run")
+    assert resumed.wait() == 3, resumed.output
+    resumed.expect("evaluation: return")
 
 
 @pytest.fixture(scope="module")

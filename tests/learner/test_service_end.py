@@ -1,5 +1,8 @@
 """The end of a run and of a learner, as actors of every speed see it: learner and actors over the memory transport."""
 
+import errno
+import os
+import re
 import threading
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.serving import actor_server
+from daedalus.learner.training import checkpointer
 from daedalus.learner.training.checkpoint import load_newest
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
@@ -126,6 +130,28 @@ def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
     newest = load_newest(tmp_path / "run")
     assert newest is not None
     assert newest.counters["env_steps"] >= 1
+
+
+def test_error_of_the_last_checkpoint_is_logged_and_promises_no_other_attempt(
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **_others: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
+    monkeypatch.setattr(checkpointer, "save_checkpoint", fail)
+    learner = LearnerProcess(network, tmp_path / "run", env_steps=1)
+    actor = GatedActor(network, "actor")
+    actor.open_gate()
+    outcome = learner.join()
+    assert (outcome.finished, outcome.saved) == (True, False)
+    (error,) = (line for line in LINES if "No space left" in line)
+    assert re.fullmatch(
+        r"the last checkpoint, at \d+ env_steps, could not be saved: No space left on device; "
+        "make room, then resume the run",
+        error,
+    )
+    assert actor.join()
 
 
 def test_run_that_finished_during_a_rollout_of_an_earlier_epoch_is_over(
