@@ -50,6 +50,7 @@ from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.finished import finished_run
 from daedalus.learner.run.heartbeat import Heartbeat
+from daedalus.learner.run.initial import initial_to_resume
 from daedalus.learner.run.run_lock import RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.service import LearnerService, Outcome
@@ -165,7 +166,8 @@ def _serve(
     spaces = arguments.spaces
     if restored is None and arguments.prepared is None:
         run, spaces = _with_spaces(run, arguments, stop)
-    initial = find_policy(arguments.init_from) if arguments.init_from is not None and restored is None else None
+    weights = arguments.init_from or (initial_to_resume(run.directory) if resumed else None)
+    initial = find_policy(weights) if weights is not None and restored is None else None
     transport = open_transport(arguments, run.spec, credentials, stop)
     stopped = STOPPED if arguments.prepared else 0
     if transport is None:  # stopped while no router answered

@@ -38,7 +38,7 @@ from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.changes import with_changes
 from daedalus.learner.run.finished import FinishedRun, finished_run
-from daedalus.learner.run.initial import check_initial
+from daedalus.learner.run.initial import check_initial, initial_to_resume
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -121,7 +121,7 @@ def train(arguments: list[str]) -> int:
         print(f"daedalus train: {error}", file=sys.stderr)
         return 2
     with lock:
-        return _run(lock, spec, parsed, started, screen, resume=False, spaces=spaces)
+        return _run(lock, spec, parsed, started, screen, parsed.init_from, resume=False, spaces=spaces)
 
 
 def resume(arguments: list[str]) -> int:
@@ -136,6 +136,7 @@ def resume(arguments: list[str]) -> int:
         _check_watching(parsed)
         spec = _resumed_spec(parsed)
         check_processes(parsed.processes or 1, spec)
+        init_from = initial_to_resume(parsed.directory)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
         print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
@@ -157,7 +158,7 @@ def resume(arguments: list[str]) -> int:
             print(f"daedalus resume: {error}", file=sys.stderr)
             return 1
         run_directory.write_config(parsed.directory, spec)
-        return _run(lock, spec, parsed, started, screen, resume=True, spaces=spaces, finished=finished)
+        return _run(lock, spec, parsed, started, screen, init_from, resume=True, spaces=spaces, finished=finished)
 
 
 def _resumed_spec(parsed: argparse.Namespace) -> RunSpec:
@@ -236,6 +237,7 @@ def _run(
     parsed: argparse.Namespace,
     started: float,
     screen: Screen,
+    init_from: Path | None,
     *,
     resume: bool,
     spaces: Spaces | None = None,
@@ -251,7 +253,7 @@ def _run(
         lock=lock.inheritable,
         spaces=spaces,
         processes=parsed.processes or 1,
-        init_from=None if resume else parsed.init_from,
+        init_from=init_from,
         resume=resume,
         trained=None if finished is None else _MISSED if finished.missed else 0,
         listen=parsed.listen,

@@ -98,7 +98,7 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
       directory: its path.
       spec: the settings of the run.
       numbered: add a number to the name if the directory exists; the lock has the resulting path.
-      init_from: run whose weights the new run begins with, for versions.json.
+      init_from: run whose weights the new run begins with, for versions.json, with its absolute path.
 
     Raises SettingsError if the directory is not empty, locked, or cannot be created.
     """
@@ -111,7 +111,7 @@ def create_locked(directory: Path, spec: RunSpec, *, numbered: bool = False, ini
         try:
             check_free(directory)  # another process may have held the lock before
             write_config(directory, spec)
-            origin = {} if init_from is None else {"init_from": str(init_from)}
+            origin = {} if init_from is None else {"init_from": os.path.abspath(init_from)}
             write_json(directory / VERSIONS, {**_versions(), **origin})
         except BaseException:
             lock.close()
