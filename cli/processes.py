@@ -139,12 +139,26 @@ def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = l
     threading.Thread(target=watch, name="parent-watch", daemon=True).start()
 
 
+def open_standard_streams() -> None:
+    """Open each standard stream that was closed when the process started, as by `>&-`; what it receives is discarded.
+
+    Call it before any other file is opened. A descriptor that is free would go to the next file, and what libraries and
+    child processes print would be written into that file.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one, which is that of the stream
+            os.set_inheritable(descriptor, True)
+            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", errors="replace"))
+
+
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
 
     Every command runs in it. After Ctrl-C, or if the disk is full, the status is 1. `outputs` are the streams that the
     command writes to, besides standard output and standard error.
     """
+    open_standard_streams()
     try:
         try:
             return command()

@@ -23,7 +23,13 @@ from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
 from daedalus.cli.logs import configure_logging
-from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
+from daedalus.cli.processes import (
+    exit_on_thread_exceptions,
+    exit_status,
+    exit_with_parent,
+    open_standard_streams,
+    stop_on_signals,
+)
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
 from daedalus.policy.saving.hub import HubError, pull
@@ -275,5 +281,6 @@ class _Progress:
 
 if __name__ == "__main__":
     exit_on_thread_exceptions()
+    open_standard_streams()  # before descriptors are opened
     stopped, result = stop_on_signals(exit_if_stuck=True), _reserved_stdout()
     sys.exit(exit_status(lambda: main(stop=stopped, output=result), result))
