@@ -1,6 +1,7 @@
 """The last lines that `daedalus train` prints."""
 
 import importlib.util
+import shlex
 import sys
 from contextlib import suppress
 from typing import Any
@@ -29,12 +30,12 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     )
     folder = f"run directory: {run.directory}"
     if importlib.util.find_spec("matplotlib") is not None:  # an extra: the suggested command has to work
-        folder += f"; draw the curves with: daedalus plot {run.directory} --output curve.png"
+        folder += f"; draw the curves with: daedalus plot {shlex.quote(str(run.directory))} --output curve.png"
     return "\n".join([trained, *_confirmed(summary), evaluated, *evaluation["notes"], folder])
 
 
-def show(text: str) -> None:
-    """Print the result of a run. A full disk is no fault of the run: standard error has one line then."""
+def show(text: str, command: str) -> None:
+    """Print the result of a run. A full disk is no fault of the run: standard error has one line of `command` then."""
     try:
         print(text, flush=True)
     except OSError as error:
@@ -43,7 +44,7 @@ def show(text: str) -> None:
         discard(sys.stdout)
         with suppress(OSError):
             message = f"cannot print the result, which is in the run directory: {error.strerror}"
-            print(f"daedalus train: {message}", file=sys.stderr)
+            print(f"{command}: {message}", file=sys.stderr)
 
 
 def _confirmed(summary: dict[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 import argparse
 import datetime
 import math
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -131,7 +132,7 @@ def _init(parsed: argparse.Namespace) -> list[str]:
         f"{directory}/router      for the option --tls of daedalus router",
         f"{directory}/operator    for the option --tls of daedalus status and exporter",
         f"valid for {', '.join(folder.hosts(Identity('learner')))}; "
-        f"next: daedalus certs issue actor NAME --directory {directory}",
+        f"next: daedalus certs issue actor NAME --directory {shlex.quote(str(directory))}",
     ]
 
 

@@ -153,7 +153,8 @@ def resume(arguments: list[str]) -> int:
             print(f"nothing to do: {finished.reason}")
             return _MISSED if finished.missed else 0
         try:
-            spaces = None if checkpoints(parsed.directory) else checked_spaces(spec, fork=True)
+            begun = checkpoints(parsed.directory) and not spec.environment.user_modules  # whose folder may be another
+            spaces = None if begun else checked_spaces(spec, fork=True)
         except EnvironmentProblemError as error:
             print(f"daedalus resume: {error}", file=sys.stderr)
             return 1
@@ -246,6 +247,7 @@ def _run(
     """Run to the end, print the result, and return the exit status. A finished run is only evaluated."""
     directory = lock.directory
     live = screen.shows_frames and not parsed.log_json
+    command = "daedalus resume" if resume else "daedalus train"
     run = LocalRun(
         directory=directory,
         spec=spec,
@@ -278,9 +280,9 @@ def _run(
         return 1
     except RunFailedError as error:
         if str(error):
-            print(f"daedalus train: {str(error).rstrip()}", file=sys.stderr)
+            print(f"{command}: {str(error).rstrip()}", file=sys.stderr)
         if not (resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
         return error.status
-    show(report(run, end.summary))
+    show(report(run, end.summary), command)
     return end.status

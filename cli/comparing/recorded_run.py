@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,8 @@ class RecordedRun:
         if ended and (steps is None or done <= steps):
             return ""
         running = is_locked(self.directory)
-        remedy = "it is still running" if running else f"continue it with: daedalus resume {self.directory}"
+        command = f"daedalus resume {shlex.quote(str(self.directory))}"
+        remedy = "it is still running" if running else f"continue it with: {command}"
         return f"{self.directory} is not finished ({done:,.0f} of {budget:,.0f} env_steps): {remedy}"
 
     @property

@@ -1,5 +1,6 @@
 """Changes of settings when a run is resumed."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,11 @@ def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> 
     before, after = _values(spec), _values(changed)
     fixed = [name for name in after if after[name] != before[name] and _is_fixed(name)]
     if fixed:
-        again = " ".join(f"--set {assignment}" for assignment in assignments)
+        changes = [word for assignment in assignments for word in ("--set", assignment)]
+        words = ["daedalus", "train", f"{directory}/config.toml", "--init-from", str(directory), *changes]
         raise SettingsError(
             f"{' and '.join(fixed)} cannot change when a run is resumed: start a new run from the weights of this one, "
-            f"such as with: daedalus train {directory}/config.toml --init-from {directory} {again}"
+            f"such as with: {shlex.join(words)}"
         )
     return changed
 

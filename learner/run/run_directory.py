@@ -17,6 +17,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -63,7 +64,7 @@ def check_free(directory: Path) -> None:
         raise SettingsError(f"run directory {directory} is a file: choose a directory with --run-dir")
     if (directory / CONFIG).exists():
         raise SettingsError(
-            f"run directory {directory} exists: continue the run with `daedalus resume {directory}`, "
+            f"run directory {directory} exists: continue the run with `daedalus resume {shlex.quote(str(directory))}`, "
             "or choose another directory with --run-dir"
         )
     if any(entry.name != LOCK for entry in directory.iterdir()):

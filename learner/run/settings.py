@@ -3,6 +3,7 @@
 import difflib
 import importlib.resources
 import re
+import shlex
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,12 +40,14 @@ def read_preset(name: str) -> dict[str, Any]:
 def _unknown_preset(name: str) -> str:
     """Return the error message for a name that is no preset, with what its user may have meant."""
     if (Path(name) / "config.toml").exists():
+        directory, config = shlex.quote(name), shlex.quote(f"{name}/config.toml")
         return (
-            f"{name} is a run directory: continue it with `daedalus resume {name}`, or start a new run with its "
-            f"settings with `daedalus train {name}/config.toml`"
+            f"{name} is a run directory: continue it with `daedalus resume {directory}`, or start a new run with its "
+            f"settings with `daedalus train {config}`"
         )
     if ":" in name or re.search(r"-v\d+$", name):
-        return f"unknown preset {name!r}: an environment is named with --env, such as with: daedalus train --env {name}"
+        command = f"daedalus train --env {shlex.quote(name)}"
+        return f"unknown preset {name!r}: an environment is named with --env, such as with: {command}"
     near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"the presets are {', '.join(preset_names())}."
     return f"unknown preset {name!r}: {hint} Any gymnasium environment runs with --env ID"

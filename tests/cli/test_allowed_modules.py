@@ -11,7 +11,7 @@ from daedalus.cli.commands import actor_arguments, train
 from daedalus.cli.local_run import LocalRun, _actor_options
 from daedalus.cli.settings_arguments import choose_run, learner_parser, resolve
 from daedalus.learner.run import run_directory
-from daedalus.policy.user_modules import ModuleNotAllowedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, allow_settings
 from daedalus.protocol.spec import EnvironmentSpec, PolicySpec, RunSpec
 
 SPEC = RunSpec(
@@ -38,6 +38,19 @@ def test_resume_prints_the_command_that_allows_the_modules_of_the_run(
         "but the modules corridor and nets may not be imported here; if you trust that code, type: daedalus resume "
         f"{run} --env-steps 9 --allow-module wrappers --allow-module corridor --allow-module nets\n"
     )
+    assert run_directory.read_config(run) == SPEC  # without the new budget
+
+
+def test_resume_in_another_folder_than_that_of_the_module_changes_nothing(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "checkpoints" / "0000000001").mkdir(parents=True)  # without one, the environment is checked anyway
+    modules = allow_settings(SPEC.user_modules)
+    assert train.resume([str(run), "--env-steps", "9", *modules]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("daedalus resume: ")
+    assert "cannot import corridor" in error
+    assert "start in the folder of corridor.py" in error
     assert run_directory.read_config(run) == SPEC  # without the new budget
 
 
@@ -73,7 +86,7 @@ def test_an_actor_allows_only_what_its_command_line_names(capsys: pytest.Capture
     allowing = [*connect, "--allow-module", "corridor", "--allow-module", "my.wrappers"]
     modules = actor_arguments.config(parse(allowing), None).modules
     assert (modules.allowed, modules.source) == ({"corridor", "my.wrappers"}, "the learner")
-    for wrong in ("corridor:Corridor-v0", "corridor.", "../corridor"):
+    for wrong in ("corridor:Corridor-v0", "corridor.", "../corridor", "corridor.py"):
         with pytest.raises(SystemExit):
             parse([*connect, "--allow-module", wrong])
         assert "is not the name of a module: write my_module" in capsys.readouterr().err

@@ -37,3 +37,10 @@ def test_plot_command_is_suggested_only_where_matplotlib_is_installed(
     assert "episodes of the newest checkpoint on CartPole-v1 (backend gymnasium)\n7 of 9 episodes were cut\nrun" in text
     assert "run directory: runs/one" in text
     assert ("daedalus plot runs/one" in text) == installed
+
+
+def test_plot_command_can_be_typed_also_with_special_characters_in_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: object())
+    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
+    text = report(LocalRun(directory=Path("runs/one;two"), spec=spec, started=time.monotonic()), SUMMARY)
+    assert text.endswith("daedalus plot 'runs/one;two' --output curve.png")

@@ -48,7 +48,7 @@ def test_a_finished_run_does_not_fail_because_its_result_cannot_be_printed(buffe
     program = (
         "from daedalus.cli.processes import exit_status\n"
         "from daedalus.cli.run_report import show\n"
-        "raise SystemExit(exit_status(lambda: show('the result') or 3))"
+        "raise SystemExit(exit_status(lambda: show('the result', 'daedalus resume') or 3))"
     )
     command = [sys.executable, "-P", "-c", program]
     environment = {**os.environ, "PYTHONUNBUFFERED": buffering}
@@ -56,5 +56,5 @@ def test_a_finished_run_does_not_fail_because_its_result_cannot_be_printed(buffe
         result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
     assert result.returncode == 3, result.stderr
     assert result.stderr == (
-        "daedalus train: cannot print the result, which is in the run directory: No space left on device\n"
+        "daedalus resume: cannot print the result, which is in the run directory: No space left on device\n"
     )

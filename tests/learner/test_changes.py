@@ -1,5 +1,6 @@
 """learner/run/changes.py: which settings may change when a run is resumed."""
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,8 @@ def test_settings_that_define_what_is_learned_are_refused_by_name(assignment: st
         with_changes(run_spec(), [assignment, "training.learning_rate=0.5"], RUN)
     assert str(refused.value) == (
         f"{name} cannot change when a run is resumed: start a new run from the weights of this one, such as with: "
-        f"daedalus train runs/one/config.toml --init-from runs/one --set {assignment} --set training.learning_rate=0.5"
+        f"daedalus train runs/one/config.toml --init-from runs/one --set {shlex.quote(assignment)} "
+        "--set training.learning_rate=0.5"
     )
 
 

@@ -58,6 +58,10 @@ class TestUnfinished:
             f"{directory} is not finished (3,000 of 1,500,000 env_steps): continue it with: daedalus resume {directory}"
         )
 
+    def test_the_command_can_be_typed_also_with_a_space_in_the_path(self, tmp_path: Path) -> None:
+        directory = record(tmp_path / "my run", finished=False, evaluation=None)
+        assert read_run(directory).unfinished.endswith(f"continue it with: daedalus resume '{directory}'")
+
     def test_a_run_that_is_in_training_is_not_to_be_continued(self, tmp_path: Path) -> None:
         directory = record(tmp_path / "run", finished=False, evaluation=None)
         with RunLock(directory):
