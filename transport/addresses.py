@@ -79,6 +79,8 @@ def _parts(endpoint: str) -> tuple[str, str]:
     known = protocol in ("tcp", "tls")
     if not slash or not known or not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise AddressError(f"{endpoint!r} is not an address: write tcp/HOST:PORT or tls/HOST:PORT")
+    if not int(port):
+        raise AddressError(f"{endpoint} has port 0: choose a port from 1 to 65535, which other processes then name")
     return protocol, host.strip("[]")
 
 

@@ -26,13 +26,29 @@ def diagnose_connection(endpoint: str, credentials: Credentials | None) -> Diagn
     try:
         link = socket.create_connection((host.strip("[]"), int(port)), timeout=_PROBE_SECONDS)
     except socket.gaierror:
-        return Diagnosis(f"{host!r} cannot be resolved to an address: check the name", False)
+        return Diagnosis(_unresolved(host), False)
     except (OSError, ValueError):
         return Diagnosis(f"nothing answers at {endpoint}", False)
     with link:
         if credentials is None or not endpoint.startswith("tls/"):
             return Diagnosis(f"the service at {endpoint} uses another protocol, or requires --tls", False)
         return _diagnose_refusal(link, host, endpoint, credentials)
+
+
+def unresolved_host(endpoint: str) -> str:
+    """Return why nothing can listen at `endpoint` if its host has no address, or an empty string."""
+    if socket_path(endpoint) is not None:
+        return ""
+    host = endpoint.partition("/")[2].rpartition(":")[0]
+    try:
+        socket.getaddrinfo(host.strip("[]"), None)
+    except (OSError, UnicodeError):
+        return _unresolved(host)
+    return ""
+
+
+def _unresolved(host: str) -> str:
+    return f"{host!r} cannot be resolved to an address: check the name"
 
 
 def _diagnose_socket(path: str) -> str:

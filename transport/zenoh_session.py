@@ -4,17 +4,20 @@ A session either embeds a full router that listens (the learner, by default) or 
 """
 
 import json
+import re
 from collections.abc import Callable
 from typing import Literal
 
 import zenoh
 
 from daedalus.transport.credentials import Credentials, CredentialsError
-from daedalus.transport.diagnosis import diagnose_connection
+from daedalus.transport.diagnosis import diagnose_connection, unresolved_host
 from daedalus.transport.interface import AddressInUseError, RefusedError, TransportError
 from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 OpenSession = Callable[[], zenoh.Session]
+
+_SOURCE = re.compile(r" at \S+\.rs:\d+\.?")  # in errors of Zenoh, a place in its own source text
 
 
 def session_opener(
@@ -44,9 +47,14 @@ def session_opener(
                 config.insert_json5(name, json.dumps(value))
             return zenoh.open(config)
         except zenoh.ZError as error:
-            raise _opening_error(str(error), listen_on, connect_to, credentials) from None
+            raise _opening_error(error_text(error), listen_on, connect_to, credentials) from None
 
     return open_session
+
+
+def error_text(error: zenoh.ZError) -> str:
+    """Return the message of an error of Zenoh, without places in its source text."""
+    return _SOURCE.sub("", str(error))
 
 
 def _descriptors() -> int:
@@ -76,4 +84,5 @@ def _opening_error(
         diagnoses = [diagnose_connection(endpoint, credentials) for endpoint in connect_to]
         is_final = all(diagnosis.is_final for diagnosis in diagnoses)
         return (RefusedError if is_final else TransportError)("; ".join(diagnosis.reason for diagnosis in diagnoses))
-    return TransportError(f"cannot listen on {', '.join(listen_on)}: {text.splitlines()[0][:200]}")
+    reason = next(filter(None, map(unresolved_host, listen_on)), "") or text.splitlines()[0][:200]
+    return TransportError(f"cannot listen on {', '.join(listen_on)}: {reason}")

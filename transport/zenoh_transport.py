@@ -24,7 +24,7 @@ from daedalus.transport.zenoh_callbacks import Callbacks
 from daedalus.transport.zenoh_declarations import Declarations, Declared
 from daedalus.transport.zenoh_messages import ZenohInbox, ZenohPresence, ZenohRequest
 from daedalus.transport.zenoh_senders import Senders
-from daedalus.transport.zenoh_session import OpenSession, session_opener
+from daedalus.transport.zenoh_session import OpenSession, error_text, session_opener
 from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def _as_transport_error(action: str) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as error:
-        raise TransportError(f"cannot {action}: {error}") from None
+        raise TransportError(f"cannot {action}: {error_text(error)}") from None
 
 
 def _answers(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:

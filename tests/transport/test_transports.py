@@ -369,6 +369,23 @@ def test_impossible_address_is_reported(closing: Callable[[Transport], Transport
         closing(listen(["tcp/256.0.0.1:1"]))
 
 
+def test_name_without_an_address_is_reported(closing: Callable[[Transport], Transport]) -> None:
+    for address in ("tcp/nohost.invalid:1", "tcp/127.0.0.1:1,tcp/nohost.invalid:1"):
+        with pytest.raises(TransportError) as refused:
+            closing(listen(address.split(",")))
+        assert str(refused.value) == (
+            f"cannot listen on {address.replace(',', ', ')}: "
+            "'nohost.invalid' cannot be resolved to an address: check the name"
+        )
+
+
+def test_error_of_zenoh_names_no_place_in_its_source(closing: Callable[[Transport], Transport]) -> None:
+    with pytest.raises(TransportError) as refused:
+        closing(listen(["tcp/192.0.2.1:1"]))  # no address of this machine: reserved for documentation
+    assert "Cannot assign requested address" in str(refused.value)
+    assert ".rs" not in str(refused.value)
+
+
 def test_unreachable_address_is_reported_at_once(closing: Callable[[Transport], Transport]) -> None:
     endpoint = free_endpoint()
     refused = Tape()
