@@ -1,6 +1,7 @@
 """Shared parts of the command lines: the layout of help, and the options for addresses, security and modules."""
 
 import argparse
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -68,6 +69,17 @@ def whole_number(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text!r} is not a whole number")
 
 
+def seconds(text: str) -> float:
+    """Return the duration in the word of an option. For argparse."""
+    try:
+        duration = float(text)
+    except ValueError:
+        duration = math.nan
+    if not duration >= 0.0:  # NaN is refused, too
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, 0 or more")
+    return duration
+
+
 def add_insecure(options: argparse._ActionsContainer) -> None:
     """Add --insecure, for commands that listen."""
     options.add_argument(
@@ -97,6 +109,6 @@ def allowing(error: ModuleNotAllowedError, command: Sequence[str]) -> str:
 
 
 def _module(name: str) -> str:
-    if re.fullmatch(r"\w+(\.\w+)*", name) is None:
+    if re.fullmatch(r"\w+(\.\w+)*", name) is None or name.endswith(".py"):
         raise argparse.ArgumentTypeError(f"{name!r} is not the name of a module: write my_module, without :NAME or .py")
     return name

@@ -7,7 +7,7 @@ import secrets
 import socket
 
 from daedalus.actor.session.service import ActorConfig
-from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser
+from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import add_logging
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol import keys
@@ -89,7 +89,7 @@ def _add_connection(options: argparse.ArgumentParser) -> None:
     )
     options.add_argument(
         "--timeout",
-        type=float,
+        type=seconds,
         metavar="SECONDS",
         help="time to look for a learner before giving up (default: no limit)",
     )

@@ -4,7 +4,7 @@ import argparse
 import sys
 import time
 
-from daedalus.cli.arguments import add_connect, add_tls, command_parser
+from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
 from daedalus.cli.status_query import ask, no_answer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     add_connect(options, "address of the learner or of its router. May be given several times")
     options.add_argument("--run", default=keys.ANY_RUN, metavar="NAME", help="run that the actors take part in")
     options.add_argument(
-        "--timeout", type=float, metavar="SECONDS", help="time to wait for the actors to leave (default: no limit)"
+        "--timeout", type=seconds, metavar="SECONDS", help="time to wait for the actors to leave (default: no limit)"
     )
     add_tls(options)
     return options

@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import math
 import sys
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
@@ -64,9 +65,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _megabytes(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 1.0 <= value <= 1024.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to 1024")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 1 to 1024")
     return value
 
 
