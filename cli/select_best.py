@@ -57,6 +57,6 @@ def select_best(
         try:
             candidate.rescore(mean)
         except OSError as error:
-            _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror)
+            _logger.warning("  the score of policy version %d could not be saved: %s", version, error.strerror or error)
         scores.append({"policy_version": version, "return_mean": mean, "return_std": std})
     return sorted(scores, key=lambda each: each["return_mean"], reverse=True)

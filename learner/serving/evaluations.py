@@ -69,7 +69,7 @@ class Evaluations:
         try:
             text += ", the best so far" if keep_if_best(directory, mean, version) else ""
         except OSError as error:
-            text += f", the best so far, but its checkpoint was not kept: {error.strerror}"
+            text += f", the best so far, but its checkpoint was not kept: {error.strerror or error}"
         return Acknowledgement(verdict="accepted"), text
 
     def take_newest(self) -> dict[str, float]:

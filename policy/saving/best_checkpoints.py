@@ -66,11 +66,24 @@ def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
 
 
 def _link(checkpoint: Path, target: Path) -> None:
-    """Create `target` atomically with hard links to the files of `checkpoint`. Raises OSError if writing fails."""
+    """Create `target` with the files of `checkpoint`, atomically. Raises OSError if writing fails."""
     partial = target.with_name(f".{target.name}")
     shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(checkpoint, partial, copy_function=os.link)
-    os.replace(partial, target)
+    try:
+        partial.mkdir()
+        for file in checkpoint.iterdir():
+            _link_or_copy(file, partial / file.name)
+        os.replace(partial, target)
+    except OSError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _link_or_copy(file: Path, target: Path) -> None:
+    try:
+        os.link(file, target)
+    except OSError:  # exFAT and many FUSE file systems have no hard links
+        shutil.copyfile(file, target)
 
 
 def _score_and_version(directory: Path) -> tuple[float, int]:

@@ -135,18 +135,24 @@ def test_version_that_two_evaluators_play_is_kept_once(run: Run, second: float) 
     assert run.names == ["0000000001", "best_5.0_0000000001"]
 
 
-def test_previous_best_is_kept_when_the_disk_is_full(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+FULL = "No space left on device"
+
+
+@pytest.mark.parametrize("arguments", [(errno.ENOSPC, FULL), (FULL,)], ids=["with a number", "without a number"])
+def test_previous_best_is_kept_when_the_disk_is_full(
+    run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[Any, ...]
+) -> None:
     run.play(1, 5.0)
     run.begin(2)
 
     def refusing(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(*arguments)
 
     monkeypatch.setattr(os, "replace", refusing)
     answer, text = run.report(2, 9.0)
     monkeypatch.undo()
     assert answer.verdict == "accepted"
-    assert text.endswith("the best so far, but its checkpoint was not kept: No space left on device")
+    assert text.endswith("the best so far, but its checkpoint was not kept: " + FULL)
     best = best_checkpoints(run.directory)[0]
     assert best.name == "best_5.0_0000000001"
     run.save(3)

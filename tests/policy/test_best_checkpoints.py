@@ -1,6 +1,9 @@
 """policy/saving/best_checkpoints.py: which checkpoints are kept, and their names."""
 
+import errno
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,6 +78,37 @@ def test_rescoring_renames_the_checkpoint(tmp_path: Path) -> None:
     (best, _) = best_checkpoints(tmp_path)
     assert rescore(best, 60.0, 2) == best
     assert scored(tmp_path) == [(60.0, "2"), (50.0, "1")]
+
+
+def no_links(*_: Any) -> None:
+    raise PermissionError(errno.EPERM, "Operation not permitted")
+
+
+def full_disk(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_checkpoint_is_copied_on_a_file_system_without_hard_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", no_links)
+    directory = checkpoint(tmp_path, 1)
+    assert keep_if_best(directory, 5.0, 1)
+    assert rescore(best_checkpoints(tmp_path)[0], 6.0, 1).name == "best_6.0_0000000001"
+    assert scored(tmp_path) == [(6.0, "1")]
+
+
+@pytest.mark.parametrize("failing", ["shutil.copyfile", "os.replace"])
+def test_checkpoint_that_cannot_be_kept_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    monkeypatch.setattr(os, "link", no_links)
+    monkeypatch.setattr(failing, full_disk)
+    directory = checkpoint(tmp_path, 1)
+    with pytest.raises(OSError, match="No space left on device") as error:
+        keep_if_best(directory, 5.0, 1)
+    assert error.value.strerror == "No space left on device"
+    assert list(directory.parent.iterdir()) == [directory]
 
 
 def test_leftovers_of_a_crash_are_replaced(tmp_path: Path) -> None:
