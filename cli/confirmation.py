@@ -14,6 +14,7 @@ from typing import Any
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.evaluation_processes import EvaluationFailedError, EvaluationProcess, without_episodes
 from daedalus.learner.run.confirmation_file import ConfirmationFile
+from daedalus.policy.saving.saved_policy import checkpoint_path
 from daedalus.protocol.spec import RunSpec
 
 _NAME = "confirmation"  # of the process
@@ -21,9 +22,9 @@ _SEEDS = 2**34  # added to the seed of the run: no other evaluation of the run a
 
 
 def confirmation_arguments(spec: RunSpec) -> list[str]:
-    """Return the options of `daedalus evaluate` that confirm the newest policy of a run, without its directory."""
+    """Return the options of `daedalus evaluate` that confirm the policy of a run, without the checkpoint."""
     training = spec.training
-    options = ["--newest", "--actions", "sampled", "--backend", spec.environment.backend]
+    options = ["--actions", "sampled", "--backend", spec.environment.backend]
     return [*options, "--episodes", str(training.target_episodes), "--seed", str(training.seed + _SEEDS)]
 
 
@@ -43,10 +44,12 @@ class Confirmations:
 
     def __init__(self, directory: Path, spec: RunSpec, options: list[str], output: ChildOutput) -> None:
         """Construct without starting a process. `options` are further ones of `daedalus evaluate`."""
-        self._file, self._output = ConfirmationFile(directory), output
-        self._arguments = [str(directory), *confirmation_arguments(spec), *options]
+        self._directory, self._file, self._output = directory, ConfirmationFile(directory), output
+        self._file.clear()  # of a launcher that was killed
+        self._options = [*confirmation_arguments(spec), *options]
         self._target = spec.training.target_return
         self._playing: EvaluationProcess | None = None
+        self._version = -1  # of the policy that plays
 
     def poll(self) -> None:
         """Start the episodes that the learner asks for, and give it their result, or say that they cannot be played.
@@ -54,26 +57,27 @@ class Confirmations:
         Raises EvaluationFailedError if the result cannot be saved.
         """
         if self._playing is None:
-            if self._file.asked() is not None:
-                self._playing = EvaluationProcess(self._arguments, _NAME, self._output, shown=True)
+            if (version := self._file.asked()) is not None:
+                self._version, checkpoint = version, checkpoint_path(self._directory, version)
+                arguments = [str(checkpoint), *self._options]
+                self._playing = EvaluationProcess(arguments, _NAME, self._output, shown=True)
         elif self._playing.has_ended():
-            asked = self._file.asked()
-            result = self._result(asked)
+            result = self._result()
             self.close()
-            if asked is not None and result["policy_version"] == asked:  # a learner that was restarted asks again
+            if self._version == self._file.asked():  # a learner that was restarted asks again
                 try:
-                    self._file.answer(asked, result)
+                    self._file.answer(self._version, result)
                 except OSError as error:  # the learner would wait for ever
                     raise EvaluationFailedError(f"the confirmation cannot be saved: {error.strerror}") from None
 
-    def _result(self, asked: int | None) -> dict[str, Any]:
+    def _result(self) -> dict[str, Any]:
         """Return the result for the learner. It has the entry `failed` if the episodes could not be played."""
         assert self._playing is not None
         assert self._target is not None
         try:
             return confirmation(without_episodes(self._playing.result()), self._target)
         except EvaluationFailedError:
-            return {"policy_version": asked, "failed": self._output.last_error(_NAME)}
+            return {"failed": self._output.last_error(_NAME)}
 
     @property
     def processes(self) -> list[subprocess.Popen[bytes]]:

@@ -5,8 +5,9 @@ read by policy/saving/saved_policy.py; this file adds the state that training co
 """
 
 import logging
+import os
 import shutil
-from collections.abc import Set
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from daedalus.policy.saving.saved_policy import (
     PROGRAM_FILE,
     OtherFormatError,
     SavedPolicy,
+    checkpoint_path,
     checkpoints,
     read_policy,
 )
@@ -61,7 +63,7 @@ def save_checkpoint(
 
     Raises OSError on a disk error; the existing checkpoints then stay.
     """
-    directory = run_directory / "checkpoints" / f"{policy_version:010d}"
+    directory = checkpoint_path(run_directory, policy_version)
     files = {
         PROGRAM_FILE: program,
         PARAMETERS_FILE: safetensors.numpy.save(parameters),
@@ -75,12 +77,12 @@ def save_checkpoint(
         "counters": counters,
     }
     write_sealed(directory, files, content)
-    # A damaged checkpoint of a higher version may exist, if the learner resumed from an earlier checkpoint.
+    # A damaged checkpoint of a higher version may exist, if it could not be set aside.
     others = [other for other in checkpoints(run_directory) if other != directory]
     for old in others[keep - 1 :]:
         if old not in also_keep:
             shutil.rmtree(old, ignore_errors=True)
-    for unfinished in directory.parent.glob(".*"):  # left by a crash
+    for unfinished in directory.parent.glob(".*"):  # left by a crash, or set aside
         shutil.rmtree(unfinished, ignore_errors=True)
     return directory
 
@@ -100,15 +102,36 @@ def load_checkpoint(directory: Path) -> Checkpoint:
 
 
 def load_newest(run_directory: Path) -> Checkpoint:
-    """Return the newest undamaged checkpoint, and log a warning for each damaged checkpoint.
+    """Return the newest undamaged checkpoint, and set aside the newer ones with one warning that names them.
+
+    The learner continues from the returned checkpoint, so that the newer ones are no longer the newest of the run.
 
     Raises DamagedError if there is no undamaged checkpoint, OtherFormatError for a run of another release.
     """
+    loaded, damaged = None, dict[Path, DamagedError]()
     for directory in checkpoints(run_directory):
         try:
-            return load_checkpoint(directory)
+            loaded = load_checkpoint(directory)
+            break
         except OtherFormatError:
             raise
         except DamagedError as error:
-            _logger.warning("damaged checkpoint skipped: %s", error)
-    raise DamagedError(f"{run_directory} has no readable checkpoint: start a new run with another --run-dir")
+            damaged[directory] = error
+    if damaged:
+        _logger.warning("damaged checkpoints skipped: %s", "; ".join(map(str, damaged.values())))
+    if loaded is None:
+        raise DamagedError(f"{run_directory} has no readable checkpoint: start a new run with another --run-dir")
+    _set_aside(damaged)
+    return loaded
+
+
+def _set_aside(damaged: Iterable[Path]) -> None:
+    """Give damaged checkpoints names that nothing takes for checkpoints. The next save removes them."""
+    for directory in damaged:
+        aside = directory.with_name(f".{directory.name}.damaged")
+        shutil.rmtree(aside, ignore_errors=True)
+        try:
+            os.replace(directory, aside)
+        except OSError as error:
+            text = "%s cannot be set aside: %s; remove it, because it counts as newer than those that training saves"
+            _logger.warning(text, directory, error.strerror or error)

@@ -46,6 +46,11 @@ class SavedPolicy:
     weights: dict[str, np.ndarray]
 
 
+def checkpoint_path(run_directory: Path, policy_version: int) -> Path:
+    """Return the directory of the checkpoint of a policy version, which may not exist."""
+    return run_directory / "checkpoints" / f"{policy_version:010d}"
+
+
 def checkpoints(run_directory: Path) -> list[Path]:
     """Return the checkpoints of a run, newest first."""
     folder = run_directory / "checkpoints"

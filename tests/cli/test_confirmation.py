@@ -1,10 +1,17 @@
 """cli/confirmation.py: the interval of a mean, and episodes that nothing else of a run plays."""
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
+from daedalus.cli import confirmation as module
+from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate_arguments import parser
-from daedalus.cli.confirmation import confirmation, confirmation_arguments, mean_interval
+from daedalus.cli.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
+from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec
 
 # 97.5 % quantiles of Student's distribution by degrees of freedom, from tables.
@@ -44,12 +51,71 @@ def test_target_is_not_confirmed_if_the_whole_interval_is_below_it(target: float
     assert result["confirmed"] is confirmed
 
 
-def test_confirmation_plays_the_newest_policy_as_in_training() -> None:
+def test_confirmation_plays_as_in_training() -> None:
     spec = RunSpec(
         environment=EnvironmentSpec(id="A-v0", backend="envpool"),
         training=TrainingSpec(seed=7, target_episodes=50),
         evaluation=EvaluationSpec(final_backend="gymnasium"),
     )
     parsed = parser().parse_args(["run", *confirmation_arguments(spec)])
-    assert (parsed.newest, parsed.actions, parsed.backend, parsed.episodes) == (True, "sampled", "envpool", 50)
+    assert (parsed.actions, parsed.backend, parsed.episodes) == ("sampled", "envpool", 50)
     assert parsed.seed not in (7, 7 + 2**32, 7 + 2**33)  # training, the final evaluation, the selection
+
+
+class InstantProcess:
+    """`daedalus evaluate` that has ended as soon as it is started."""
+
+    started: list[Path]
+
+    def __init__(self, arguments: list[str], *_: Any, **__: Any) -> None:
+        self._checkpoint = parser().parse_args(arguments).directory
+        self.started.append(self._checkpoint)
+
+    def has_ended(self) -> bool:
+        return True
+
+    def result(self) -> dict[str, Any]:
+        return {"policy_version": int(self._checkpoint.name), "return_mean": 9.0, "return_std": 0.0, "episodes": 2}
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def confirmations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Confirmations]:
+    monkeypatch.setattr(InstantProcess, "started", [], raising=False)
+    monkeypatch.setattr(module, "EvaluationProcess", InstantProcess)
+    spec = RunSpec(environment=EnvironmentSpec(id="A-v0"), training=TrainingSpec(target_return=5.0))
+    ConfirmationFile(tmp_path).ask(3)  # of a launcher that was killed
+    with ChildOutput(tmp_path / "output.log", print, print) as output:
+        yield Confirmations(tmp_path, spec, [], output)
+
+
+def test_confirmation_plays_the_checkpoint_that_the_learner_asks_for(
+    tmp_path: Path, confirmations: Confirmations
+) -> None:
+    """The newest checkpoint may be another: a damaged one of a higher version that could not be renamed."""
+    file = ConfirmationFile(tmp_path)
+    confirmations.poll()
+    file.ask(450)
+    confirmations.poll()
+    confirmations.poll()
+    assert InstantProcess.started == [tmp_path / "checkpoints" / "0000000450"]
+    answered = file.answered(450)
+    assert answered is not None
+    assert answered["confirmed"] is True
+
+
+def test_learner_that_asks_again_gets_the_result_of_the_version_that_it_asks_for_then(
+    tmp_path: Path, confirmations: Confirmations
+) -> None:
+    file = ConfirmationFile(tmp_path)
+    file.ask(450)
+    confirmations.poll()
+    file.ask(451)  # by a learner that was restarted
+    confirmations.poll()
+    assert file.answered(450) is file.answered(451) is None
+    confirmations.poll()
+    confirmations.poll()
+    assert [each.name for each in InstantProcess.started] == ["0000000450", "0000000451"]
+    assert file.answered(451) is not None

@@ -374,7 +374,7 @@ def test_the_best_checkpoint_is_selected_by_new_episodes_before_the_final_evalua
 
 def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path, output: ChildOutput) -> None:
     training = {"target_return": 20.0, "target_episodes": 40}
-    run = save(tmp_path / "run", CARTPOLE, 4, 5, evaluation={"final_episodes": 10}, training=training)
+    run = save(tmp_path / "run", CARTPOLE, 4, 5, 6, evaluation={"final_episodes": 10}, training=training)
     score(run, 77.0, 4)
     spec = read_policy(run / "checkpoints" / "0000000005").spec
     file, confirmations = ConfirmationFile(run), Confirmations(run, spec, [], output)

@@ -12,7 +12,7 @@ from building import SPACES, run_spec
 from log_lines import LINES
 
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
-from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, read_policy
+from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, find_policy, read_policy
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
@@ -81,6 +81,40 @@ def test_load_newest_names_a_damaged_checkpoint_and_returns_the_previous_one(tmp
     assert "parameters.safetensors" in LINES[0]
 
 
+def test_damaged_checkpoints_are_no_longer_the_newest_after_a_resume(tmp_path: Path) -> None:
+    """Only the learner's state is damaged, which nothing else reads."""
+    for version in (1, 2, 3):
+        save(tmp_path, version)
+    for version in (2, 3):
+        flip(tmp_path / "checkpoints" / f"{version:010d}" / "learner.safetensors", 20)
+    assert find_policy(tmp_path, newest=True).policy_version == 3
+    assert load_newest(tmp_path).policy.policy_version == 1
+    assert find_policy(tmp_path, newest=True).policy_version == 1
+    assert [directory.name for directory in checkpoints(tmp_path)] == ["0000000001"]
+    (line,) = LINES
+    assert "0000000002" in line
+    assert "0000000003" in line
+    assert len(names(tmp_path)) == 3  # their files can be looked at until the learner saves again
+    flip(save(tmp_path, 2) / "learner.safetensors", 20)
+    assert names(tmp_path) == ["0000000001", "0000000002"]
+    assert load_newest(tmp_path).policy.policy_version == 1
+
+
+def test_learner_resumes_although_a_damaged_checkpoint_cannot_be_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path, 1)
+    flip(save(tmp_path, 2) / "learner.safetensors", 20)
+
+    def refusing(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "replace", refusing)
+    assert load_newest(tmp_path).policy.policy_version == 1
+    _, line = LINES
+    assert line.startswith(f"{tmp_path / 'checkpoints' / '0000000002'} cannot be set aside: Read-only file system")
+
+
 def test_load_newest_raises_when_no_checkpoint_is_undamaged(tmp_path: Path) -> None:
     with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
@@ -88,7 +122,10 @@ def test_load_newest_raises_when_no_checkpoint_is_undamaged(tmp_path: Path) -> N
         flip(save(tmp_path, version) / "seal", 0)
     with pytest.raises(DamagedError, match="no readable checkpoint"):
         load_newest(tmp_path)
-    assert len(LINES) == 2
+    (line,) = LINES
+    assert "0000000001" in line
+    assert "0000000002" in line
+    assert [directory.name for directory in checkpoints(tmp_path)] == ["0000000002", "0000000001"]
 
 
 def test_run_of_another_format_is_refused_and_its_checkpoints_are_not_called_damaged(tmp_path: Path) -> None:
