@@ -52,8 +52,9 @@ class ObservationNormalizer(nn.Module):
         index = self._names.index(name)
         rest = mean.to(torch.float64)
         for part in self.means[index]:
-            part.copy_(rest.to(torch.bfloat16))
-            rest = rest - part.to("cpu", torch.float64)
+            rounded = rest.to(torch.bfloat16)
+            part.copy_(rounded)  # may be on a GPU, unlike the statistics
+            rest = rest - rounded.to(torch.float64)
         self.scales[index].copy_((variance + _SMALLEST_VARIANCE).rsqrt().to(torch.bfloat16))
 
 

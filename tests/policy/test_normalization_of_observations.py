@@ -36,6 +36,12 @@ def test_compact_snapshot_changes_no_statistic(normalizer: ObservationNormalizer
     torch.testing.assert_close(variance.sqrt(), deviation, rtol=2**-8, atol=1e-6)
 
 
+def test_statistics_are_set_without_reading_the_parameters(normalizer: ObservationNormalizer) -> None:
+    """Parameters on a GPU cannot be combined with statistics on the CPU; those on "meta" cannot be read either."""
+    normalizer.to("meta")
+    normalizer.set_statistics("o", torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+
+
 BYTES = ArraySpace(shape=(7, 7, 3), dtype="uint8")
 NUMBERS = ArraySpace(shape=(3,), dtype="float32")
 IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
