@@ -211,6 +211,20 @@ def test_standard_deviation_comes_back_from_beyond_its_limits(name: str, outside
     pytest.fail(f"log_std is still {family.log_std}")
 
 
+@pytest.mark.parametrize(("action", "inwards"), [(0.0, 0), (0.999, 1)])
+def test_shapes_of_kumaraswamy_come_back_from_beyond_their_limit(action: float, inwards: int) -> None:
+    """The density of the first action grows with a smaller a and a larger b; that of the second with the opposite."""
+    family = Kumaraswamy(ContinuousSpace(low=(-1.0,), high=(1.0,)))
+    shapes = torch.full((1, 2), 1100.0, requires_grad=True)  # the limit is 1,000
+    optimizer = torch.optim.SGD([shapes], lr=100.0)
+    for _ in range(3):
+        optimizer.zero_grad()
+        (-family.log_prob(shapes, torch.full((1, 1), action))).sum().backward()
+        optimizer.step()
+    assert shapes[0, inwards] < 1000.0
+    assert shapes[0, 1 - inwards] == 1100.0
+
+
 def test_neutral_noise_gives_the_mean_of_the_most_probable_component() -> None:
     family = GaussianMixture(ContinuousSpace(low=(None,), high=(None,)), initial_std=0.4, components=2)
     parameters = torch.tensor([[0.0, 2.0, 1.0, 3.0]])  # logits 0 and 2, means 1 and 3

@@ -12,6 +12,8 @@ def bounded(values: Tensor, low: float, high: float) -> Tensor:
     torch's clamp has no gradient beyond its bounds: a value that has crossed one, such as by the momentum of the
     optimiser, would stay there for ever.
     """
+    if not torch.is_grad_enabled():  # also in the export: the exporter knows clamp
+        return values.clamp(low, high)
     return _Bounded.apply(values, low, high)  # pyright: ignore[reportReturnType]
 
 
@@ -29,9 +31,3 @@ class _Bounded(torch.autograd.Function):
         # Descent subtracts the gradient.
         leaves = ((values < ctx.low) & (outer > 0.0)) | ((values > ctx.high) & (outer < 0.0))
         return outer.masked_fill(leaves, 0.0), None, None
-
-    @staticmethod
-    def symbolic(graph: Any, values: Any, low: float, high: float) -> Any:
-        """Export as Clip, as torch's clamp is."""
-        bounds = (graph.op("Constant", value_t=torch.tensor(bound)) for bound in (low, high))
-        return graph.op("Clip", values, *bounds).setType(values.type())

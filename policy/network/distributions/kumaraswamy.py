@@ -7,6 +7,7 @@ from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from daedalus.policy.network.distributions.bounding import bounded
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.protocol.spaces import ContinuousSpace
 
@@ -58,7 +59,7 @@ class Kumaraswamy(Distribution):
         return (1.0 - 1.0 / b + (1.0 - 1.0 / a) * harmonic - a.log() - b.log() + math.log(2.0)).sum(-1)
 
     def _shapes(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        a, b = (1.0 + softplus(parameters)).clamp(max=_LARGEST).split(self._size, -1)
+        a, b = bounded(1.0 + softplus(parameters), 1.0, _LARGEST).split(self._size, -1)
         return a, b
 
 
