@@ -114,6 +114,7 @@ class LearnerService:
         self._annealing = Annealing(budget=spec.training.env_steps)
         if restored is not None:
             self._counters.restore(restored.counters)
+            self._counters.forget_target(restored.policy.spec.training, spec.training)
             self._annealing = _resumed_annealing(restored, spec)
         self.learner_epoch = epoch = secrets.randbits(62)
         self._evaluations = Evaluations(epoch, self._counters)
@@ -135,7 +136,7 @@ class LearnerService:
             orders=self._orders,
         )
         self._confirmation = None
-        if confirms:
+        if confirms and spec.training.stop_when_solved:
             self._confirmation = TargetConfirmation(
                 directory,
                 spec.training,
@@ -260,59 +261,53 @@ class LearnerService:
         """Run the main loop, then write the last metrics row, checkpoint and summary, and let the actors leave."""
         recorder = Recorder(self._open_writers, self._progress)
         self._reporter.begin(time.monotonic())
-        finished, saved, reached_at = False, None, None
+        finished, saved, ended = False, None, None
         try:
-            reached_at = self._loop(learner, checkpointer, recorder)
-            finished = self._is_finished(solved=reached_at is not None)
+            ended = self._loop(learner, checkpointer, recorder)
+            finished = self._is_finished()
         except RankLostError:
             if not self._stop.is_set():  # a signal may end all processes of the learner at once
                 raise
         finally:
-            ended = time.monotonic()
-            if reached_at is not None and self._spec.training.stop_when_solved:
-                ended = reached_at  # what follows is the confirmation, and no training
+            ended = ended or time.monotonic()
             try:
                 self._server.close(_FINISHED if finished else _STOPPED, finished=finished)
                 self._record(recorder, learner, ended, last=True)
                 recorder.close()
             finally:
                 saved = checkpointer.save(last=True)
-        solved = reached_at is not None
-        seconds_to_target = None if reached_at is None else self._reporter.wall_seconds(reached_at)
-        self._write_summary(solved, finished, seconds_to_target, ended)
+        self._write_summary(finished, ended)
         env_steps = f"{self._counters.env_steps:,} env_steps"
         if finished:
             self._server.await_departures(self._stop)
         elif saved is not None:
             _logger.info("stopped; checkpoint saved at %s: %s", env_steps, saved)
         return Outcome(
-            solved=solved,
+            solved=self._counters.seconds_to_target is not None,
             finished=finished,
             saved=saved is not None,
-            seconds_to_target=seconds_to_target,
+            seconds_to_target=self._counters.seconds_to_target,
             ordered=self._orders.stopped,
         )
 
-    def _is_finished(self, *, solved: bool) -> bool:
+    def _is_finished(self) -> bool:
         """Return whether the run is over, rather than stopped."""
-        training = self._spec.training
+        training, solved = self._spec.training, self._counters.seconds_to_target is not None
         return self._counters.env_steps >= training.env_steps or (solved and training.stop_when_solved)
 
-    def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float | None:
-        """Train until the run ends. Return when the target was reached, on the monotonic clock; None if it was not."""
-        training, service = self._spec.training, self._spec.service
-        reached_at = None
+    def _loop(self, learner: "Learner", checkpointer: "Checkpointer", recorder: Recorder) -> float:
+        """Train until the run ends. Return when training ended, on the monotonic clock: before the confirmation."""
+        training, service, counters = self._spec.training, self._spec.service, self._counters
         now = time.monotonic()
         log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
-        while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+        while not self._stop.is_set() and counters.env_steps < training.env_steps:
             self._beat()
             self._update(learner)
-            self._evaluation_server.serve(learner, checkpointer, self._counters.env_steps)
+            self._evaluation_server.serve(learner, checkpointer, counters.env_steps)
             now = time.monotonic()
-            if reached_at is None and self._counters.is_solved(training):
-                if not training.stop_when_solved:
-                    reached_at = now
-                elif self._is_confirmed(learner, checkpointer):
+            if self._reaches_target(learner, checkpointer):
+                counters.seconds_to_target = self._reporter.wall_seconds(now)
+                if training.stop_when_solved:
                     return now
             if now >= log_at:
                 self._record(recorder, learner, now)
@@ -322,10 +317,12 @@ class LearnerService:
             if now >= save_at or self._orders.take_checkpoint():
                 checkpointer.save()
                 save_at = time.monotonic() + service.checkpoint_seconds
-        return reached_at
+        return time.monotonic()
 
-    def _is_confirmed(self, learner: "Learner", checkpointer: "Checkpointer") -> bool:
-        """Return whether new episodes confirm the target, as far as there is a launcher that plays them."""
+    def _reaches_target(self, learner: "Learner", checkpointer: "Checkpointer") -> bool:
+        """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
+        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._spec.training):
+            return False
         return self._confirmation is None or self._confirmation.confirm(learner.policy_version, checkpointer)
 
     def _beat_without_updates(self) -> None:
@@ -378,8 +375,8 @@ class LearnerService:
     def _status(self) -> RunStatus:
         return self._reporter.status(self._server.rollouts.queue_bytes, time.monotonic())
 
-    def _write_summary(self, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> None:
-        content = self._reporter.summary(solved=solved, finished=finished, seconds_to_target=seconds_to_target, now=now)
+    def _write_summary(self, finished: bool, now: float) -> None:
+        content = self._reporter.summary(finished=finished, now=now)
         if self._confirmation is not None and (result := self._confirmation.result) is not None:
             content["confirmation"] = result
             content["confirmation_return_mean"] = result["return_mean"]

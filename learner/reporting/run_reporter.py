@@ -109,15 +109,13 @@ class RunReporter:
             now,
         )
 
-    def summary(self, *, solved: bool, finished: bool, seconds_to_target: float | None, now: float) -> dict[str, Any]:
+    def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
         """Return the content of summary.json. Its env_steps_per_second is over the training of this process."""
         return summary(
             self._run,
             self._spec,
             self._counters,
-            solved=solved,
             finished=finished,
-            seconds_to_target=seconds_to_target,
             wall_seconds=self.wall_seconds(now),
             env_steps_per_second=self._meter.overall(self._counters, now),
         )

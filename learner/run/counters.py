@@ -44,6 +44,7 @@ class RunCounters:
     snapshots_published: int = 0
     best_evaluation: float | None = None  # the highest mean return of an evaluation
     wall_seconds: float = 0.0  # of the learner processes before this one
+    seconds_to_target: float | None = None  # duration of the run until the target was reached; None if it was not
     returns: deque[float] = field(init=False)
     lengths: deque[int] = field(init=False)
     info: dict[str, deque[float]] = field(default_factory=dict)  # newest scalars of the environment; not saved
@@ -115,6 +116,15 @@ class RunCounters:
         self.lengths.clear()
         self.best_evaluation = None
 
+    def forget_target(self, before: TrainingSpec, training: TrainingSpec) -> None:
+        """Forget when the target was reached, where it has to be reached again under the settings of a resumed run.
+
+        Only a target at which training does not end, and which is the same as before, stays reached.
+        """
+        same = (before.target_return, before.target_episodes) == (training.target_return, training.target_episodes)
+        if training.stop_when_solved or not same:
+            self.seconds_to_target = None
+
     def state(self, wall_seconds: float) -> dict[str, Any]:
         """Return all counters as plain JSON values; `wall_seconds` is the duration of the whole run so far."""
         return {
@@ -122,6 +132,7 @@ class RunCounters:
             "rollouts_rejected": dict(self.rollouts_rejected),
             "best_evaluation": self.best_evaluation,
             "wall_seconds": wall_seconds,
+            "seconds_to_target": self.seconds_to_target,
             "returns": list(self.returns),
             "lengths": list(self.lengths),
         }
@@ -133,5 +144,6 @@ class RunCounters:
         self.rollouts_rejected = Counter(state["rollouts_rejected"])
         self.best_evaluation = state.get("best_evaluation")  # absent in checkpoints of earlier releases
         self.wall_seconds = state["wall_seconds"]
+        self.seconds_to_target = state.get("seconds_to_target")  # absent in checkpoints of earlier releases
         self.returns.extend(state["returns"])
         self.lengths.extend(state["lengths"])

@@ -8,6 +8,7 @@ import pytest
 from building import make_rollout, run_spec
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.uploads import Rollout
 
 
@@ -73,10 +74,30 @@ def test_an_evaluation_solves_a_run_only_where_actors_explore() -> None:
 
 def test_counters_of_an_earlier_release_are_restored() -> None:
     state = RunCounters(3).state(1.0)
-    del state["best_evaluation"], state["accepted_env_steps"]
+    del state["best_evaluation"], state["accepted_env_steps"], state["seconds_to_target"]
     counters = RunCounters(3)
     counters.restore(state)
-    assert (counters.best_evaluation, counters.accepted_env_steps) == (None, 0)
+    assert (counters.best_evaluation, counters.accepted_env_steps, counters.seconds_to_target) == (None, 0, None)
+
+
+@pytest.mark.parametrize(
+    ("changed", "kept"),
+    [
+        ({}, True),
+        ({"env_steps": 9}, True),
+        ({"stop_when_solved": True}, False),
+        ({"target_return": 6.0}, False),
+        ({"target_episodes": 4}, False),
+    ],
+)
+def test_target_has_to_be_reached_again_after_a_resume_where_it_is_another_or_ends_training(
+    changed: dict[str, Any], kept: bool
+) -> None:
+    before = TrainingSpec(stop_when_solved=False, target_return=5.0, target_episodes=3)
+    counters = RunCounters(3)
+    counters.seconds_to_target = 1.5
+    counters.forget_target(before, before.model_copy(update=changed))
+    assert counters.seconds_to_target == (1.5 if kept else None)
 
 
 def with_info(**values: tuple[float, ...]) -> Rollout:
@@ -112,6 +133,7 @@ def test_counters_restored_from_json_continue_equally() -> None:
         through.rollouts_rejected["stale"] += 1
         through.snapshots_published += 1
         through.evaluated(0.1 * number)
+    through.seconds_to_target = 7.5
     first.restore(json.loads(json.dumps(through.state(12.5))))
     assert first.wall_seconds == 12.5
     through.wall_seconds = 12.5

@@ -21,6 +21,7 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.service import ActorConfig, ActorService
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.finished import finished_run
 from daedalus.learner.service import LearnerService
 from daedalus.learner.training.checkpoint import Checkpoint, load_newest
@@ -422,6 +423,21 @@ def test_resuming_with_a_learning_rate_of_0_is_reported(tmp_path: Path) -> None:
 def budget(env_steps: int) -> dict[str, Any]:
     training = {"env_steps": env_steps, "stop_when_solved": False, "algorithm": "appo", **FEW_UPDATES}
     return {"training": training, "service": {**FAST, "keep_checkpoints": 99}}
+
+
+def test_resumed_run_remembers_when_it_reached_its_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def train(env_steps: int, restored: Checkpoint | None = None) -> dict[str, Any]:
+        settings = budget(env_steps)
+        settings["training"] |= {"target_return": 1.0, "target_episodes": 1}
+        TrainingRun(tmp_path, restored=restored, **settings).finish()
+        return json.loads((tmp_path / "run" / "summary.json").read_text())
+
+    before = train(400)
+    assert before["solved"]
+    monkeypatch.setattr(RunCounters, "is_solved", lambda *_: False)  # the newest episodes are worse than the target now
+    after = train(500, load_newest(tmp_path / "run"))
+    assert after["env_steps"] > before["env_steps"]
+    assert (after["solved"], after["seconds_to_target"]) == (True, before["seconds_to_target"])
 
 
 def test_the_restored_state_is_exact(tmp_path: Path) -> None:
