@@ -1,10 +1,10 @@
 """An encoder supplied by the user as `module:Class`: any torch.nn.Module that can be exported to ONNX.
 
 The class is constructed with one argument, the shape of an observation, frame stack included. It is called with
-observations [N, *shape], float32 or uint8, and returns features [N, F] float32. They are as the environment returns
-them, but `policy.normalize_observations` normalises float32 that are no image. If the observation has several
-components, it is constructed with a map of shapes, and called with a map of tensors; discrete components are int64
-[N, D].
+observations [N, *shape], float32 or uint8, and returns features [N, F] float32. Observations are as the environment
+returns them, but `policy.normalize_observations` normalises every float32 array. If the observation has several
+components, the class is constructed with a map of shapes, and called with a map of tensors; discrete components are
+int64 [N, D].
 """
 
 import torch
@@ -12,8 +12,10 @@ from torch import Tensor, nn
 
 from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spec import PolicySpec
 
 ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 
@@ -21,15 +23,16 @@ ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 class CustomEncoder(nn.Module):
     """The user's module, imported, constructed and checked."""
 
-    def __init__(self, name: str, spaces: ObservationSpaces, modules: UserModules) -> None:
+    def __init__(self, spec: PolicySpec, spaces: ObservationSpaces, modules: UserModules) -> None:
         """Raise NetworkError, naming the encoder, if it may not be imported, or cannot be constructed or called."""
         super().__init__()
+        name = spec.encoder
         self._only = next(iter(spaces)) if len(spaces) == 1 else None
         shapes = {component: space.stacked_shape for component, space in spaces.items()}
         contract = ""  # for errors of the class, not for those of its module
         try:
             encoder = find_class("policy.encoder", name, nn.Module, modules)
-            contract = f"; {_contract(spaces)}"
+            contract = f"; {_contract(spec, spaces)}"
             self.module = encoder(shapes if self._only is None else shapes[self._only])
             self.features = _checked_features(self.module, self._inputs(_zeros(spaces)))
         except UserModuleError as error:
@@ -58,9 +61,10 @@ def _zeros(spaces: ObservationSpaces) -> dict[str, Tensor]:
     }
 
 
-def _contract(spaces: ObservationSpaces) -> str:
+def _contract(spec: PolicySpec, spaces: ObservationSpaces) -> str:
     """Return the arguments of the constructor and of the calls."""
-    described = {name: _described(space) for name, space in spaces.items()}
+    normalized = normalized_components(spec, spaces)
+    described = {name: _described(space, is_normalized=name in normalized) for name, space in spaces.items()}
     if len(spaces) == 1:
         (space,), (text,) = spaces.values(), described.values()
         return f"it is constructed with the shape {space.stacked_shape}, and called with observations {text}"
@@ -68,13 +72,14 @@ def _contract(spaces: ObservationSpaces) -> str:
     return f"it is constructed with a dict of shapes by name, and called with a dict of observations: {parts}"
 
 
-def _described(space: ArraySpace | DiscreteSpace) -> str:
+def _described(space: ArraySpace | DiscreteSpace, *, is_normalized: bool) -> str:
     sizes = ", ".join(map(str, space.stacked_shape))
     if isinstance(space, DiscreteSpace):
         return f"[N, {sizes}] of {space.dtype}, numbers of choices from 0 on"
-    scale = "uint8 from 0 to 255, not scaled" if space.dtype == "uint8" else "float32"
+    values = "uint8 from 0 to 255" if space.dtype == "uint8" else "float32"
+    scale = "normalised by policy.normalize_observations" if is_normalized else "not scaled"
     stacked = f", {space.frames} frames first" if space.frames > 1 else ""
-    return f"[N, {sizes}] of {scale}, axes as in the environment{stacked}"
+    return f"[N, {sizes}] of {values}, {scale}, axes as in the environment{stacked}"
 
 
 def _checked_features(module: nn.Module, zeros: Tensor | dict[str, Tensor]) -> int:

@@ -93,7 +93,7 @@ def build_encoder(spec: PolicySpec, spaces: ObservationSpaces, modules: UserModu
     observations.
     """
     if ":" in spec.encoder:
-        return CustomEncoder(spec.encoder, spaces, modules)
+        return CustomEncoder(spec, spaces, modules)
     images = {name: space for name, space in spaces.items() if isinstance(space, ArraySpace) and space.is_image}
     if spec.encoder == "mlp" or (spec.encoder == "auto" and not images):
         return FlatEncoder(spaces, spec)

@@ -200,6 +200,27 @@ def test_the_error_of_an_encoder_states_its_input(build: Building) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("normalize", "numbers"), [(True, "normalised by policy.normalize_observations"), (False, "not scaled")]
+)
+def test_the_error_of_an_encoder_states_what_is_normalised(build: Building, normalize: bool, numbers: str) -> None:
+    arrays: dict[str, ArraySpace | DiscreteSpace] = {
+        "cells": ArraySpace(shape=(7, 7, 3), dtype="uint8"),
+        "depth": ArraySpace(shape=(20, 20), dtype="float32"),  # images are uint8
+    }
+    with pytest.raises(NetworkError) as caught:
+        build(
+            "class Net(nn.Module):\n    def __init__(self, shapes): raise ValueError",
+            Spaces(observations=arrays, actions=SPACES.actions),
+            normalize_observations=normalize,
+        )
+    assert str(caught.value).endswith(
+        "; it is constructed with a dict of shapes by name, and called with a dict of observations: "
+        "cells: [N, 7, 7, 3] of uint8 from 0 to 255, not scaled, axes as in the environment, "
+        f"depth: [N, 20, 20] of float32, {numbers}, axes as in the environment"
+    )
+
+
 FORWARD = """
 class Net(Base):
     def __init__(self, shape):
