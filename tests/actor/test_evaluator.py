@@ -95,10 +95,10 @@ def test_failure_of_an_evaluator_is_reported_to_its_learner(network: MemoryNetwo
 
 
 def test_evaluator_plays_as_many_episodes_as_the_run_says(network: MemoryNetwork) -> None:
-    learner = ScriptedLearner(network, run_spec(episodes=150))  # more than there are environments
+    learner = ScriptedLearner(network, run_spec(episodes=40))  # more than the 32 environments of training
     evaluator = RunningEvaluator(network)
     learner.give(learner.snapshot(0))
-    assert learner.receive_report().lengths.tolist() == [3] * 100 + [2] * 50
+    assert learner.receive_report().lengths.tolist() == [3] * 32 + [2] * 8
     evaluator.end(learner)
 
 
