@@ -253,8 +253,9 @@ def _listening_address(listen: str, tls: bool, insecure: bool) -> tuple[str, int
     host, colon, port = listen.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise AddressError(f"{listen!r} is not an address: write HOST:PORT, such as {LISTEN}")
+    checked = f"{'tls' if tls else 'tcp'}/{host}:{port if int(port) else 1}"  # with 0 the gateway names the one it got
     try:
-        check_listening([f"{'tls' if tls else 'tcp'}/{listen}"], tls=tls, insecure=insecure)
+        check_listening([checked], tls=tls, insecure=insecure)
     except AddressError:
         raise AddressError(
             f"{listen} is unencrypted and open to every host that can reach it: use --serve-tls (daedalus certs issue "

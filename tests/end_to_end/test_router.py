@@ -66,7 +66,7 @@ def test_router_and_exporter_accept_only_certificates_of_their_ca(start: Start, 
     ("arguments", "message"),
     [
         (("router", "--listen", "tcp/0.0.0.0:1"), "is unencrypted and open to every host"),
-        (("router", "--listen", "tls/127.0.0.1:0"), "needs certificates: --tls DIR"),
+        (("router", "--listen", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
         (("router", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
         (("exporter", "--connect", "tls/127.0.0.1:1"), "needs certificates: --tls DIR"),
     ],
