@@ -77,5 +77,5 @@ def test_the_agents_of_one_loop_are_one_actor(
     assert loop.wait() == 0, loop.output
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["env_steps"] >= 6_000
-    assert summary["episodes"] > 50
+    assert summary["episodes"] >= 6_000 // 500 - 3  # of at most 500 env_steps, and one of each agent has not ended
     assert summary["rollouts_rejected"].keys() <= {"stale"}
