@@ -2,14 +2,13 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.run.confirmation_file import ConfirmationFile
-from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
-from daedalus.protocol.spec import TrainingSpec
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
@@ -24,9 +23,7 @@ class TargetConfirmation:
 
     def __init__(
         self,
-        directory: Path,
-        training: TrainingSpec,
-        counters: RunCounters,
+        state: RunState,
         events: EventLog,
         stop: threading.Event,
         *,
@@ -36,15 +33,13 @@ class TargetConfirmation:
         """Construct the confirmation.
 
         Args:
-          directory: the run directory.
-          training: the target, and the number of episodes.
-          counters: their newest returns are forgotten when the target is not confirmed.
+          state: the target, and the counters, whose newest returns are forgotten when the target is not confirmed.
           events: receives each target that was reached, and what came of it.
           stop: event that ends the run, and the wait.
           lock: guards the counters.
           beat: called again and again during the wait, to show that this process works.
         """
-        self._file, self._training, self._counters = ConfirmationFile(directory), training, counters
+        self._file, self._state = ConfirmationFile(state.directory), state
         self._events, self._stop, self._lock, self._beat = events, stop, lock, beat
         self.result: dict[str, Any] | None = None  # of the new episodes that confirmed the target
 
@@ -56,10 +51,9 @@ class TargetConfirmation:
         """
         if checkpointer.save() is None:
             return True
-        episodes = f"{self._training.target_episodes} new episodes"
-        text = (
-            f"target {self._training.target_return:g} reached: the policy of this moment plays {episodes} to confirm it"
-        )
+        training = self._state.spec.training
+        episodes = f"{training.target_episodes} new episodes"
+        text = f"target {training.target_return:g} reached: the policy of this moment plays {episodes} to confirm it"
         self._events.add("target", text, cause=f"version {policy_version}")
         try:
             result = self._played_with(policy_version)
@@ -74,7 +68,7 @@ class TargetConfirmation:
             self.result = result
             return True
         with self._lock:
-            self._counters.forget_returns()
+            self._state.counters.forget_returns()
         if result is not None:
             text = f"not confirmed: return {result['return_mean']:.1f}; training continues"
             self._events.add("target", text, cause=f"result of version {policy_version}")
@@ -86,6 +80,7 @@ class TargetConfirmation:
             self._file.ask(policy_version)
             while (result := self._file.answered(policy_version)) is None and not self._stop.wait(_POLL_SECONDS):
                 self._beat()
+                self._state.health.updated = time.monotonic()  # it works, although it does not train
             return result
         finally:
             self._file.clear()

@@ -1,59 +1,19 @@
 """Metrics rows, status and summary of a run, from its counters and fleet. No I/O."""
 
-from collections.abc import Callable, Set
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from daedalus.learner.reporting.metrics import ENV
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.health import Health
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page, totals
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
-_STALLED_SECONDS = 60.0  # without an update for so long, the service has a problem
 # env_steps in each environment without the end of an episode after which a hint is given; the least in a small budget.
 _LONG_EPISODE, _USUAL_EPISODE = 10_000, 2_000
-_NO_ACTOR_SECONDS = 10.0  # without a live actor for so long, the service has a problem
-
-
-@dataclass(slots=True)
-class Health:
-    """Health of the learner process. Times are on the monotonic clock, in seconds."""
-
-    started: float
-    updated: float  # time of the last update, or the start
-    actor_seen: float  # last time with a live actor, or the start
-    saved: float | None = None  # time of the last checkpoint
-    save_fault: str = ""  # error of the last checkpoint, if it failed
-    left_out: Set[str] = frozenset()  # names of the live actors that no batch waits for
-    gradient_fault: bool = False  # whether the last update was skipped
-    # Days until the certificate of this process expires, or None without one.
-    certificate_days_left: Callable[[], float | None] = lambda: None
-
-    def problems(self, now: float, live: int) -> tuple[str, ...]:
-        """Return descriptions of the problems, most severe first; empty if the service is healthy.
-
-        Args:
-          now: time on the monotonic clock, in seconds.
-          live: number of live actors.
-        """
-        found = []
-        if not live and now - self.actor_seen > _NO_ACTOR_SECONDS:
-            found.append(f"no live actor for {now - self.actor_seen:.0f} s")
-        elif now - self.updated > _STALLED_SECONDS:
-            found.append(f"no update for {now - self.updated:.0f} s")
-        if self.left_out:
-            names = sorted(self.left_out)
-            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            found.append(f"batches do not wait for {', '.join(names[:5])}{more}: connected, but without rollouts")
-        if self.gradient_fault:
-            found.append("updates are skipped: the gradient is not finite")
-        if self.save_fault:
-            found.append(f"checkpoints cannot be saved: {self.save_fault}")
-        return tuple(found)
 
 
 class RateMeter:

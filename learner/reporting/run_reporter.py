@@ -5,13 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 from daedalus.learner.reporting.learning_hint import LearningHint
 from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.report import EpisodeHint, Health, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.report import EpisodeHint, RateMeter, metrics_row, run_status, summary
 from daedalus.learner.reporting.user_metrics import UserMetrics
-from daedalus.learner.run.annealing import Annealing
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.fleet import Fleet
-from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.status import RunStatus
 
 if TYPE_CHECKING:
@@ -23,58 +20,40 @@ class RunReporter:
 
     def __init__(
         self,
-        run: str,
-        spec: RunSpec,
-        learner_epoch: int,
-        *,
-        counters: RunCounters,
-        annealing: Annealing,
+        state: RunState,
         fleet: Fleet,
         lock: threading.Condition,
-        evaluations: Evaluations,
-        health: Health,
-        started: float,
         user_metrics: UserMetrics,
     ) -> None:
-        """Construct the reporter. `lock` guards counters and fleet; `started` is on the monotonic clock, in seconds."""
-        self._run, self._spec, self._epoch = run, spec, learner_epoch
-        self._counters, self._annealing, self._fleet, self._lock = counters, annealing, fleet, lock
-        self._evaluations, self._health, self._started = evaluations, health, started
-        self._meter = RateMeter(counters, started)
-        self._episode_hint = EpisodeHint(spec.training.env_steps)
-        self._learning_hint = LearningHint(spec.training.env_steps, normalizes_rewards=spec.training.normalize_rewards)
+        """Construct the reporter. `lock` guards the counters and the fleet."""
+        self._state, self._counters, self._fleet, self._lock = state, state.counters, fleet, lock
         self._user_metrics = user_metrics
+        training = state.spec.training
+        self._meter = RateMeter(self._counters, state.health.started)
+        self._episode_hint = EpisodeHint(training.env_steps)
+        self._learning_hint = LearningHint(training.env_steps, normalizes_rewards=training.normalize_rewards)
 
     def begin(self, now: float) -> None:
         """Start to measure rates, at the begin of training."""
         self._meter = RateMeter(self._counters, now)
-        self._health.updated = self._health.actor_seen = now
-
-    def wall_seconds(self, now: float) -> float:
-        """Return the duration of the run in seconds, including the processes before a resume."""
-        return self._counters.wall_seconds + now - self._started
-
-    def counters_state(self, now: float) -> dict[str, Any]:
-        """Return the counters in the form that a checkpoint stores."""
-        with self._lock:
-            return {**self._counters.state(self.wall_seconds(now)), "annealing": self._annealing.state()}
+        self._state.health.updated = self._state.health.actor_seen = now
 
     def row(self, learner: "Learner", now: float, *, last: bool = False) -> dict[str, float]:
         """Return a metrics row, with rates and means since the previous row. `last` marks that of a stop."""
         learned = {**learner.metrics.take_means(), **learner.take_diagnostics()}
         with self._lock:
-            progress = self._annealing.at(self._counters.env_steps)
+            progress = self._state.progress
             rates = self._meter.measure(self._counters, self._fleet, now, last=last)
             if self._fleet.live:
-                self._health.actor_seen = now
+                self._state.health.actor_seen = now
             learning = {
                 **learned,
-                **self._evaluations.take_newest(),
+                **self._state.evaluations.take_newest(),
                 "learning_rate": learner.learning_rate(progress),
                 "entropy_bonus": learner.entropy_bonus(progress),
                 **self._user_metrics.take(),
             }
-            row = metrics_row(self._counters, self._fleet, rates, learning, self.wall_seconds(now))
+            row = metrics_row(self._counters, self._fleet, rates, learning, self._state.wall_seconds(now))
         self._learning_hint.add(row)
         return row
 
@@ -98,13 +77,13 @@ class RunReporter:
     def status(self, queue_bytes: int, now: float) -> RunStatus:
         """Return the answer to a status query. The caller holds the lock."""
         return run_status(
-            self._run,
-            self._epoch,
-            self._spec,
+            self._state.name,
+            self._state.learner_epoch,
+            self._state.spec,
             self._counters,
             self._fleet,
             self._meter.rates,
-            self._health,
+            self._state.health,
             queue_bytes,
             now,
         )
@@ -112,10 +91,10 @@ class RunReporter:
     def summary(self, *, finished: bool, now: float) -> dict[str, Any]:
         """Return the content of summary.json. Its env_steps_per_second is over the training of this process."""
         return summary(
-            self._run,
-            self._spec,
+            self._state.name,
+            self._state.spec,
             self._counters,
             finished=finished,
-            wall_seconds=self.wall_seconds(now),
+            wall_seconds=self._state.wall_seconds(now),
             env_steps_per_second=self._meter.overall(self._counters, now),
         )

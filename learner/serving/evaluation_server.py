@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from daedalus.learner.run.evaluations import Evaluations
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
-from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Refusal

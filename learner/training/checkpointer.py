@@ -1,18 +1,15 @@
 """Saving of checkpoints during training. A disk error is logged as a warning and does not end the run."""
 
 import logging
+import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from daedalus.learner.reporting.report import Health
-from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.spaces import Spaces
-from daedalus.protocol.spec import RunSpec
 
 _logger = logging.getLogger(__name__)
 
@@ -22,32 +19,26 @@ class Checkpointer:
 
     def __init__(
         self,
-        directory: Path,
-        spec: RunSpec,
-        spaces: Spaces,
+        state: RunState,
         learner: Learner,
         program: bytes,
+        spaces: Spaces,
         *,
-        counters: Callable[[], dict[str, Any]],
-        evaluations: Evaluations,
-        health: Health,
         events: EventLog,
+        lock: threading.Condition,
     ) -> None:
         """Construct the checkpointer.
 
         Args:
-          directory: the run directory.
-          spec, spaces, program: content of every checkpoint.
+          state: the counters and settings to save. Checkpoints that are being evaluated are not pruned.
           learner: source of the parameters and the optimiser state.
-          counters: function that returns the current counters of the run.
-          evaluations: checkpoints that are being evaluated are not pruned.
-          health: record of the last saved checkpoint and of the last error.
+          program, spaces: content of every checkpoint.
           events: receives each saved checkpoint and each error.
+          lock: guards the counters.
         """
-        self._directory, self._spec, self._spaces = directory, spec, spaces
-        self._learner, self._program = learner, program
-        self._counters, self._evaluations, self._health = counters, evaluations, health
-        self._events = events
+        self._state, self._spec, self._health = state, state.spec, state.health
+        self._learner, self._program, self._spaces = learner, program, spaces
+        self._events, self._lock = events, lock
         self._newest: tuple[int, Path] | None = None  # policy version and directory of the last checkpoint
 
     def ensure_saved(self) -> Path | None:
@@ -60,10 +51,11 @@ class Checkpointer:
 
     def save(self, *, last: bool = False) -> Path | None:
         """Save a checkpoint and return its directory, or None on a disk error; `last` is that of this process."""
-        counters = self._counters()
+        with self._lock:
+            counters = self._state.saved(time.monotonic())
         try:
             directory = save_checkpoint(
-                self._directory,
+                self._state.directory,
                 spec=self._spec,
                 spaces=self._spaces,
                 policy_version=self._learner.policy_version,
@@ -72,7 +64,7 @@ class Checkpointer:
                 state=self._learner.state(),
                 counters=counters,
                 keep=self._spec.service.keep_checkpoints,
-                also_keep=self._evaluations.checkpoints_in_use,
+                also_keep=self._state.evaluations.checkpoints_in_use,
             )
         except OSError as error:
             fault = error.strerror or type(error).__name__

@@ -15,6 +15,7 @@ from daedalus.cli.status_query import ask, ask_events, fleet_size
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.health import Health
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -50,7 +51,7 @@ def operator() -> MemoryTransport:
 def server(operator: MemoryTransport) -> Iterator[ActorServer]:
     """Server with many actors, half of which are present."""
     spec, counters = run_spec(), RunCounters(10)
-    health = report.Health(started=0.0, updated=0.0, actor_seen=0.0)
+    health = Health(started=0.0, updated=0.0, actor_seen=0.0)
 
     def status() -> RunStatus:
         return report.run_status("r", EPOCH, spec, counters, opened.fleet, {}, health, 0, 1.0)

@@ -1,14 +1,13 @@
 """learner/training/checkpointer.py: each policy version is saved once for evaluations."""
 
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
-from building import EPOCH, POLICY, SPACES, make_rollouts, run_spec
+from building import POLICY, SPACES, make_rollouts, run_spec
 
-from daedalus.learner.reporting.report import Health
-from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.evaluations import Evaluations
+from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpointer import Checkpointer
 from daedalus.learner.training.learner import Learner
@@ -23,17 +22,8 @@ def written(directory: Path) -> int:
 
 def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
     learner = Learner(TrainingSpec(), POLICY, SPACES)
-    checkpointer = Checkpointer(
-        tmp_path,
-        run_spec(),
-        SPACES,
-        learner,
-        b"program",
-        counters=lambda: RunCounters(10).state(0.0),
-        evaluations=Evaluations(EPOCH, RunCounters(10)),
-        health=Health(started=0.0, updated=0.0, actor_seen=0.0),
-        events=EventLog(),
-    )
+    state = RunState(tmp_path, run_spec(), started=0.0)
+    checkpointer = Checkpointer(state, learner, b"program", SPACES, events=EventLog(), lock=threading.Condition())
     first = checkpointer.ensure_saved()
     assert first is not None
     before = written(first)
@@ -49,18 +39,9 @@ def test_a_version_is_saved_once_for_evaluations(tmp_path: Path) -> None:
 
 
 def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    events, health = EventLog(), Health(started=0.0, updated=0.0, actor_seen=0.0)
-    checkpointer = Checkpointer(
-        tmp_path,
-        run_spec(),
-        SPACES,
-        Learner(TrainingSpec(), POLICY, SPACES),
-        b"program",
-        counters=lambda: RunCounters(10).state(0.0),
-        evaluations=Evaluations(EPOCH, RunCounters(10)),
-        health=health,
-        events=events,
-    )
+    events, state = EventLog(), RunState(tmp_path, run_spec(), started=0.0)
+    learner, health = Learner(TrainingSpec(), POLICY, SPACES), state.health
+    checkpointer = Checkpointer(state, learner, b"program", SPACES, events=events, lock=threading.Condition())
     (tmp_path / "checkpoints").write_text("in the way")
     assert checkpointer.ensure_saved() is None
     assert health.save_fault

@@ -8,9 +8,9 @@ import pytest
 from building import EPOCH, SPACES, run_spec
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.evaluations import Evaluations
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.serving.evaluation_server import EvaluationServer
-from daedalus.learner.serving.evaluations import Evaluations
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import Limits

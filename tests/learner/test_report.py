@@ -12,7 +12,6 @@ from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
 from daedalus.learner.reporting.report import (
     EpisodeHint,
-    Health,
     RateMeter,
     episode_statistics,
     metrics_row,
@@ -20,6 +19,7 @@ from daedalus.learner.reporting.report import (
     summary,
 )
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.health import Health
 from daedalus.learner.training.update_metrics import METRICS
 
 DIAGNOSTICS = (

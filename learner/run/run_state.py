@@ -1,0 +1,74 @@
+"""State of a run that the parts of a learner process share. No I/O."""
+
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from daedalus.learner.run.annealing import Annealing
+from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.evaluations import Evaluations
+from daedalus.learner.run.health import Health
+from daedalus.protocol.spec import RunSpec
+
+
+class RunState:
+    """How far one run has come, and how its learner process is.
+
+    Attributes:
+      directory: the run directory.
+      spec: specification of the run.
+      learner_epoch: epoch of this learner process.
+      counters: the lock of the actor server guards them.
+      annealing: progress of the annealed settings.
+      evaluations: evaluations in progress, and the newest result.
+      health: what the status reports as problems.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        spec: RunSpec,
+        started: float,
+        certificate_days_left: Callable[[], float | None] = lambda: None,
+    ) -> None:
+        """Begin a run. `started` is on the monotonic clock, in seconds; for the last argument see Health."""
+        self.directory, self.spec, self._started = directory, spec, started
+        self.learner_epoch = secrets.randbits(62)
+        self.counters = RunCounters(spec.training.target_episodes)
+        self.annealing = Annealing(budget=spec.training.env_steps)
+        self.evaluations = Evaluations(self.learner_epoch, self.counters)
+        self.health = Health(
+            started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the run."""
+        return self.directory.name
+
+    @property
+    def progress(self) -> float:
+        """Progress of the annealed settings, from 0 to 1."""
+        return self.annealing.at(self.counters.env_steps)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has used its budget, or reached a target at which it stops."""
+        training, solved = self.spec.training, self.counters.seconds_to_target is not None
+        return self.counters.env_steps >= training.env_steps or (solved and training.stop_when_solved)
+
+    def wall_seconds(self, now: float) -> float:
+        """Return the duration of the run in seconds, including the processes before a resume."""
+        return self.counters.wall_seconds + now - self._started
+
+    def saved(self, now: float) -> dict[str, Any]:
+        """Return the counters in the form that a checkpoint stores."""
+        return {**self.counters.state(self.wall_seconds(now)), "annealing": self.annealing.state()}
+
+    def restore(self, saved: dict[str, Any], before: RunSpec) -> None:
+        """Continue from a result of `saved`, perhaps with other settings than those of the run `before`."""
+        self.counters.restore(saved)
+        self.counters.forget_target(before.training, self.spec.training)
+        annealing = Annealing(**saved.get("annealing", {"budget": before.training.env_steps}))  # absent in early ones
+        self.annealing = annealing.resumed(self.counters.env_steps, self.spec.training.env_steps)

@@ -1,0 +1,124 @@
+"""The main loop of a learner process: update after update, and between them all that the learner's thread does."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from daedalus.learner.reporting.run_records import RunRecords
+from daedalus.learner.run.run_state import RunState
+from daedalus.learner.serving.actor_server import ActorServer
+from daedalus.learner.serving.evaluation_server import EvaluationServer
+from daedalus.learner.serving.orders import Orders
+from daedalus.learner.target_confirmation import TargetConfirmation
+from daedalus.learner.training.checkpointer import Checkpointer
+from daedalus.learner.training.learner import Learner
+from daedalus.protocol.uploads import Gradient, Rollout, Upload
+
+_logger = logging.getLogger(__name__)
+
+
+class TrainingLoop:
+    """Loop of one run: updates; between them it serves evaluators, records metrics, saves checkpoints, obeys orders."""
+
+    def __init__(
+        self,
+        state: RunState,
+        server: ActorServer,
+        learner: Learner,
+        checkpointer: Checkpointer,
+        *,
+        orders: Orders,
+        confirmation: TargetConfirmation | None,
+        stop: threading.Event,
+        beat: Callable[[], None],
+    ) -> None:
+        """Construct the loop.
+
+        Args:
+          state: progress of the run.
+          server: source of the rollouts; publishes the policy.
+          learner: makes the updates.
+          checkpointer: saves them.
+          orders: of operators.
+          confirmation: confirms that the target is reached; None: it needs no confirmation.
+          stop: event that ends the run.
+          beat: called before each update, and while there is no batch.
+        """
+        self._state, self._counters, self._health = state, state.counters, state.health
+        self._server, self._learner, self._checkpointer = server, learner, checkpointer
+        self._orders, self._confirmation, self._stop, self._beat = orders, confirmation, stop, beat
+        self._evaluators = EvaluationServer(server.evaluations, state.evaluations, server.publisher)
+
+    def publish(self, program: bytes) -> None:
+        """Offer the policy to the actors, before the first update."""
+        learner = self._learner
+        self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
+        self._add_gradient_inputs()
+        self._server.publisher.publish(learner.policy_version, learner.weights())
+
+    def run(self, records: RunRecords) -> float:
+        """Train until the target is reached, the budget is used or the stop event is set.
+
+        Return when training ended, on the monotonic clock: before the target was confirmed.
+        """
+        training, service = self._state.spec.training, self._state.spec.service
+        now = time.monotonic()
+        log_at, save_at = now + service.log_seconds, now + service.checkpoint_seconds
+        while not self._stop.is_set() and self._counters.env_steps < training.env_steps:
+            self._beat()
+            self._update()
+            self._evaluators.serve(self._learner, self._checkpointer, self._counters.env_steps)
+            now = time.monotonic()
+            if self._reaches_target():
+                self._counters.seconds_to_target = self._state.wall_seconds(now)
+                if training.stop_when_solved:
+                    return now
+            if now >= log_at:
+                records.record(self._learner, now)
+                log_at = now + service.log_seconds
+            if now >= save_at or self._orders.take_checkpoint():
+                self._checkpointer.save()
+                save_at = time.monotonic() + service.checkpoint_seconds
+        return time.monotonic()
+
+    def _reaches_target(self) -> bool:
+        """Return whether the target is reached for the first time, and new episodes confirm it if they are played."""
+        if self._counters.seconds_to_target is not None or not self._counters.is_solved(self._state.spec.training):
+            return False
+        confirmation, version = self._confirmation, self._learner.policy_version
+        return confirmation is None or confirmation.confirm(version, self._checkpointer)
+
+    def _update(self) -> None:
+        """Train on one batch and publish the result. Return without an update if no batch is complete soon."""
+        learner, rollouts = self._learner, self._server.rollouts
+        env_steps, progress = self._counters.env_steps, self._state.progress
+        batch = rollouts.take_batch(learner.policy_version)
+        self._health.left_out = rollouts.left_out
+        if not batch:
+            return
+        skipped = learner.updates_skipped
+        left_out = self._learn_from(batch, progress)
+        learner.anneal_exploration(self._state.spec.training.exploration_annealing(progress, env_steps))
+        self._add_gradient_inputs()
+        self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(batch))
+        rollouts.count_trained(batch, left_out)
+        self._health.updated = self._health.actor_seen = time.monotonic()
+        skipped = learner.updates_skipped - skipped
+        if skipped and not self._health.gradient_fault:
+            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
+        self._health.gradient_fault = skipped > 0
+        self._counters.updates_skipped += skipped
+
+    def _learn_from(self, uploads: Sequence[Upload], progress: float) -> list[Upload]:
+        """Train on one batch. Return the rollouts that were left out; gradients were checked before."""
+        gradients = [upload for upload in uploads if isinstance(upload, Gradient)]
+        if gradients:
+            self._learner.apply(gradients, progress)
+            return []
+        return [*self._learner.step([upload for upload in uploads if isinstance(upload, Rollout)], progress)]
+
+    def _add_gradient_inputs(self) -> None:
+        """Let the next snapshots carry what actors need to compute gradients, if they do."""
+        if self._state.spec.uploads_gradients:
+            self._server.publisher.extras = self._learner.gradient_inputs(self._state.progress)
