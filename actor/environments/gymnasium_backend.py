@@ -27,6 +27,8 @@ from daedalus.protocol.spec import EnvironmentSpec
 # Packages that register environments when they are imported: beginning of the id -> module and extra.
 _PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
 _OLD_ATARI = ("-v0", "-v4")  # versions of Atari's games under names without ALE/, such as PongNoFrameskip-v4
+# Arguments of the constructor that change an Atari game, by the same names on all backends. ALE's own has no modes.
+_ATARI_GAME_KWARGS = ("repeat_action_probability", "full_action_space", "mode", "difficulty")
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
@@ -177,7 +179,8 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
 def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
     """Return the specification for an evaluation on gymnasium's implementation of the environment.
 
-    Atari games of the other backends have another name there, and repeat actions unless told not to.
+    Atari games of the other backends have another name there, and repeat actions unless told not to. Of their `kwargs`
+    those are kept that all backends have.
     """
     evaluated = spec.as_evaluated("gymnasium")
     if spec.backend == "gymnasium":
@@ -187,7 +190,8 @@ def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
         gymnasium.register_envs(importlib.import_module("ale_py"))
     if atari_id not in gymnasium.registry:
         return evaluated
-    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0}  # as the others have it by default
+    same_game = {name: value for name, value in evaluated.kwargs.items() if name in _ATARI_GAME_KWARGS}
+    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0, **same_game}  # the defaults of the other backends
     return evaluated.model_copy(update={"id": atari_id, "kwargs": kwargs})
 
 

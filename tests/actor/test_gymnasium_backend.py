@@ -20,7 +20,7 @@ from plain import PlainEnvironments, choices
 from daedalus.actor.environments import environment_processes, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
-from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, make_gymnasium
+from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium, make_gymnasium
 from daedalus.actor.environments.wrappers import RepeatedSteps
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
@@ -469,6 +469,16 @@ def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
     plain = make_environments(EnvironmentSpec(id="ALE/Pong-v5"), 1)
     assert plain.spaces.observations["observation"].shape == (210, 160, 3)
     plain.close()
+
+
+def test_an_atari_game_of_another_backend_is_the_same_game_on_gymnasium() -> None:
+    pytest.importorskip("ale_py")
+    kwargs = {"repeat_action_probability": 0.25, "full_action_space": True, "noop_max": 1}
+    spec = as_on_gymnasium(EnvironmentSpec(id="Pong-v5", backend="envpool", kwargs=kwargs, action_repeat=4))
+    assert spec.kwargs == {"frameskip": 1, "repeat_action_probability": 0.25, "full_action_space": True}
+    environments = make_environments(spec, 1)
+    assert choices(environments.spaces) == 18
+    environments.close()
 
 
 @pytest.mark.parametrize("name", ["PongNoFrameskip-v4", "Pong-v0"])
