@@ -295,8 +295,8 @@ def watch(
     """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
 
     The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training, or UNSAVED. Raises
-    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the episodes
-    that are to confirm the target cannot be played.
+    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the result of a
+    confirmation cannot be saved.
     """
     record = EventFile(run.directory)
     while not stopping.wait(_POLL_SECONDS):

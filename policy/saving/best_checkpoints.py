@@ -1,10 +1,11 @@
 """The best checkpoints of a run: those with the highest scores, named by their score. Functions on directories."""
 
 import math
-import os
 import re
 import shutil
 from pathlib import Path
+
+from daedalus.policy.saving.sealed import link_sealed
 
 _BEST = re.compile(r"best_(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)_(\d{10,})", re.ASCII)
 _KEPT = 3  # scores over few episodes are noisy: with several, the best can be selected over more episodes
@@ -49,7 +50,7 @@ def keep_if_best(checkpoint: Path, score: float, policy_version: int) -> bool:
     rank = sum(_score_and_version(other) > (score, policy_version) for other in kept)
     if rank >= _KEPT or any(_score_and_version(other)[1] == policy_version for other in kept):
         return False
-    _link(checkpoint, target)
+    link_sealed(checkpoint, target)
     for other in kept[_KEPT - 1 :]:
         shutil.rmtree(other, ignore_errors=True)
     return rank == 0
@@ -59,31 +60,10 @@ def rescore(checkpoint: Path, score: float, policy_version: int) -> Path:
     """Give a checkpoint another score and return its new path. Raises OSError if writing fails."""
     target = checkpoint.with_name(best_name(score, policy_version))
     if target != checkpoint:
-        _link(checkpoint, target)
+        link_sealed(checkpoint, target)
         if is_best(checkpoint):
             shutil.rmtree(checkpoint, ignore_errors=True)
     return target
-
-
-def _link(checkpoint: Path, target: Path) -> None:
-    """Create `target` with the files of `checkpoint`, atomically. Raises OSError if writing fails."""
-    partial = target.with_name(f".{target.name}")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir()
-        for file in checkpoint.iterdir():
-            _link_or_copy(file, partial / file.name)
-        os.replace(partial, target)
-    except OSError:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
-def _link_or_copy(file: Path, target: Path) -> None:
-    try:
-        os.link(file, target)
-    except OSError:  # exFAT and many FUSE file systems have no hard links
-        shutil.copyfile(file, target)
 
 
 def _score_and_version(directory: Path) -> tuple[float, int]:

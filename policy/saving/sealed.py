@@ -52,6 +52,28 @@ def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, An
         raise
 
 
+def link_sealed(directory: Path, target: Path) -> None:
+    """Create `target` with the files of a sealed directory, atomically; as hard links where the file system has them.
+
+    Raises OSError if writing fails; then no partial directory remains.
+    """
+    partial = target.with_name(f".{target.name}")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir()
+        for file in directory.iterdir():
+            try:
+                os.link(file, partial / file.name)
+            except OSError:  # exFAT and many FUSE file systems have no hard links
+                _write_synced(partial / file.name, file.read_bytes())
+        _sync_directory(partial)
+        os.replace(partial, target)
+        _sync_directory(target.parent)
+    except OSError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
 def _move_into_place(partial: Path, directory: Path) -> None:
     """Rename `partial` to `directory`; restore an existing directory of that name if renaming fails."""
     if not directory.exists():

@@ -92,13 +92,16 @@ def test_checkpoint_is_copied_on_a_file_system_without_hard_links(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "link", no_links)
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", synced.append)
     directory = checkpoint(tmp_path, 1)
     assert keep_if_best(directory, 5.0, 1)
+    assert len(synced) == len([*directory.iterdir()]) + 2  # its files and both directories
     assert rescore(best_checkpoints(tmp_path)[0], 6.0, 1).name == "best_6.0_0000000001"
     assert scored(tmp_path) == [(6.0, "1")]
 
 
-@pytest.mark.parametrize("failing", ["shutil.copyfile", "os.replace"])
+@pytest.mark.parametrize("failing", ["os.fsync", "os.replace"])
 def test_checkpoint_that_cannot_be_kept_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
