@@ -20,6 +20,7 @@ from daedalus.cli.logs import add_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
+from daedalus.learner.run.changes import differing, fixed_changes
 from daedalus.learner.run.default_settings import default_settings
 from daedalus.learner.run.settings import SettingsError, choose_algorithm, override, preset_names, read_preset, run_spec
 from daedalus.policy.user_modules import UserModules, modules_of
@@ -42,6 +43,7 @@ examples:
   daedalus learner cartpole --connect tcp/router:7447
   daedalus learner car_racing_article --processes 2
   daedalus learner cartpole --run-dir runs/mine --resume      (the same line for each start by systemd or Kubernetes)
+  daedalus learner --run-dir runs/mine --resume --env-steps 3000000      (the whole budget, with the steps already done)
 
 exit status: 0 the target was reached, all steps were done without a target to stop at, or a signal stopped the learner
 and its checkpoint is saved; 3 the budget was used up before the target; 1 failed; 2 bad usage"""
@@ -224,6 +226,7 @@ class ChosenRun:
     spec: RunSpec
     directory: Path
     exists: bool  # whether the run directory was created before
+    changed: list[str]  # settings of a run that exists, which the command line changes
     modules: UserModules  # that the learner may import
 
 
@@ -238,20 +241,36 @@ def choose_run(arguments: argparse.Namespace) -> ChosenRun:
     if directory is None:
         spec, directory = resolve(arguments)
         run_directory.check_free(directory)
+        changed = []
     else:
-        spec = run_directory.read_config(directory)
-        # The settings that --env begins with depend on the environment, which need not be made for this.
-        if named and resolve_spec(arguments, spec.model_dump(mode="json", exclude_none=True)) != spec:
-            raise SettingsError(
-                f"the run in {directory} has other settings: leave out PRESET, --env and all settings to continue it, "
-                "or name another --run-dir"
-            )
+        before = run_directory.read_config(directory)
+        spec = _resumed_spec(before, arguments, directory)
+        changed = differing(before, spec)
     own = modules_of(spec.user_modules) if named else []
     modules = UserModules(frozenset({*arguments.allow_module, *own}), str(directory / run_directory.CONFIG))
     modules.check(spec.learner_modules)  # the learner makes no environment
     spec = with_record(spec, modules)
     exists = (directory / run_directory.CONFIG).exists()
-    return ChosenRun(spec=spec, directory=directory, exists=exists, modules=modules)
+    return ChosenRun(spec=spec, directory=directory, exists=exists, changed=changed, modules=modules)
+
+
+def _resumed_spec(before: RunSpec, arguments: argparse.Namespace, directory: Path) -> RunSpec:
+    """Return the specification of the run in `directory` with the settings that the command line changes.
+
+    A preset must be that of the run. Raises SettingsError.
+    """
+    config = str(directory / run_directory.CONFIG)
+    changes = argparse.Namespace(**{**vars(arguments), "preset": config, "env": None})
+    named = arguments.preset is not None or arguments.env is not None
+    # The settings that --env begins with depend on the environment, which need not be made for this.
+    spec = resolve_spec(arguments if named else changes, before.model_dump(mode="json", exclude_none=True))
+    other = fixed_changes(before, spec) or differing(resolve_spec(changes), spec)
+    if other:
+        raise SettingsError(
+            f"the run in {directory} has other settings ({', '.join(other)}): leave out PRESET, --env and all settings "
+            "to continue it, or name another --run-dir"
+        )
+    return spec
 
 
 def _directory_to_resume(arguments: argparse.Namespace) -> Path | None:
@@ -280,7 +299,7 @@ def learner_parser() -> argparse.ArgumentParser:
         "--resume",
         action="store_true",
         help="continue the run in --run-dir from its newest checkpoint, or start the run if there is none. "
-        "For a supervisor that repeats the same command",
+        "For a supervisor that repeats the same command. Another --env-steps or --set changes the run from then on",
     )
     add_processes(options)
     add_allow_module(options, "config.toml of an existing run")

@@ -162,6 +162,9 @@ def _serve(
         _logger.info("nothing to do: %s", finished.reason)
         ranks.dismiss(run.spec, stop)
         return NOT_REACHED if finished.missed else REACHED
+    if run.changed:
+        _logger.info("settings of the run changed: %s", ", ".join(run.changed))
+        run_directory.write_config(run.directory, run.spec)
     restored = _newest_checkpoint(run.directory) if resumed else None
     spaces = arguments.spaces
     if restored is None and arguments.prepared is None:

@@ -24,9 +24,7 @@ def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> 
     settings = spec.model_dump(mode="json", exclude_none=True)
     override(settings, assignments)
     changed = run_spec(settings)
-    before, after = _values(spec), _values(changed)
-    fixed = [name for name in after if after[name] != before[name] and _is_fixed(name)]
-    if fixed:
+    if fixed := fixed_changes(spec, changed):
         changes = [word for assignment in assignments for word in ("--set", assignment)]
         words = ["daedalus", "train", f"{directory}/config.toml", "--init-from", str(directory), *changes]
         raise SettingsError(
@@ -34,6 +32,17 @@ def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> 
             f"such as with: {shlex.join(words)}"
         )
     return changed
+
+
+def fixed_changes(before: RunSpec, after: RunSpec) -> list[str]:
+    """Return the settings that differ and cannot change when a run is resumed, as `section.key`."""
+    return [name for name in differing(before, after) if _is_fixed(name)]
+
+
+def differing(before: RunSpec, after: RunSpec) -> list[str]:
+    """Return the settings in which two specifications differ, as `section.key`."""
+    old = _values(before)
+    return [name for name, value in _values(after).items() if value != old[name]]
 
 
 def _is_fixed(name: str) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from daedalus.cli.commands.train import resume_parser, train_parser
-from daedalus.cli.settings_arguments import learner_parser, resolve
+from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 
@@ -66,3 +66,26 @@ def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they
     assert (spec.training.passes, spec.training.minibatches) == (2, 4)
     spec, _ = resolve(learner_parser().parse_args(words[:2]))
     assert (spec.training.passes, spec.collection.rollout_length) == (10, 128)
+
+
+def test_a_learner_that_resumes_changes_the_settings_that_its_command_line_names(tmp_path: Path) -> None:
+    spec, _ = resolve(learner_parser().parse_args(["cartpole", "--set", "training.learning_rate=0.5"]))
+    run_directory.create(tmp_path / "run", spec)
+
+    def resumed(*words: str) -> ChosenRun:
+        return choose_run(learner_parser().parse_args([*words, "--run-dir", str(tmp_path / "run"), "--resume"]))
+
+    same = ("cartpole", "--set", "training.learning_rate=0.5")
+    for words in ((), same, ("--env", "CartPole-v1")):
+        assert (resumed(*words).spec, resumed(*words).changed) == (spec, [])
+        longer = resumed(*words, "--env-steps", "9e6")
+        assert longer.spec.training == spec.training.model_copy(update={"env_steps": 9_000_000})
+        assert longer.changed == ["training.env_steps"]
+    for words, names in (
+        (("--seed", "9"), "training.seed"),
+        (("cartpole", "--algorithm", "a2c", "--set", "policy.hidden=[3]"), "policy.hidden, training.algorithm.*"),
+        (("cartpole",), "training.learning_rate"),
+        (("--env", "Acrobot-v1"), "environment.id"),
+    ):
+        with pytest.raises(SettingsError, match=rf"^the run in .*/run has other settings \({names}\): leave out"):
+            resumed(*words)
