@@ -155,10 +155,10 @@ def resume(arguments: list[str]) -> int:
         try:
             begun = checkpoints(parsed.directory) and not spec.environment.user_modules  # whose folder may be another
             spaces = None if begun else checked_spaces(spec, fork=True)
-        except EnvironmentProblemError as error:
+            run_directory.write_config(parsed.directory, spec)
+        except (EnvironmentProblemError, SettingsError) as error:
             print(f"daedalus resume: {error}", file=sys.stderr)
             return 1
-        run_directory.write_config(parsed.directory, spec)
         return _run(lock, spec, parsed, started, screen, init_from, resume=True, spaces=spaces, finished=finished)
 
 

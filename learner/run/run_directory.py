@@ -159,10 +159,13 @@ def remove_failed(directory: Path) -> None:
 
 
 def write_config(directory: Path, spec: RunSpec) -> None:
-    """Write config.toml: all settings, including defaults; unset settings are omitted."""
+    """Write config.toml: all settings, including defaults; unset settings are omitted. Raises SettingsError."""
     derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
     text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
-    _replace(directory / CONFIG, text)
+    try:
+        _replace(directory / CONFIG, text)
+    except OSError as error:
+        raise SettingsError(f"{directory / CONFIG} cannot be written: {error.strerror}") from None
 
 
 def read_config(directory: Path) -> RunSpec:
@@ -189,8 +192,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def _replace(path: Path, text: str) -> None:
     beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    beside.write_text(text, "utf-8")
-    os.replace(beside, path)
+    try:
+        beside.write_text(text, "utf-8")
+        os.replace(beside, path)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink()
+        raise
 
 
 def _versions() -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """learner/run/run_directory.py: files of the run directory, and config.toml that reproduces the run."""
 
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -132,6 +133,22 @@ def test_json_file_is_unchanged_when_its_replacement_fails(tmp_path: Path, monke
     with pytest.raises(OSError, match="power"):
         run_directory.write_json(path, {"run": 2})
     assert json.loads(path.read_text()) == {"run": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_settings_that_cannot_be_written_are_named_and_leave_the_former_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_directory.write_config(tmp_path, run_spec(seed=1))
+
+    def disk_full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")  # without a file name, as of a write
+
+    monkeypatch.setattr(Path, "write_text", disk_full)
+    with pytest.raises(SettingsError, match=r"^.*/config\.toml cannot be written: No space left on device$"):
+        run_directory.write_config(tmp_path, run_spec(seed=2))
+    assert run_directory.read_config(tmp_path) == run_spec(seed=1)
+    assert [file.name for file in tmp_path.iterdir()] == [run_directory.CONFIG]
 
 
 def test_default_directory_is_named_after_the_run() -> None:
