@@ -38,12 +38,12 @@ class CertificateAuthority:
 
     @classmethod
     def create(cls, directory: Path, common_name: str, lifetime: datetime.timedelta) -> "CertificateAuthority":
-        """Create a CA with a name in a folder that does not exist yet."""
+        """Create a CA with a name in a folder that holds none. The certificate is written last."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = _x509_name(common_name)
         builder = _builder(name, name, key, lifetime).add_extension(x509.BasicConstraints(True, 0), critical=True)
         builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
-        directory.mkdir(parents=True)
+        directory.mkdir(parents=True, exist_ok=True)
         _write(directory / KEY, _pem(key))
         _write(directory / CA, builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
         return cls(directory)

@@ -126,7 +126,7 @@ class CertificateFolder:
 
     def _issuer(self, record: Path, identity: Identity) -> CertificateAuthority:
         """Return the issuer of a client's certificates, which is created with the first certificate."""
-        if record.exists():
+        if (record / CA).exists():  # not where the creation was interrupted
             return CertificateAuthority(record)
         return CertificateAuthority.create(record, identity.common_name, _CA_LIFETIME)
 

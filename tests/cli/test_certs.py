@@ -1,6 +1,7 @@
 """Test of `daedalus certs`."""
 
 import datetime
+import errno
 import json
 import shutil
 import stat
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli import certificate_folder
+from daedalus.cli import certificate_authority, certificate_folder
 from daedalus.cli.commands.certs import certs
 from daedalus.transport.credentials import authorised_names, load
 
@@ -48,6 +49,22 @@ def test_issue_and_revoke_update_the_authorised_clients_of_learner_and_router(tm
     assert certs(["revoke", "actor", "box", "--directory", str(made)]) == 0
     assert authorised_names(made / "learner")["actors"] == ["arm"]
     assert not (made / "actor-box").exists()
+
+
+def test_issue_that_was_interrupted_succeeds_when_it_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = make(tmp_path / "certs")
+    with monkeypatch.context() as broken:
+        broken.setattr(certificate_authority, "_pem", _disk_full)
+        assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 1
+    assert (folder / "ca" / "actor-arm-1").exists()
+    assert certs(["issue", "actor", "arm-1", "--directory", str(folder)]) == 0, capsys.readouterr().err
+    assert authorised_names(folder / "learner")["actors"] == ["arm-1"]
+
+
+def _disk_full(_key: object) -> bytes:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_an_actor_may_have_the_name_of_a_role(tmp_path: Path) -> None:
