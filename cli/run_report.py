@@ -8,6 +8,7 @@ from typing import Any
 
 from daedalus.cli.local_run import LocalRun
 from daedalus.cli.processes import UNWRITABLE, discard
+from daedalus.protocol.texts import short_number
 
 
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
@@ -23,7 +24,7 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
         trained = f"done: {summary['env_steps']:,} env_steps, {summary['updates']:,} updates{goal}"
     evaluation = summary["evaluation"]
     evaluated = (
-        f"evaluation: return {evaluation['return_mean']:.1f} +- {evaluation['return_std']:.1f} "
+        f"evaluation: return {short_number(evaluation['return_mean'])} +- {short_number(evaluation['return_std'])} "
         f"over {evaluation['episodes']} {evaluation['actions']} episodes of the "
         f"{'best' if evaluation['best_checkpoint'] else 'newest'} checkpoint "
         f"on {evaluation['environment']} (backend {evaluation['backend']})"
@@ -53,9 +54,9 @@ def _confirmed(summary: dict[str, Any]) -> list[str]:
     if confirmation is None:
         return []
     line = (
-        f"confirmation: return {confirmation['return_mean']:.1f} over {confirmation['episodes']} new sampled episodes "
-        "of the policy at that moment"
+        f"confirmation: return {short_number(confirmation['return_mean'])} over {confirmation['episodes']} new sampled "
+        "episodes of the policy at that moment"
     )
     if confirmation["interval"] is not None:
-        line += ", 95 % interval {:.1f} to {:.1f}".format(*confirmation["interval"])
-    return [f"{line}; training mean {summary['episode_return_mean']:.1f}"]
+        line += ", 95 % interval {} to {}".format(*map(short_number, confirmation["interval"]))
+    return [f"{line}; training mean {short_number(summary['episode_return_mean'])}"]

@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+from daedalus.protocol.texts import short_number
+
 _ERRORS = 3.0  # standard errors between two means that differ
 _FEWEST = 10  # episodes, from which on their standard error means something
 
@@ -22,7 +24,7 @@ def is_below_training(evaluation: dict[str, Any], training_mean: float | None) -
 def sampled_note(greedy: dict[str, Any], sampled: dict[str, Any]) -> str:
     """Return a message about the results of greedy and of sampled actions, of the same checkpoint."""
     text = (
-        f"sampled actions: return {sampled['return_mean']:.1f} +- {sampled['return_std']:.1f} over "
+        f"sampled actions: return {short_number(sampled['return_mean'])} +- {short_number(sampled['return_std'])} over "
         f"{sampled['episodes']} episodes; played because the greedy ones were worse than training"
     )
     if sampled["return_mean"] - greedy["return_mean"] > _ERRORS * math.hypot(_error(greedy), _error(sampled)):

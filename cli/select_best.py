@@ -12,6 +12,7 @@ from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.evaluation_processes import play
 from daedalus.learner.run.candidates import candidates
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.texts import short_number
 
 _logger = logging.getLogger(__name__)
 
@@ -52,8 +53,8 @@ def select_best(
     scores = []
     for candidate, result in zip(finalists, results, strict=True):
         version, mean, std = candidate.policy_version, result["return_mean"], result["return_std"]
-        before = "" if candidate.score is None else f" ({candidate.score:.1f} before)"
-        _logger.info("  policy version %d: %.1f +- %.1f%s", version, mean, std, before)
+        before = "" if candidate.score is None else f" ({short_number(candidate.score)} before)"
+        _logger.info("  policy version %d: %s +- %s%s", version, short_number(mean), short_number(std), before)
         try:
             candidate.rescore(mean)
         except OSError as error:

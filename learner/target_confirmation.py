@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
+from daedalus.protocol.texts import short_number
 
 if TYPE_CHECKING:
     from daedalus.learner.training.checkpointer import Checkpointer
@@ -70,7 +71,7 @@ class TargetConfirmation:
         with self._lock:
             self._state.counters.forget_returns()
         if result is not None:
-            text = f"not confirmed: return {result['return_mean']:.1f}; training continues"
+            text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
             self._events.add("target", text, cause=f"result of version {policy_version}")
         return False
 

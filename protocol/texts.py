@@ -1,4 +1,4 @@
-"""Texts of peers, bounded for a person who reads them. Pure functions."""
+"""Texts for a person who reads them: those of peers, bounded, and numbers. Pure functions."""
 
 MAX_NAME, MAX_TEXT = 64, 300  # bytes in UTF-8: of a name, and of a reason or an event
 
@@ -12,3 +12,8 @@ def bounded_text(text: str, most: int = MAX_TEXT) -> str:
     start = text[:most]
     printable = "".join(character if character.isprintable() else " " for character in start)
     return " ".join(printable.split()).encode()[:most].decode(errors="ignore")
+
+
+def short_number(value: float) -> str:
+    """Return a number of any size with at least three digits that count: 1,234,567, 987.1, 0.982 or 1.2e-05."""
+    return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"

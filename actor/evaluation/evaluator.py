@@ -20,6 +20,7 @@ from daedalus.actor.session.run_end import RunEndWatch, RunOverError
 from daedalus.actor.session.service import ActorConfig
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.protocol.messages import EvaluationReport, Join, Snapshot, Welcome
+from daedalus.protocol.texts import short_number
 from daedalus.transport.interface import Transport
 
 _logger = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ class Evaluator:
             longest=wanted.max_episode_env_steps,
             progress=self._raise_if_ended,
         )
-        _logger.info("policy version %d: return %.1f", snapshot.policy_version, evaluation.returns.mean())
+        _logger.info("policy version %d: return %s", snapshot.policy_version, short_number(evaluation.returns.mean()))
         if evaluation.cut.any() and not self._warned_of_cuts:
             self._warned_of_cuts = True
             cut, longest = int(evaluation.cut.sum()), wanted.max_episode_env_steps

@@ -37,6 +37,7 @@ from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
 from daedalus.protocol.spec import EnvironmentSpec
+from daedalus.protocol.texts import short_number
 
 _PROGRESS_SECONDS = 5.0
 _FRAMES_PER_SECOND = 30.0  # of environments without render_fps
@@ -238,8 +239,8 @@ def _text(result: dict[str, Any]) -> str:
     best = "best checkpoint, " if result["best_checkpoint"] else ""
     text = (
         f"{result['environment']} (backend {result['backend']}), {best}policy version {result['policy_version']}: "
-        f"return {result['return_mean']:.1f} +- {result['return_std']:.1f} "
-        f"(from {result['return_min']:.1f} to {result['return_max']:.1f}) "
+        f"return {short_number(result['return_mean'])} +- {short_number(result['return_std'])} "
+        f"(from {short_number(result['return_min'])} to {short_number(result['return_max'])}) "
         f"over {result['episodes']} {result['actions']} episodes"
     )
     if "video" in result:
@@ -265,7 +266,9 @@ class _Progress:
         if time.monotonic() < self._due:
             return False
         self._due = time.monotonic() + _PROGRESS_SECONDS
-        so_far = f", mean return {mean:.1f}" if finished else f" (each is cut after {self._longest:,} env_steps)"
+        so_far = (
+            f", mean return {short_number(mean)}" if finished else f" (each is cut after {self._longest:,} env_steps)"
+        )
         line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
         self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
         self._stream.flush()

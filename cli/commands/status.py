@@ -14,6 +14,7 @@ from daedalus.learner.run.heartbeat import silence
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
+from daedalus.protocol.texts import short_number
 from daedalus.transport.connecting import connect
 from daedalus.transport.credentials import WARNING_DAYS, Credentials
 from daedalus.transport.interface import TransportError
@@ -157,7 +158,7 @@ def _events(page: EventsPage) -> list[str]:
 
 
 def _table(status: RunStatus) -> list[str]:
-    mean = "-" if status.episode_return_mean is None else f"{status.episode_return_mean:.1f}"
+    mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
     age = status.checkpoint_age_seconds
     skipped = f" ({status.updates_skipped:,} skipped)" if status.updates_skipped else ""
     return [

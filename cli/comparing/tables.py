@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
+from daedalus.protocol.texts import short_number
 
 _FEW = 5  # runs
 
@@ -35,10 +36,10 @@ def header(comparison: Comparison) -> list[str]:
 
 def cells(result: GroupResult, comparison: Comparison) -> list[str]:
     """Return the cells of one group, one for each name of `header`."""
-    texts = [result.group, str(result.runs), written(result.final_return, _number)]
+    texts = [result.group, str(result.runs), written(result.final_return, short_number)]
     if result.env_steps is not None and result.minutes is not None:
         texts.append(f"{result.reached} of {result.runs}")
-        texts += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, _number)]
+        texts += [written(result.env_steps, lambda value: f"{value:,.0f}"), written(result.minutes, short_number)]
     if len(comparison.results) > 1:
         improvement = result.improvement
         texts.append("" if improvement is None else written(improvement, lambda value: f"{value:.2f}"))
@@ -66,10 +67,6 @@ def notes(comparison: Comparison) -> list[str]:
         named = " and ".join(single) if len(single) < 3 else f"{len(single)} groups"
         lines.append(f"one run only, so without an interval: {named}; train more seeds")
     return lines
-
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 1e5 else f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
 
 
 def written(estimate: Estimate, form: Callable[[float], str]) -> str:

@@ -9,6 +9,7 @@ from typing import TextIO
 
 from daedalus.cli.sweeping.plan import PlannedRun
 from daedalus.learner.run.run_directory import METRICS
+from daedalus.protocol.texts import short_number
 
 _TERMINAL_SECONDS = 1.0  # between lines on a terminal
 _LINE_SECONDS = 60.0  # and elsewhere
@@ -51,7 +52,7 @@ class Display:
         parts.append(self._left((ended + sum(shares)) / max(self._total, 1), now))
         for run, row, share in zip(running, rows, shares, strict=True):
             mean = row.get("episode_return_mean")
-            parts.append(f"{run.name} {100 * share:.0f} %" + ("" if mean is None else f" return {mean:.1f}"))
+            parts.append(f"{run.name} {100 * share:.0f} %" + ("" if mean is None else f" return {short_number(mean)}"))
         if self._terminal:
             self._write(f"\r\x1b[K{'  '.join(parts)[: max(shutil.get_terminal_size().columns - 1, 0)]}")
             self._rewriting = True

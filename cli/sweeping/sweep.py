@@ -10,6 +10,7 @@ from daedalus.cli.sweeping.processes import FINISHED, RunProcesses, reason
 from daedalus.cli.sweeping.searches import Search
 from daedalus.learner.run.run_directory import SUMMARY, read_json
 from daedalus.learner.run.settings import SettingsError
+from daedalus.protocol.texts import short_number
 
 _POLL_SECONDS = 0.1
 
@@ -100,5 +101,5 @@ def result(run: PlannedRun) -> str:
     end = "target reached" if summary["solved"] else "done"
     return (
         f"{end} after {summary['env_steps']:,} env_steps, {summary['wall_seconds']:.0f} s; "
-        f"final return {summary['evaluation_return_mean']:.1f}"
+        f"final return {short_number(summary['evaluation_return_mean'])}"
     )

@@ -16,6 +16,7 @@ from daedalus.cli.watching.sparkline import ASCII, BLOCKS, sparkline
 from daedalus.cli.watching.watched_run import WatchedRun
 from daedalus.learner.reporting.progress import duration
 from daedalus.protocol.status import ActorStatus
+from daedalus.protocol.texts import short_number
 
 _WIDE = 60  # columns
 _SPARKLINE_WIDTH = 60  # at most
@@ -64,7 +65,7 @@ def _head(run: WatchedRun, width: int, ascii_only: bool) -> list[RenderableType]
     share = min(status.env_steps / max(status.env_steps_budget, 1), 1.0)
     up = f"  up {duration(status.uptime_seconds)}" if width >= _WIDE else ""
     left = "-" if run.seconds_left is None else duration(run.seconds_left)
-    mean = "-" if status.episode_return_mean is None else f"{status.episode_return_mean:.1f}"
+    mean = "-" if status.episode_return_mean is None else short_number(status.episode_return_mean)
     label = f"return {mean:>8}  "
     curve = sparkline(run.returns, min(width - len(label) - 1, _SPARKLINE_WIDTH), ASCII if ascii_only else BLOCKS)
     progress = Table.grid(padding=(0, 1))

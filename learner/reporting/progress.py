@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
+from daedalus.protocol.texts import short_number
+
 _LINE_SECONDS = 5.0  # between lines if the stream is not a terminal
 _FIRST_LINE_SECONDS = 1.0
 _RATE_SECONDS = 30.0  # of the run, over which the rate of the env_steps is measured
@@ -91,7 +93,7 @@ def is_terminal(stream: TextIO) -> bool:
 
 def _parts(row: Mapping[str, float], budget: int, rate: float) -> list[str]:
     """Return the parts of a line, the most important first. What is not known yet is a dash."""
-    mean = _number(row.get("episode_return_mean"), ".1f")
+    mean = short_number(row["episode_return_mean"]) if "episode_return_mean" in row else "-"
     left = duration((budget - row["env_steps"]) / rate) if rate > 0.0 else "-"
     parts = [
         f"{row['wall_seconds']:7.1f} s",

@@ -12,6 +12,7 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.policy.saving.best_checkpoints import keep_if_best
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Acknowledgement, EvaluationReport
+from daedalus.protocol.texts import short_number
 
 _MAX_IN_PROGRESS = 16
 
@@ -65,7 +66,8 @@ class Evaluations:
             "evaluation_length_mean": float(report.lengths.mean()),
             "evaluation_env_steps": env_steps,
         }
-        text = f"evaluation at {env_steps:,} env_steps: {mean:.1f} +- {std:.1f} over {len(report.returns)} episodes"
+        result = f"{short_number(mean)} +- {short_number(std)} over {len(report.returns)} episodes"
+        text = f"evaluation at {env_steps:,} env_steps: {result}"
         try:
             text += ", the best so far" if keep_if_best(directory, mean, version) else ""
         except OSError as error:

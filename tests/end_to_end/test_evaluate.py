@@ -35,6 +35,7 @@ from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
 from daedalus.protocol.spaces import DiscreteSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.texts import short_number
 
 Start = Callable[..., Running]
 
@@ -398,8 +399,9 @@ def test_a_reached_target_is_confirmed_with_new_sampled_episodes(tmp_path: Path,
     local_run = LocalRun(directory=run, spec=spec, started=0.0)
     summary = evaluate_run(local_run, threading.Event(), output)
     report = report_of(local_run, summary)
-    assert f"confirmation: return {mean:.1f} over 40 new sampled episodes" in report
-    assert report.splitlines()[1].endswith(f"95 % interval {low:.1f} to {high:.1f}; training mean 1000.5")
+    assert f"confirmation: return {short_number(mean)} over 40 new sampled episodes" in report
+    interval = f"95 % interval {short_number(low)} to {short_number(high)}"
+    assert report.splitlines()[1].endswith(f"{interval}; training mean 1000.5")
     assert "sampled_evaluation" not in summary  # the confirmation has sampled episodes already
 
 
@@ -438,7 +440,7 @@ def test_greedy_episodes_that_are_worse_than_training_are_played_again_with_samp
         assert (sampled["actions"], sampled["episodes"], sampled["policy_version"]) == ("sampled", 10, 5)
         assert sampled["seed"] == summary["evaluation"]["seed"]
         (note,) = read_json(run / "evaluation.json")["notes"]
-        assert note.startswith(f"sampled actions: return {sampled['return_mean']:.1f} +- ")
+        assert note.startswith(f"sampled actions: return {short_number(sampled['return_mean'])} +- ")
 
 
 def _played(evaluate: Callable[..., dict], run: Path, version: int) -> float:

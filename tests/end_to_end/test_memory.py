@@ -57,7 +57,7 @@ def test_a_run_on_pixels_is_evaluated_and_keeps_its_best_checkpoint(start: Start
         """
     )
     running = start("train", "pong.toml", "--run-dir", "run")
-    running.expect(r"evaluation at [\d,]+ env_steps: -?\d+\.\d \+- 0\.0 over 1 episodes, the best so far")
+    running.expect(r"evaluation at [\d,]+ env_steps: \S+ \+- 0 over 1 episodes, the best so far")
     until(lambda: running.output.count("evaluation at") >= 2)
     running.process.terminate()
     assert running.wait() == 1

@@ -38,7 +38,7 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     running = train()
     assert running.wait() == 0, running.output
     first, second = (index for index, line in enumerate(running.lines) if line.startswith("target 1 reached: "))
-    assert "not confirmed: return 0.0; training continues" in running.lines[first:second]
+    assert "not confirmed: return 0; training continues" in running.lines[first:second]
     result = summary(tmp_path)
     assert (result["solved"], result["finished"], result["confirmation_return_mean"]) == (True, True, 1.0)
     confirmation = result["confirmation"]
@@ -48,8 +48,8 @@ def test_training_continues_until_new_episodes_confirm_the_target(
     assert not (tmp_path / "run" / "confirmation.json").exists()
     asked, refused, confirmed = (each.text for each in read_events(tmp_path / "run") if each.kind == "target")
     assert asked == confirmed == running.lines[first]
-    assert refused == "not confirmed: return 0.0; training continues"
-    running.expect("confirmation: return 1.0 over 10 new sampled episodes of the policy at that moment")
+    assert refused == "not confirmed: return 0; training continues"
+    running.expect("confirmation: return 1 over 10 new sampled episodes of the policy at that moment")
 
 
 def test_run_ends_at_its_target_if_the_episodes_cannot_be_played(train: Callable[..., Running], tmp_path: Path) -> None:

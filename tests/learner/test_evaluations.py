@@ -78,7 +78,7 @@ def run(tmp_path: Path) -> Run:
 
 
 def test_first_evaluated_checkpoint_is_kept_as_best_under_its_score(run: Run) -> None:
-    assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.3 +- 1.2 over 3 episodes, the best so far"
+    assert run.play(7, 1.0, 2.0, 4.0) == "evaluation at 7,000 env_steps: 2.33 +- 1.25 over 3 episodes, the best so far"
     assert run.names == ["0000000007", "best_2.3333333333333335_0000000007"]
     best = best_checkpoints(run.directory)[0]
     assert read_policy(best).policy_version == 7

@@ -106,6 +106,14 @@ def test_line_shows_the_return_after_the_first_episode(monkeypatch: pytest.Monke
         assert part in line
 
 
+@pytest.mark.parametrize(("mean", "shown"), [(0.00012, "0.00012"), (-0.034, "-0.034"), (12_345_678.9, "12,345,679")])
+def test_line_shows_returns_of_any_size(mean: float, shown: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    screen = Screen()
+    Progress(screen, 2_000_000).show(row(1_500_000, episode_return_mean=mean))
+    assert f"return {shown:>7}  " in screen.getvalue()
+
+
 def test_rates_are_unknown_before_the_first_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     screen = Screen()

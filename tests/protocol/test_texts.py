@@ -1,10 +1,10 @@
-"""protocol/texts.py: foreign texts, bounded in bytes, in one line and printable."""
+"""protocol/texts.py: foreign texts, bounded in bytes, in one line and printable; numbers of any size."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daedalus.protocol.texts import bounded_text
+from daedalus.protocol.texts import bounded_text, short_number
 
 offline = settings(max_examples=200, deadline=None, derandomize=True)
 
@@ -32,3 +32,11 @@ def test_any_text_becomes_printable_and_small(text: str, most: int) -> None:
     assert bounded.isprintable()
     assert len(bounded.encode()) <= most
     assert bounded_text(bounded, most) == bounded.rstrip()
+
+
+SHOWN = {0.0: "0", 1.2e-5: "1.2e-05", -0.0345: "-0.0345", 0.98765: "0.988", -475.25: "-475.2", 1e6: "1,000,000"}
+
+
+@pytest.mark.parametrize(("value", "text"), SHOWN.items())
+def test_numbers_of_any_size_have_three_digits_that_count(value: float, text: str) -> None:
+    assert short_number(value) == text

@@ -74,7 +74,7 @@ def test_all_runs_are_made_one_after_another(tmp_path: Path) -> None:
     assert [run.name for run in end.done] == programs.begun
     assert programs.most == 1
     assert "rollout_length-5_seed-1: begins" in output
-    assert "rollout_length-5_seed-1: done after 3,000 env_steps, 9 s; final return 5.0" in output
+    assert "rollout_length-5_seed-1: done after 3,000 env_steps, 9 s; final return 5" in output
 
 
 def test_runs_are_made_side_by_side(tmp_path: Path) -> None:
