@@ -48,7 +48,7 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
 
 def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps
+    from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps, uninformative_bounds
 
     try:
         report = quick_check(spec.environment, UserModules(frozenset(modules_of(spec.user_modules))), fork=fork)
@@ -59,7 +59,8 @@ def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
         raise EnvironmentProblemError(with_preset(report.problems[0], spec))
     for warning in report.warnings:
         _logger.warning("%s", warning)
-    for advice in (slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec)):
+    slow = slow_steps(report, spec, os.cpu_count() or 1)
+    for advice in (slow, float_images(report, spec), uninformative_bounds(report)):
         if advice:
             _logger.info("%s", advice)
     return report

@@ -2,11 +2,12 @@
 
 from pydantic import Field
 
-from daedalus.protocol.spaces import ArraySpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.specification import Specification
 
 _SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchange with another process
+_WIDE = 1e6  # from bound to bound of an action: the policy explores a hundredth of it to the end
 _BUSY = 0.2  # share of processor time below which a step mostly waits, even on a busy machine
 
 
@@ -67,6 +68,25 @@ def float_images(report: EnvironmentReport, spec: RunSpec) -> str:
                 f"{name!r} is a {space}, which goes through a multilayer perceptron: if it is an image, "
                 "return bytes from 0 to 255 (Box of uint8), which get convolutions"
             )
+    return ""
+
+
+def uninformative_bounds(report: EnvironmentReport) -> str:
+    """Return advice if an action lacks a bound, or has bounds too wide to explore, else an empty string."""
+    for name, space in report.spaces.actions.items() if report.spaces is not None else ():
+        if not isinstance(space, ContinuousSpace):
+            continue
+        for low, high in zip(space.low, space.high, strict=True):
+            if low is None or high is None:
+                return (
+                    f"action {name!r} is not bounded on both sides, so that it is not scaled: the policy begins within "
+                    "about 1 of 0; where useful values are of another size, give it their bounds"
+                )
+            if high - low > _WIDE:
+                return (
+                    f"action {name!r} goes from {low:g} to {high:g}, and the policy explores all of it: "
+                    "where useful values are closer together, give it their bounds"
+                )
     return ""
 
 

@@ -9,7 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
+from daedalus.actor.checking.report import (
+    EnvironmentReport,
+    float_images,
+    never_ends,
+    slow_steps,
+    uninformative_bounds,
+)
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
 from daedalus.cli.quick_check import with_preset
@@ -152,7 +158,8 @@ def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
 def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     if report.problems:
         return []
-    advice = (never_ends(report, spec), slow_steps(report, spec, os.cpu_count() or 1), float_images(report, spec))
+    slow = slow_steps(report, spec, os.cpu_count() or 1)
+    advice = (never_ends(report, spec), slow, float_images(report, spec), uninformative_bounds(report))
     return [text for text in advice if text]
 
 

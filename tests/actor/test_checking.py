@@ -12,10 +12,10 @@ from plain import plain_spaces
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
-from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps
+from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps, uninformative_bounds
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ArraySpace
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -211,3 +211,22 @@ def test_an_image_of_floats_is_noted(shape: tuple[int, ...], dtype: Literal["flo
     assert ("if it is an image, return bytes from 0 to 255" in float_images(report, spec())) is noted
     chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "nature"})})
     assert not float_images(report, chosen)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "noted"),
+    [
+        ((-1.0, -1000.0), (1.0, 1000.0), ""),
+        ((-1.0, 0.0), (1.0, None), "is not bounded on both sides"),
+        ((-1.0, -1e9), (1.0, 1e9), "goes from -1e+09 to 1e+09"),
+    ],
+)
+def test_bounds_that_say_nothing_about_useful_actions_are_noted(
+    low: tuple[float | None, ...], high: tuple[float | None, ...], noted: str
+) -> None:
+    spaces = plain_spaces(ArraySpace(shape=(2,), dtype="float32"), 2)
+    continuous = spaces.model_copy(update={"actions": {"action": ContinuousSpace(low=low, high=high)}})
+    advice = uninformative_bounds(EnvironmentReport(spaces=continuous))
+    assert advice == "" if not noted else f"action 'action' {noted}" in advice
+    assert not uninformative_bounds(EnvironmentReport(spaces=spaces))
+    assert not uninformative_bounds(EnvironmentReport())
