@@ -12,6 +12,7 @@ from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
+_LARGEST_MEAN = 5.0  # of the scaled returns: that of episodes of a thousand equal rewards, at a discount factor of 0.99
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 _MAX_STREAMS = 4096  # actors whose running returns are kept
 
@@ -105,11 +106,12 @@ class ObservationStatistics:
 
 
 class RewardNormalizer:
-    """Division of rewards by the running standard deviation of the discounted return.
+    """Division of rewards by the running standard deviation of the discounted return, or a fifth of its mean.
 
     The return of row t is G_t = r_t + discount_factor * G_{t-1}, which begins at 0 with each episode: a sum over the
     past, whose deviation is that of the values to within the mean (Engstrom et al. 2020, section 3). It runs on from
-    rollout to rollout of an actor.
+    rollout to rollout of an actor. The mean counts where it is large beside the deviation, such as with episodes of one
+    step whose rewards are 100 and 101: divided by their deviation, all would be clipped to the same value.
     """
 
     def __init__(self, discount_factor: float) -> None:
@@ -128,8 +130,9 @@ class RewardNormalizer:
 
     def scale(self, batch: Batch) -> None:
         """Scale the rewards of a batch in place."""
-        deviation = float(self.moments.variance.sqrt())
-        batch.rewards.div_(max(deviation, 1e-8)).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
+        deviation, mean = float(self.moments.variance.sqrt()), float(self.moments.mean)
+        divisor = max(deviation, abs(mean) / _LARGEST_MEAN, 1e-8)
+        batch.rewards.div_(divisor).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
 
     def _returns(self, rollout: Rollout) -> np.ndarray:
         """Return G [T, E] of a rollout, and remember its last row."""

@@ -227,7 +227,8 @@ class TrainingSpec(Specification):
     entropy_bonus_final: Annotated[float, Field(ge=0.0)] | None = None
     """Anneal the entropy bonus linearly to this value over the budget. Unset: constant."""
     normalize_rewards: bool = False
-    """Divide rewards by the running standard deviation of the discounted return, so that values are near one."""
+    """Divide rewards by the running standard deviation of the discounted return, or by a fifth of its mean if that is
+    larger, so that values are near one."""
     normalize_advantages: bool = False
     """Scale the advantages of each batch to mean 0 and standard deviation 1."""
 

@@ -110,6 +110,21 @@ def test_rewards_are_divided_by_the_deviation_and_clipped() -> None:
     assert batch.rewards[0, 0] == 10.0
 
 
+@pytest.mark.parametrize("offset", [100.0, -1e5])
+def test_rewards_that_differ_little_beside_their_mean_stay_different(offset: float) -> None:
+    """As with episodes of one step: divided by their deviation, all would be clipped to the same value."""
+    normalizer = RewardNormalizer(DISCOUNT)
+    rewards = offset + torch.tensor([0.0, 1.0], dtype=torch.float64).repeat(50)
+    normalizer.moments.add(rewards)
+    batch = join([sent(1)])
+    batch.rewards[0] = torch.tensor([offset, offset + 1.0, 0.0])
+    normalizer.scale(batch)
+    lower, higher, none = batch.rewards[0].tolist()
+    assert none == 0.0
+    assert 4.9 < abs(lower) < 5.1
+    assert higher - lower == pytest.approx(5.0 / abs(offset), rel=0.05)
+
+
 def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(normalization, "_MAX_STREAMS", 2)
     normalizer = RewardNormalizer(DISCOUNT)
