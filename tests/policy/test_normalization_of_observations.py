@@ -22,6 +22,14 @@ def test_observations_are_shifted_scaled_and_clipped(normalizer: ObservationNorm
     torch.testing.assert_close(seen, torch.tensor([[1.0, 2.0, 10.0]]))
 
 
+def test_small_units_are_normalised_and_constants_are_not(normalizer: ObservationNormalizer) -> None:
+    """Micrometres in metres, and a number that never changes."""
+    deviation = torch.tensor([1e-6, 1e-5, 0.0], dtype=torch.float64)
+    normalizer.set_statistics("o", torch.tensor([0.0, 0.1, 1234.5]), deviation.square())
+    seen = normalizer({"o": torch.tensor([[1e-6, 0.1 - 2e-5, 1234.5]])})["o"]
+    torch.testing.assert_close(seen, torch.tensor([[1.0, -2.0, 0.0]]), rtol=0.01, atol=1e-6)
+
+
 def test_compact_snapshot_changes_no_statistic(normalizer: ObservationNormalizer) -> None:
     """A mean of 1,000 beside a deviation of 0.01: bfloat16 alone would move it by up to 4, which is 400 deviations."""
     mean, deviation = torch.tensor([1000.123, -7.7777, 3e-5]), torch.tensor([0.01, 3.3, 1.0])
