@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from daedalus.protocol.spaces import ArraySpace
 
 _LARGEST = 10.0  # normalised values are clipped to +- this value
-_SMALLEST_VARIANCE = 1e-16  # of numbers such as micrometres in metres; smaller deviations may be rounding
+_SMALLEST_VARIANCE = 1e-12  # smaller deviations may be the rounding of float32 numbers near one
 _PARTS = 3  # bfloat16 numbers, of 8 bits each, that make a float32
 
 

@@ -23,10 +23,10 @@ def test_observations_are_shifted_scaled_and_clipped(normalizer: ObservationNorm
 
 
 def test_small_units_are_normalised_and_constants_are_not(normalizer: ObservationNormalizer) -> None:
-    """Micrometres in metres, and a number that never changes."""
-    deviation = torch.tensor([1e-6, 1e-5, 0.0], dtype=torch.float64)
+    """A hundredth of a millimetre in metres, and a number that never changes."""
+    deviation = torch.tensor([1e-5, 1e-4, 0.0], dtype=torch.float64)
     normalizer.set_statistics("o", torch.tensor([0.0, 0.1, 1234.5]), deviation.square())
-    seen = normalizer({"o": torch.tensor([[1e-6, 0.1 - 2e-5, 1234.5]])})["o"]
+    seen = normalizer({"o": torch.tensor([[1e-5, 0.1 - 2e-4, 1234.5]])})["o"]
     torch.testing.assert_close(seen, torch.tensor([[1.0, -2.0, 0.0]]), rtol=0.01, atol=1e-6)
 
 
