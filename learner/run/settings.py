@@ -56,7 +56,7 @@ def _unknown_preset(name: str) -> str:
 def read_file(path: Path) -> dict[str, Any]:
     """Return the settings in a TOML file, such as the config.toml of a run, by section. Raises SettingsError."""
     try:
-        settings = tomllib.loads(path.read_text("utf-8"))
+        settings = tomllib.loads(path.read_text("utf-8-sig"))  # some editors of Windows begin a file with a mark
     except OSError as error:
         raise SettingsError(f"{path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -52,6 +52,12 @@ def test_unknown_preset_error_lists_all_presets_when_none_is_similar() -> None:
         read_preset("zzz")
 
 
+def test_toml_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text('[environment]\nid = "CartPole-v1"\n', "utf-8-sig")
+    assert read_preset(str(path)) == {"environment": {"id": "CartPole-v1"}}
+
+
 def test_toml_file_can_be_used_as_a_preset(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text('[environment]\nid = "Own-v0"\n')
