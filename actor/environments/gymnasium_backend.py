@@ -180,7 +180,7 @@ def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
     """Return the specification for an evaluation on gymnasium's implementation of the environment.
 
     Atari games of the other backends have another name there, and repeat actions unless told not to. Of their `kwargs`
-    those are kept that all backends have.
+    those are kept that change the game itself.
     """
     evaluated = spec.as_evaluated("gymnasium")
     if spec.backend == "gymnasium":

@@ -18,13 +18,7 @@ if TYPE_CHECKING:
 class RunReporter:
     """Reporter of one run. Reads the counters and the fleet under their lock. No I/O."""
 
-    def __init__(
-        self,
-        state: RunState,
-        fleet: Fleet,
-        lock: threading.Condition,
-        user_metrics: UserMetrics,
-    ) -> None:
+    def __init__(self, state: RunState, fleet: Fleet, lock: threading.Condition, user_metrics: UserMetrics) -> None:
         """Construct the reporter. `lock` guards the counters and the fleet."""
         self._state, self._counters, self._fleet, self._lock = state, state.counters, fleet, lock
         self._user_metrics = user_metrics
