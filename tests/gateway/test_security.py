@@ -74,6 +74,19 @@ def test_token_admits_its_own_name_only(secured: RunningGateway, folder: Path) -
             assert "daedalus certs issue client NAME" in answer["reason"]
 
 
+def test_clients_over_tls_get_no_session_ticket_while_they_send(secured: RunningGateway, folder: Path) -> None:
+    context = ssl.create_default_context(cafile=folder / "client-phone" / "ca.pem")
+    address = ("127.0.0.1", secured.port)
+    with (
+        socket.create_connection(address, timeout=LIMIT) as plain,
+        context.wrap_socket(plain, server_hostname="127.0.0.1") as client,
+    ):
+        client.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert client.recv(9) == b"HTTP/1.1 "  # a ticket would have come before it
+        assert client.version() == "TLSv1.3"
+        assert client.session is None or not client.session.has_ticket
+
+
 def test_connection_without_tls_is_not_served(secured: RunningGateway) -> None:
     with pytest.raises(Exception, match=r"did not receive a valid HTTP response|connection|closed"):
         JsonClient(secured.port)
