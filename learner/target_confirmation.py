@@ -47,7 +47,7 @@ class TargetConfirmation:
     def confirm(self, policy_version: int, checkpointer: "Checkpointer") -> bool:
         """Wait until the launcher has played new episodes with the present policy, and return whether they confirm it.
 
-        Otherwise the newest returns are forgotten: the target has to be reached again. If the episodes cannot be
+        If they do not, the newest returns are forgotten: the target has to be reached again. If the episodes cannot be
         played, or nothing can be written to the disk, the target counts as reached without them.
         """
         if checkpointer.save() is None:
@@ -61,18 +61,19 @@ class TargetConfirmation:
         except OSError as error:
             _logger.warning("the target cannot be confirmed: %s", error.strerror)
             return True
-        if result is not None and "failed" in result:  # such as a simulator of which only one runs at a time
+        if result is None:  # the run is stopped; when it is resumed, it asks again
+            return False
+        if "failed" in result:  # such as a simulator of which only one runs at a time
             text = f"the target cannot be confirmed: {result['failed']}"
             self._events.add("target", text, cause=f"result of version {policy_version}")
             return True
-        if result is not None and result["confirmed"]:
+        if result["confirmed"]:
             self.result = result
             return True
         with self._lock:
             self._state.counters.forget_returns()
-        if result is not None:
-            text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
-            self._events.add("target", text, cause=f"result of version {policy_version}")
+        text = f"not confirmed: return {short_number(result['return_mean'])}; training continues"
+        self._events.add("target", text, cause=f"result of version {policy_version}")
         return False
 
     def _played_with(self, policy_version: int) -> dict[str, Any] | None:

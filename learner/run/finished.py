@@ -33,7 +33,7 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     if counters is None or summary.get("env_steps") != counters.env_steps:
         return None
     training = spec.training
-    solved = counters.is_solved(training)
+    solved = counters.is_solved(training) and bool(summary.get("solved"))  # not while new episodes have to confirm it
     if solved and training.stop_when_solved:
         reason = (
             f"the target return {training.target_return:g} was reached after {counters.env_steps:,} env_steps: "

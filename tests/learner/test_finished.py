@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Path:
 
 def finished(run: Path, summary: dict[str, Any] | None, **training: Any) -> FinishedRun | None:
     if summary is not None:
-        write_json(run / "summary.json", {"env_steps": 5000, "finished": True, **summary})
+        write_json(run / "summary.json", {"env_steps": 5000, "finished": True, "solved": True, **summary})
     return finished_run(run, run_spec(**training))
 
 
@@ -52,6 +52,10 @@ def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:
     missed = finished(run, {}, **{**TARGET, "target_return": 99.0}, env_steps=5000)
     assert missed is not None
     assert missed.missed
+
+
+def test_a_run_that_was_stopped_before_new_episodes_confirmed_its_target_has_to_train(run: Path) -> None:
+    assert finished(run, {"finished": False, "solved": False}, **TARGET) is None
 
 
 def test_a_run_that_an_evaluation_solved_has_nothing_to_train(run: Path) -> None:
