@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from daedalus.cli.run_observer import RunObserver
+from daedalus.cli.running.run_observer import RunObserver
 from daedalus.protocol.keys import is_name
 
 _READ_BYTES = 1 << 16

@@ -6,8 +6,8 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from daedalus.cli.local_run import LocalRun
 from daedalus.cli.processes import UNWRITABLE, discard
+from daedalus.cli.running.local_run import LocalRun
 from daedalus.protocol.texts import short_number
 
 

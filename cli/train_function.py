@@ -14,9 +14,10 @@ from typing import Any, TextIO
 
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError, run_locally
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
+from daedalus.cli.running.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
+from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.settings_arguments import Choice, check_processes, named_directory
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory

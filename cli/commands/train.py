@@ -17,20 +17,20 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.local_run import (
+from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.own_algorithm import with_record
+from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
+from daedalus.cli.run_report import report, show
+from daedalus.cli.running.local_run import (
     LocalRun,
     RunFailedError,
     RunStoppedError,
     UnsavedError,
     resume_command,
-    run_locally,
 )
-from daedalus.cli.logs import add_logging, configure_logging
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
-from daedalus.cli.run_observer import RunObserver
-from daedalus.cli.run_report import report, show
+from daedalus.cli.running.run_locally import run_locally
+from daedalus.cli.running.run_observer import RunObserver
 from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, check_processes, resolve
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay

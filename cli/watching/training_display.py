@@ -4,7 +4,7 @@ import logging
 import subprocess
 import threading
 
-from daedalus.cli.run_observer import RunObserver
+from daedalus.cli.running.run_observer import RunObserver
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.watched_run import WatchedRun
 

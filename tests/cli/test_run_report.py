@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daedalus.cli.local_run import LocalRun
 from daedalus.cli.run_report import report
+from daedalus.cli.running.local_run import LocalRun
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 SUMMARY = {

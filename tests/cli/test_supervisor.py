@@ -14,10 +14,11 @@ from processes import LIMIT, until
 
 from daedalus.cli import supervised_learner, supervisor
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.confirmation import Confirmations
-from daedalus.cli.local_run import LocalRun, watch
 from daedalus.cli.processes import RANK_LOST, STOPPED, UNSAVED
-from daedalus.cli.run_observer import RunObserver
+from daedalus.cli.running.confirmation import Confirmations
+from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.running.run_observer import RunObserver
+from daedalus.cli.running.training import watch
 from daedalus.cli.supervisor import FailedError, Supervised, stop, supervised_actor
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 

@@ -23,11 +23,12 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate import main
 from daedalus.cli.comparing.recorded_run import read_run
-from daedalus.cli.confirmation import Confirmations
 from daedalus.cli.evaluation_processes import EvaluationFailedError
-from daedalus.cli.local_run import LocalRun, evaluate_run
 from daedalus.cli.reports.run_record import read_record
 from daedalus.cli.run_report import report as report_of
+from daedalus.cli.running.confirmation import Confirmations
+from daedalus.cli.running.final_evaluation import evaluate_run
+from daedalus.cli.running.local_run import LocalRun
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.learner.run.run_directory import create, read_json, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime

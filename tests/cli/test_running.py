@@ -1,4 +1,4 @@
-"""Test of cli/local_run.py: that no process of a run outlives it."""
+"""Test of cli/running: that no process of a run outlives it, and which episodes are played at its end."""
 
 import subprocess
 import sys
@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from daedalus.cli import local_run
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.local_run import LocalRun, run_locally
+from daedalus.cli.running import final_evaluation, training
+from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.supervisor import Supervised
 from daedalus.protocol.spec import RunSpec
 
@@ -29,8 +30,8 @@ def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
     def supervised(*_: Any) -> Supervised:
         return Supervised("process", begin, ended={0})
 
-    monkeypatch.setattr(local_run, "_supervised_learner", supervised)
-    monkeypatch.setattr(local_run, "supervised_actor", supervised)
+    monkeypatch.setattr(training, "_supervised_learner", supervised)
+    monkeypatch.setattr(training, "supervised_actor", supervised)
     spec = RunSpec.model_validate({"environment": {"id": "CartPole-v1"}, "collection": {"actors": 4}})
     output = ChildOutput(tmp_path / "output.log", print, print)
     try:
@@ -54,9 +55,9 @@ def test_sampled_episodes_are_played_only_if_sampled_actions_can_differ(
         actions.append("sampled" if "sampled" in commands[0] else "greedy")
         return [{"return_mean": 1.0, "return_std": 0.0, "episodes": 100, "actions": actions[-1], "notes": []}]
 
-    monkeypatch.setattr(local_run, "play", play)
+    monkeypatch.setattr(final_evaluation, "play", play)
     (tmp_path / "summary.json").write_text('{"solved": false, "episode_return_mean": 9.0}')
     spec = RunSpec.model_validate({"environment": {"id": "Any-v0"}, "training": {"algorithm": algorithm}})
     output = ChildOutput(tmp_path / "output.log", print, print)
-    local_run.evaluate_run(LocalRun(directory=tmp_path, spec=spec, started=0.0), threading.Event(), output)
+    final_evaluation.evaluate_run(LocalRun(directory=tmp_path, spec=spec, started=0.0), threading.Event(), output)
     assert actions == played

@@ -1,0 +1,162 @@
+"""The learner and the actors of one run, as supervised child processes."""
+
+import logging
+import subprocess
+import threading
+import time
+
+from daedalus.cli.child_output import ChildOutput, OpenStreams
+from daedalus.cli.processes import ORDERED, UNSAVED
+from daedalus.cli.running.child_arguments import (
+    actor_arguments,
+    evaluation_arguments,
+    gateway_arguments,
+    learner_arguments,
+)
+from daedalus.cli.running.confirmation import Confirmations
+from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.supervisor import (
+    GATEWAY,
+    FailedError,
+    Supervised,
+    start,
+    stop,
+    supervised_actor,
+    supervised_gateway,
+)
+from daedalus.cli.tracking.tracker_processes import TrackerProcesses
+from daedalus.learner.run.event_file import EventFile
+from daedalus.transport.private_address import private_address
+
+_logger = logging.getLogger(__name__)
+
+FINISHED = {0, 3}  # exit statuses of a learner: see RunEnd
+
+_POLL_SECONDS = 0.05
+_EVALUATOR = "evaluator"
+_HELPERS = {_EVALUATOR, GATEWAY}  # processes without which a run goes on
+_SUMMARY_SECONDS = 30.0  # for the learner to write its summary after a callback ended training
+
+
+def train(
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams,
+    page: list[Supervised],
+    trackers: TrackerProcesses,
+) -> int:
+    """Run the learner and the actors; return the learner's exit status. Raises FailedError.
+
+    Adds the gateway to `page`, and starts the trackers. The caller ends them.
+    """
+    with private_address() as address:
+        run.observer.begin(address)
+        try:
+            return _train_at(address, run, stopping, output, learner_streams, page, trackers)
+        finally:
+            run.observer.end()
+
+
+def _train_at(
+    address: str,
+    run: LocalRun,
+    stopping: threading.Event,
+    output: ChildOutput,
+    learner_streams: OpenStreams,
+    page: list[Supervised],
+    trackers: TrackerProcesses,
+) -> int:
+    """Run the learner, and connect this machine's actors to it at an address."""
+    spec, options = run.spec, actor_arguments(run)
+    confirmations = Confirmations(run.directory, spec, evaluation_arguments(run), output)
+    learner = _supervised_learner(run, address, learner_streams)
+    actors: list[Supervised] = []
+    try:
+        for index in range(spec.collection.actors):  # one by one: if one cannot be started, those before it are stopped
+            actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
+        training = spec.training
+        _logger.info(
+            "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
+            spec.environment.id,
+            training.algorithm,
+            training.seed,
+            len(actors),
+            spec.collection.envs_per_actor,
+            address,
+            run.directory,
+        )
+        if spec.evaluation.seconds is not None:
+            evaluating = (*options, "--evaluator")
+            actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
+        if run.watch:
+            page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
+        trackers.start()
+        return watch(learner, [*actors, *page], run, stopping, confirmations)
+    finally:
+        stop([learner.process, *(actor.process for actor in actors), *confirmations.processes])
+        confirmations.close()
+
+
+def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) -> Supervised:
+    """Start a learner. After a crash, the next process resumes from the newest checkpoint."""
+    descriptors = *run.lock, *run.observer.descriptors
+
+    def begin(first: bool) -> subprocess.Popen[bytes]:
+        arguments = learner_arguments(run, address, first=first)
+        with open_streams("learner") as streams:
+            return start("daedalus.cli.commands.learner", *arguments, streams=streams, descriptors=descriptors)
+
+    return Supervised("the learner", begin, ended=FINISHED | {ORDERED, UNSAVED})
+
+
+def _end(learner: subprocess.Popen[bytes], stopping: threading.Event) -> None:
+    """End the learner, and wait until it has written its summary, which the evaluation reads."""
+    learner.terminate()
+    deadline = time.monotonic() + _SUMMARY_SECONDS
+    while learner.poll() is None and time.monotonic() < deadline and not stopping.wait(_POLL_SECONDS):
+        pass
+
+
+def watch(
+    learner: Supervised,
+    actors: list[Supervised],
+    run: LocalRun,
+    stopping: threading.Event,
+    confirmations: Confirmations,
+) -> int:
+    """Wait for the end of the learner, restart processes that die, and return the learner's exit status.
+
+    The log shows each restart, and events.jsonl keeps it. Return 0 if the observer ends training, or UNSAVED. Raises
+    FailedError if the learner failed too often, or if too few actors are left; EvaluationFailedError if the result of a
+    confirmation cannot be saved.
+    """
+    record = EventFile(run.directory)
+    while not stopping.wait(_POLL_SECONDS):
+        status = learner.process.poll()
+        if run.observer.poll(learner.process) and status is None:
+            _end(learner.process, stopping)
+            return UNSAVED if learner.process.returncode == UNSAVED else 0
+        if status is not None and (status in learner.ended or learner.failed_at_once):
+            return status
+        _warn(learner.check(), record)
+        confirmations.poll()
+        for actor in list(actors):
+            try:
+                _warn(actor.check(), record)
+            except FailedError as error:
+                actors.remove(actor)
+                stop([actor.process])
+                playing = sum(other.name not in _HELPERS for other in actors)
+                # A synchronous algorithm waits for all actors at its start.
+                needed = not playing or run.spec.algorithm.synchronous
+                if needed and actor.name not in _HELPERS:
+                    raise (error if playing else FailedError("all actors", error.reason, "failed")) from None
+                _warn(f"{error}; training continues without this process", record)
+    return 1
+
+
+def _warn(message: str | None, record: EventFile) -> None:
+    if message:
+        _logger.warning("%s", message)
+        record.add_restart(message)
