@@ -161,7 +161,8 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     open_standard_streams()
     try:
         try:
-            return command()
+            with _interrupts_recognised():
+                return command()
         finally:
             sys.stdout.flush()
     except KeyboardInterrupt:  # before a command has handlers of its own, or without any
@@ -179,6 +180,34 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
         discard(*outputs, sys.stdout)
         print(f"daedalus: cannot write the output: {error.strerror}", file=sys.stderr)
         return 1
+
+
+@contextlib.contextmanager
+def _interrupts_recognised() -> Iterator[None]:
+    """Raise KeyboardInterrupt after Ctrl-C, also where a library has replaced it by an exception of its own.
+
+    The validators of pydantic do this while a module is imported.
+    """
+    interrupts: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        interrupts.append(number)
+        raise KeyboardInterrupt
+
+    default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not default or threading.current_thread() is not threading.main_thread():  # ignored, as after `&` in a script
+        yield
+        return
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    except Exception as error:
+        if not interrupts:
+            raise
+        raise KeyboardInterrupt from error
+    finally:
+        if signal.getsignal(signal.SIGINT) is handle:  # the command has no handlers of its own
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def discard(*streams: TextIO) -> None:

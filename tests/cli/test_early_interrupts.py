@@ -56,3 +56,27 @@ def test_ctrl_c_before_the_handlers_stops_the_process_in_order(
         finally:
             process.kill()
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+# In place of a command without handlers: Ctrl-C arrives in code that replaces KeyboardInterrupt, as pydantic does.
+REPLACING = """
+import signal, sys
+from daedalus.cli import main
+
+def build(_arguments):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt as error:
+        raise ValueError("cannot build the validator") from error
+
+main._COMMANDS["plot"] = build
+sys.argv[1:] = ["plot"]
+sys.exit(main.main())
+"""
+
+
+def test_ctrl_c_that_a_library_replaces_by_its_own_exception_shows_no_traceback() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", REPLACING], capture_output=True, text=True, timeout=SECONDS, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", "stopped\n")
