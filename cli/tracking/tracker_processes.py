@@ -90,12 +90,8 @@ class TrackerProcesses:
         for name, process in self._processes.items():
             _kill(process)
             if process.returncode != 0:
-                _logger.warning(
-                    "%s has not received the whole run, which is in %s; see %s",
-                    name,
-                    self._directory,
-                    self._output.path,
-                )
+                said = f"; see {self._output.path}" if self._output.path.exists() else ""
+                _logger.warning("%s has not received the whole run, which is in %s%s", name, self._directory, said)
         self._processes.clear()
 
 
