@@ -105,7 +105,7 @@ class JsonClient:
         address = f"{scheme}://127.0.0.1:{port}/actor"
         self._stack = contextlib.ExitStack()
         self.socket: ClientConnection = self._stack.enter_context(
-            connect(address, open_timeout=LIMIT, close_timeout=LIMIT, **options)
+            connect(address, **{"open_timeout": LIMIT, "close_timeout": LIMIT, **options})
         )
 
     def send(self, kind: str, **fields: Any) -> None:

@@ -253,7 +253,7 @@ def test_client_that_reads_neither_answers_nor_pings_is_disconnected(
         "connection_made",
         lambda channel, transport: made.append(channel) or connection_made(channel, transport),
     )
-    client = JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1)
+    client = JsonClient(gateway.port, sock=deaf_socket(gateway.port), max_queue=1, close_timeout=1.0)  # nobody answers
     try:
         assert client.hello("deaf")["type"] == "welcome"
         for _ in range(1000):
