@@ -29,7 +29,7 @@ from daedalus.policy.saving.saved_policy import find_policy, pretrained
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
 
-BUDGET = {"env_steps": 5_000, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
+BUDGET = {"env_steps": 5_000, "actors": 1, "settings": {"evaluation.final_episodes": 3, "policy.hidden": [16]}}
 
 
 def test_importing_daedalus_loads_no_other_package() -> None:
@@ -66,7 +66,7 @@ def test_train_returns_the_result_in_another_thread(tmp_path: Path, capfd: pytes
     handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     results: list[daedalus.RunResult] = []
     directory = tmp_path / "from-a-thread"
-    arguments = {**BUDGET, "run_dir": str(directory), "quiet": True, "seed": 3, "actors": 1}
+    arguments = {**BUDGET, "run_dir": str(directory), "quiet": True, "seed": 3}
     thread = threading.Thread(target=lambda: results.append(daedalus.train("cartpole", **arguments)))
     thread.start()
     thread.join()
@@ -98,7 +98,7 @@ def test_train_prints_its_log_records_unless_quiet(tmp_path: Path, quiet: bool) 
     output = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
     lines = output.stdout.splitlines()
     assert lines[-1] == "[]"
-    assert any(line.startswith("CartPole-v1: appo, seed 1, 2 actors") for line in lines) != quiet
+    assert any(line.startswith("CartPole-v1: appo, seed 1, 1 actors") for line in lines) != quiet
     assert len(lines) == 1 or not quiet
     assert not output.stderr or not quiet
 
