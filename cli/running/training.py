@@ -4,6 +4,8 @@ import logging
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from daedalus.cli.child_output import ChildOutput, OpenStreams
 from daedalus.cli.processes import ORDERED, UNSAVED
@@ -50,52 +52,47 @@ def train(
 
     Adds the gateway to `page`, and starts the trackers. The caller ends them.
     """
+    with _observed_address(run) as address:
+        spec, options = run.spec, actor_arguments(run)
+        confirmations = Confirmations(run.directory, spec, evaluation_arguments(run), output)
+        learner = _supervised_learner(run, address, learner_streams)
+        actors: list[Supervised] = []
+        try:
+            # One by one: if one cannot be started, those before it are stopped.
+            for index in range(spec.collection.actors):
+                actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
+            training = spec.training
+            _logger.info(
+                "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
+                spec.environment.id,
+                training.algorithm,
+                training.seed,
+                len(actors),
+                spec.collection.envs_per_actor,
+                address,
+                run.directory,
+            )
+            if spec.evaluation.seconds is not None:
+                evaluating = (*options, "--evaluator")
+                actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
+            if run.watch:
+                page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
+            trackers.start()
+            return watch(learner, [*actors, *page], run, stopping, confirmations)
+        finally:
+            stop([learner.process, *(actor.process for actor in actors), *confirmations.processes])
+            confirmations.close()
+
+
+@contextmanager
+def _observed_address(run: LocalRun) -> Iterator[str]:
+    """Yield a private address for the learner. The observer of the run follows it there."""
     with private_address() as address:
         run.observer.begin(address)
         try:
-            return _train_at(address, run, stopping, output, learner_streams, page, trackers)
+            yield address
         finally:
             run.observer.end()
-
-
-def _train_at(
-    address: str,
-    run: LocalRun,
-    stopping: threading.Event,
-    output: ChildOutput,
-    learner_streams: OpenStreams,
-    page: list[Supervised],
-    trackers: TrackerProcesses,
-) -> int:
-    """Run the learner, and connect this machine's actors to it at an address."""
-    spec, options = run.spec, actor_arguments(run)
-    confirmations = Confirmations(run.directory, spec, evaluation_arguments(run), output)
-    learner = _supervised_learner(run, address, learner_streams)
-    actors: list[Supervised] = []
-    try:
-        for index in range(spec.collection.actors):  # one by one: if one cannot be started, those before it are stopped
-            actors.append(supervised_actor(f"actor-{index}", address, options, output.pipes, output.last_error))
-        training = spec.training
-        _logger.info(
-            "%s: %s, seed %d, %d actors x %d environments at %s; run directory %s",
-            spec.environment.id,
-            training.algorithm,
-            training.seed,
-            len(actors),
-            spec.collection.envs_per_actor,
-            address,
-            run.directory,
-        )
-        if spec.evaluation.seconds is not None:
-            evaluating = (*options, "--evaluator")
-            actors.append(supervised_actor(_EVALUATOR, address, evaluating, output.pipes, output.last_error))
-        if run.watch:
-            page.append(supervised_gateway(address, gateway_arguments(run), output.pipes))
-        trackers.start()
-        return watch(learner, [*actors, *page], run, stopping, confirmations)
-    finally:
-        stop([learner.process, *(actor.process for actor in actors), *confirmations.processes])
-        confirmations.close()
 
 
 def _supervised_learner(run: LocalRun, address: str, open_streams: OpenStreams) -> Supervised:
