@@ -29,7 +29,8 @@ from daedalus.actor.clock import Clock
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.service import ActorConfig, ActorService, LinkChoice
+from daedalus.actor.session.config import ActorConfig, LinkChoice
+from daedalus.actor.session.service import ActorService
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import MAX_ENVIRONMENTS

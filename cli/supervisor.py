@@ -25,7 +25,7 @@ _CRASHES = {
 _MOST_FAILURES = 3  # of one process, in a row
 _SOON_SECONDS = 60.0  # a process that ran for longer before it ended starts a new count
 _MOST_RESTARTS = 1000  # of one process that is killed from outside
-_LEAVING_SECONDS = 10.0  # between the end of the first process and the end of the others
+_LEAVING_SECONDS = 30.0  # between the end of the first process and the end of the others
 _GRACE_SECONDS = 4.0  # from SIGTERM to SIGKILL
 
 _ACTOR_ERROR = "daedalus actor: "  # beginning of the line in which an actor reports its error

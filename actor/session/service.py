@@ -7,30 +7,28 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 from daedalus.actor.collecting.collector import Collector
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.errors import ActorError, LearnerLostError
 from daedalus.actor.session.client_reports import ClientReports
+from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.learner_presence import LearnerPresence
 from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.actor.session.origin import own_origin
 from daedalus.actor.session.run_end import RunEndWatch, RunOverError
+from daedalus.actor.session.runtime_maker import RuntimeMaker
 from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
-from daedalus.actor.session.snapshot_source import FIRST_PUSH_SECONDS, MISSED_PUSH_SECONDS, SnapshotSource
+from daedalus.actor.session.snapshot_source import SnapshotSource
 from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.actor.session.uploads import RolloutUploads, Uploads, make_uploads
-from daedalus.policy.acting.runtime import OnnxRuntime, PolicyRuntime
-from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Snapshot, Welcome
-from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
 from daedalus.transport.interface import Transport
@@ -39,32 +37,8 @@ _logger = logging.getLogger(__name__)
 
 _CONFIRMATIONS = 4  # requests for a newer snapshot within the largest age of the policy
 _REFRESH_SECONDS = 0.2  # while a client fills a rollout: how often newer weights are looked for
-_SLOW_LINK_SECONDS, _SLOW_LINK_RATE = 0.1, 1 << 20  # a link is slow beyond this latency and so many bytes a second
 _MANY_REJECTIONS = 20  # warn after this many consecutive rejections
 _SLOW_LINK_WINDOW = 4  # most rollouts in flight on a slow link, unless the run asks for more
-
-LinkChoice = Literal["auto", "lan", "wan"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ActorConfig:
-    """Everything that an actor decides for itself."""
-
-    name: str
-    incarnation: int
-    run: str = keys.ANY_RUN
-    environments: int | None = None  # E; None: as many as the learner's specification says
-    runtime: Literal["onnx", "torch"] = "onnx"
-    modules: UserModules = NO_MODULES  # that may be imported for environments
-    link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
-    timeout: float | None = None  # seconds to look for a learner; None: for ever
-    waits_for_return: bool = False  # whether to look for ever for a learner that has gone, whatever the timeout
-    max_policy_age: float | None = None  # seconds within which the learner must confirm the policy; None: no limit
-    any_run: bool = False  # whether the actor may change to another run when its learner has gone
-
-    def run_to_join(self, followed: str) -> str:
-        """Return the run to look for; `followed` is the run that the actor joined before, or an empty text."""
-        return self.run if self.any_run or not followed else followed
 
 
 class ActorService:
@@ -103,6 +77,7 @@ class ActorService:
         )
         self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
         self._snapshots = SnapshotSource(self._feed, self._monitor, self._uploads)
+        self._runtimes = RuntimeMaker(config, self._queries, self._feed, self._monitor, self._end, stop)
         self._reports = None if report is None else ClientReports(transport, report)
         self._contents: Uploads = RolloutUploads()  # what is uploaded of the rollouts
         self._runs: set[str] = set()  # in which this actor's presence is declared
@@ -172,7 +147,7 @@ class ActorService:
         if self._config.link == "wan" and not welcome.spec.algorithm.synchronous:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
-        runtime = self._make_runtime(confirmed, spaces, count)
+        runtime = self._runtimes.make(confirmed, spaces, count)
         self._collector.begin(runtime, confirmed.spec, confirmed.seed, confirmed.epsilon)
         self._contents = make_uploads(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
@@ -185,48 +160,6 @@ class ActorService:
         self._runs.add(run)
         self._transport.watch_presence(keys.learner(run), self._presence.on_presence)
         self._transport.declare_presence(keys.presence(run, self._config.name, self._config.incarnation))
-
-    def _make_runtime(self, welcome: Welcome, spaces: Spaces, environments: int) -> PolicyRuntime:
-        if self._config.runtime == "torch":
-            from daedalus.policy.acting.torch_runtime import TorchRuntime  # the only part of an actor with torch
-
-            return TorchRuntime(welcome.spec.policy, spaces, welcome.spec.training)
-        rows = environments * welcome.spec.collection.rollout_length  # a rollout is played with one snapshot
-        return OnnxRuntime(self._await_program(welcome), self._stop, rows)
-
-    def _await_program(self, welcome: Welcome) -> bytes:
-        """Return the program once the learner has it; measure the link by the time that it takes."""
-        pause = FIRST_PUSH_SECONDS
-        while True:
-            began = time.monotonic()
-            program = self._queries.program(welcome.run)
-            if program is not None:
-                break
-            self._feed.subscribe()  # nothing is pushed yet: the first snapshot says that the program is there too
-            self._monitor.wait_for_message(pause)
-            self._feed.read()
-            pause = min(2 * pause, MISSED_PUSH_SECONDS)
-        if self._config.link == "auto" and not welcome.spec.algorithm.synchronous:
-            self._measure_link(welcome, time.monotonic() - began, len(program[1]))
-        return program[1]
-
-    def _measure_link(self, welcome: Welcome, seconds: float, size: int) -> None:
-        """Use compact snapshots if the program takes long again and again: once may be a busy machine."""
-        allowed = _SLOW_LINK_SECONDS + size / _SLOW_LINK_RATE
-        for _ in range(2):
-            if seconds <= allowed:
-                return
-            self._end.check()  # a request may take 5 s
-            began = time.monotonic()
-            self._queries.program(welcome.run)
-            seconds = time.monotonic() - began
-        if seconds > allowed:
-            _logger.info(
-                "slow link: %s bytes took %.2f s; fetching compact snapshots as often as it allows",
-                f"{size:,}",
-                seconds,
-            )
-            self._feed.use_compact_snapshots()
 
     # ------------------------------------------------------------------------------------------- collecting
 

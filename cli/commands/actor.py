@@ -14,7 +14,8 @@ from dataclasses import replace
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.errors import ActorError
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.actor.session.config import ActorConfig
+from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals

@@ -6,7 +6,7 @@ import re
 import secrets
 import socket
 
-from daedalus.actor.session.service import ActorConfig
+from daedalus.actor.session.config import ActorConfig
 from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import add_logging
 from daedalus.policy.user_modules import UserModules

@@ -10,7 +10,7 @@ from processes import LIMIT, until
 from scripted_learner import SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session import learner_queries, service, session_monitor
+from daedalus.actor.session import learner_queries, runtime_maker, service, session_monitor
 from daedalus.protocol import keys
 from daedalus.protocol.codec import PROTOCOL_VERSION, encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded, Welcome
@@ -283,7 +283,7 @@ def test_an_actor_that_is_stopped_during_a_query_sends_no_other_query(
     learner = ScriptedLearner(network)
     learner.publish(0)
     actor = RunningActor(network, begin=False)
-    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
+    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)  # the link is measured by several queries
     query, sent = actor.transport.query, list[str]()
 
     def stopping_query(key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:

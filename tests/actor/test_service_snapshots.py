@@ -10,8 +10,8 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
-from daedalus.actor.session import learner_queries, service, snapshot_feed, snapshot_source
-from daedalus.actor.session.service import LinkChoice
+from daedalus.actor.session import learner_queries, runtime_maker, service, snapshot_feed, snapshot_source
+from daedalus.actor.session.config import LinkChoice
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
@@ -43,7 +43,7 @@ def test_actor_never_subscribes_on_a_link_measured_as_slow(
         return subscribe(transport, key, on_news)
 
     monkeypatch.setattr(MemoryTransport, "subscribe", noted)
-    monkeypatch.setattr(service, "_SLOW_LINK_SECONDS", -LIMIT)
+    monkeypatch.setattr(runtime_maker, "_SLOW_LINK_SECONDS", -LIMIT)
     learner = ScriptedLearner(network)
     learner.publish(3)
     actor = RunningActor(network)

@@ -18,7 +18,8 @@ from processes import LIMIT, until
 
 from daedalus.actor.collecting.environment_collector import EnvironmentCollector
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.service import ActorConfig, ActorService
+from daedalus.actor.session.config import ActorConfig
+from daedalus.actor.session.service import ActorService
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.run.counters import RunCounters

@@ -12,7 +12,7 @@ from processes import LIMIT, until
 from session_fleet import GatedActor, LearnerProcess
 
 from daedalus.actor.evaluation.evaluator import Evaluator
-from daedalus.actor.session.service import ActorConfig
+from daedalus.actor.session.config import ActorConfig
 from daedalus.learner.reporting.run_reporter import RunReporter
 from daedalus.learner.serving import actor_server
 from daedalus.learner.training import checkpointer
