@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.specification import meanings
 
 MARKER = "<!-- settings -->"
 _BOUNDS = {Ge: ("ge", "≥"), Gt: ("gt", ">"), Le: ("le", "≤"), Lt: ("lt", "<")}
@@ -30,15 +31,15 @@ def settings_tables() -> str:
 def _section(name: str, model: Any) -> str:
     assert issubclass(model, BaseModel)
     title = (model.__doc__ or "").strip().replace("\n    ", "\n")
-    rows = [_row(name, key, field) for key, field in model.model_fields.items()]
+    texts = meanings(model)
+    rows = [_row(name, key, field, texts.get(key, "")) for key, field in model.model_fields.items()]
     return "\n".join(
         [f"## {name}", "", title, "", "| setting | type | range | default | meaning |", "|---|---|---|---|---|", *rows]
     )
 
 
-def _row(section: str, key: str, field: FieldInfo) -> str:
+def _row(section: str, key: str, field: FieldInfo, meaning: str) -> str:
     kind = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
-    meaning = " ".join((field.description or "").split())
     cells = (f"`{section}.{key}`", _type(kind), _range(kind), _default(field), meaning)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.specification import meanings
 
 _FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
 
@@ -191,8 +192,7 @@ def _description(path: list[str]) -> str:
     """Return the description of a setting, or of the list that it is part of, in one line, or an empty string."""
     path = [part for part in path if not part.isdigit()]
     model = _model(path[:-1])
-    field = model.model_fields.get(path[-1]) if model else None
-    return " ".join((field.description or "").split()) if field else ""
+    return meanings(model).get(path[-1], "") if model else ""
 
 
 def _known_names(path: list[str]) -> list[str]:

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from daedalus.cli.main import USAGE
 from daedalus.learner.reporting.metrics import GROUPS
 from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.specification import meanings
 
 SETTINGS = hook("settings_reference").settings_tables().splitlines()
 COMMANDS = hook("command_reference")
@@ -27,8 +28,7 @@ FIELDS = [(section, key) for section, model in sections().items() for key in mod
 
 @pytest.mark.parametrize(("section", "key"), FIELDS)
 def test_every_setting_has_a_meaning_and_a_row(section: str, key: str) -> None:
-    description = sections()[section].model_fields[key].description or ""
-    assert re.fullmatch(r"[^a-z].*[.]", " ".join(description.split())), description
+    assert re.fullmatch(r"[^a-z].*[.]", meanings(sections()[section])[key])
     rows = [row for row in SETTINGS if row.startswith(f"| `{section}.{key}` |")]
     assert len(rows) == 1
     assert rows[0].count("|") - rows[0].count("\\|") == 6
