@@ -1,6 +1,7 @@
 """`daedalus evaluate` as child processes of a run."""
 
 import json
+import signal
 import subprocess
 import tempfile
 import threading
@@ -12,6 +13,7 @@ from daedalus.cli.child_output import STREAMS, ChildOutput
 from daedalus.cli.supervisor import start, stop
 
 _POLL_SECONDS = 0.05
+_REPORTED = (1, 2)  # exit statuses of a `daedalus evaluate` that has printed the reason
 
 
 class EvaluationFailedError(Exception):
@@ -51,16 +53,28 @@ class EvaluationProcess:
 
     def result(self) -> dict[str, Any]:
         """Return the result of a process that has ended. Raises EvaluationFailedError if it failed."""
-        if self._process.returncode != 0:
-            # The environment may have printed much: the error is at the end.
-            raise EvaluationFailedError("\n".join(self._output.unshown(self._name)))
+        status = self._process.returncode
         self._file.seek(0)
-        return json.load(self._file)
+        text = self._file.read()
+        if status == 0 and text:
+            return json.loads(text)
+        # The environment may have printed much: the error is at the end.
+        lines = self._output.unshown(self._name)
+        reported = status in _REPORTED and self._output.last_error(self._name)
+        raise EvaluationFailedError("\n".join(lines if reported else [*lines, _died(status)]))
 
     def close(self) -> None:
         """End the process if it still runs."""
         stop([self._process])
         self._file.close()
+
+
+def _died(status: int) -> str:
+    """Return the error of an evaluation whose process ended without a result, from its exit status."""
+    if status == -getattr(signal, "SIGKILL", 9):
+        return "an evaluation was killed (signal 9): check whether it was killed for lack of memory"
+    how = f"signal {-status}" if status < 0 else f"status {status}"
+    return f"the environment or one of its libraries ended an evaluation ({how}): play it with `daedalus check`"
 
 
 def play(commands: list[list[str]], stopping: threading.Event, output: ChildOutput) -> list[dict[str, Any]]:

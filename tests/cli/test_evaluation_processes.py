@@ -1,0 +1,35 @@
+"""cli/evaluation_processes.py: an evaluation whose process ends without a result."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from daedalus.cli import evaluation_processes
+from daedalus.cli.child_output import ChildOutput, Streams
+from daedalus.cli.evaluation_processes import EvaluationFailedError, play
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("import os; os._exit(0)", r"ended an evaluation \(status 0\): play it with `daedalus check`"),
+        ("import os; os._exit(1)", r"ended an evaluation \(status 1\)"),
+        ("import os; os._exit(7)", r"ended an evaluation \(status 7\)"),
+        ("import os; os.abort()", r"ended an evaluation \(signal 6\)"),
+        ("import os; os.kill(os.getpid(), 9)", r"was killed \(signal 9\): check whether .* lack of memory"),
+    ],
+)
+def test_a_process_that_ends_without_a_result_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
+) -> None:
+    def start(_module: str, *_arguments: str, streams: Streams) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-S", "-c", program]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=streams.stdout, stderr=streams.stderr)
+
+    monkeypatch.setattr(evaluation_processes, "start", start)
+    output = ChildOutput(tmp_path / "output.log", print, print)
+    with pytest.raises(EvaluationFailedError, match=reason):
+        play([["RUN_DIR"]], threading.Event(), output)
