@@ -148,6 +148,9 @@ def watch(
                 # A synchronous algorithm waits for all actors at its start.
                 needed = not playing or run.spec.algorithm.synchronous
                 if needed and actor.name not in _HELPERS:
+                    _end(learner.process, stopping)
+                    if learner.process.returncode in FINISHED:  # it had all env_steps that it needs
+                        return learner.process.returncode
                     raise (error if playing else FailedError("all actors", error.reason, "failed")) from None
                 _warn(f"{error}; training continues without this process", record)
     return 1

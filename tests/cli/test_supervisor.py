@@ -174,6 +174,24 @@ def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synch
         stop([each.process for each in processes])
 
 
+def test_training_that_has_finished_is_not_failed_by_actors_that_fail_at_its_end(tmp_path: Path) -> None:
+    spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
+    run = LocalRun(directory=tmp_path, spec=spec, started=0.0)
+    confirmations = Confirmations(tmp_path, spec, [], ChildOutput(tmp_path / "output.log", print, print))
+    ready = tmp_path / "ready"
+    learner = supervised(
+        "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(3)); "
+        f"open({str(ready)!r}, 'x'); {SLEEP}",
+        ended={0, 3},
+    )
+    until(ready.exists)
+    actor = supervised("raise SystemExit(7)")
+    try:
+        assert watch(learner, [actor], run, threading.Event(), confirmations) == 3
+    finally:
+        stop([learner.process, actor.process])
+
+
 def test_training_that_a_callback_ended_is_not_evaluated_if_its_last_checkpoint_could_not_be_saved(
     tmp_path: Path,
 ) -> None:
