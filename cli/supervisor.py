@@ -128,6 +128,11 @@ class Supervised:
             self._ended_at = self._ended_at or now
             if now < self._ended_at + _LEAVING_SECONDS:
                 return None
+            # The code of a user may end its process with the status of one whose work is done.
+            self.failures = self.failures + 1 if self._ended_at - self._started < _SOON_SECONDS else 0
+            if self.failures >= _MOST_FAILURES:
+                raise FailedError(self.name, self.reason(status), f"ended {self.failures} times before the run")
+            self.restarts += 1
             self._start(first=False)
             return f"{self.name} ended before the run; started again"
         if now - self._started >= _SOON_SECONDS:

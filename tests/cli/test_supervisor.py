@@ -153,6 +153,16 @@ def test_a_process_that_ended_before_the_others_is_restarted(monkeypatch: pytest
     stop([process.process])
 
 
+def test_a_process_that_ends_early_again_and_again_is_not_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module of the user may call `os._exit(0)`."""
+    process = supervised("pass")
+    monkeypatch.setattr(supervisor, "_LEAVING_SECONDS", 0.0)
+    assert [message(process), message(process)] == ["worker ended before the run; started again"] * 2
+    with pytest.raises(FailedError, match="worker ended 3 times before the run"):
+        message(process)
+    stop([process.process])
+
+
 @pytest.mark.parametrize(("algorithm", "continues"), [("impala", True), ("a2c", False)])
 def test_training_continues_without_a_failed_actor_unless_the_algorithm_is_synchronous(
     algorithm: str, continues: bool, caplog: pytest.LogCaptureFixture, tmp_path: Path
