@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed, VectorEnvironment
 from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
@@ -79,7 +80,7 @@ def play_episodes(
       progress: called after every step with the number of episodes that ended and their mean return (NaN at first).
         If it returns True, the episodes in progress are cut, and no other begins.
 
-    Returns: the results of the episodes that began.
+    Returns: the results of the episodes that began. Raises EnvironmentSetupError for a reward that is not finite.
     """
     environment_seed, action_seed = (int(word) for word in np.random.SeedSequence(seed).generate_state(2))
     results = _Results(episodes)
@@ -151,6 +152,7 @@ def _play_round(
     for _ in range(longest):
         actions, state = _act(runtime, stacks.observations, state, random.draw(), observed.masks)
         observed, rewards, terminated, truncated = environments.step(actions)
+        _check_finite(rewards[playing], numbers[playing])
         stacks.push(observed.frames, np.zeros(count, np.bool_))
         results.returns[numbers[playing]] += rewards[playing]
         results.lengths[numbers[playing]] += 1
@@ -162,6 +164,16 @@ def _play_round(
         if not playing.any():
             break
     return True
+
+
+def _check_finite(rewards: np.ndarray, numbers: np.ndarray) -> None:
+    """Raise EnvironmentSetupError if a reward [n] of the episodes `numbers` [n] is not finite: they have no return."""
+    faulty = ~np.isfinite(rewards)
+    if faulty.any():
+        raise EnvironmentSetupError(
+            f"the environment gave the reward {rewards[faulty][0]} in episode {numbers[faulty][0] + 1} of the "
+            "evaluation: rewards must be finite; correct its `step`"
+        )
 
 
 def _act(

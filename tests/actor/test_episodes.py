@@ -4,14 +4,17 @@ import os
 from typing import Any
 
 import numpy as np
+import pytest
 from allowed_modules import TEST_MODULES
 from counting_environment import Counting
 from plain import PlainPolicy
 
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import VectorEnvironment
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.evaluation.episodes import environments_for, play_episodes
 from daedalus.policy.acting.noise import Noise
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec
 
 COUNTING = EnvironmentSpec(id="counting_environment:Counting-v0")
@@ -133,6 +136,14 @@ def test_progress_may_end_the_evaluation() -> None:
     assert evaluation.returns.tolist() == [3, 3, 10, 10]
     assert evaluation.lengths.tolist() == [3, 3, 1, 1]
     assert evaluation.cut.tolist() == [False, False, True, True]
+
+
+def test_a_reward_that_is_not_finite_ends_the_evaluation() -> None:
+    spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "reward"})
+    modules = UserModules(frozenset({"faulty_environments"}))
+    environments = make_environments(spec, 2, modules=modules, for_evaluation=True)
+    with pytest.raises(EnvironmentSetupError, match="gave the reward nan in episode 1 of the evaluation"):
+        play_episodes(AlwaysZero(), environments, 2, 1, sampled=False)
 
 
 def test_environments_in_processes_are_limited_per_processor() -> None:
