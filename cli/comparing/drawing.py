@@ -1,5 +1,6 @@
 """Pictures of groups of runs. Imports matplotlib, an extra, when a picture is drawn."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -90,10 +91,16 @@ def _pyplot():
 
 
 def _save(figure, output: Path) -> None:
+    """Write the picture at once: on a full disk the one before it stays. Raises OSError."""
     import matplotlib.pyplot as plt
 
-    figure.savefig(output, dpi=110)
-    plt.close(figure)
+    beside = output.with_name(f".{output.stem}.{os.getpid()}.partial{output.suffix}")
+    try:
+        figure.savefig(beside, dpi=110)
+        os.replace(beside, output)
+    finally:
+        plt.close(figure)
+        beside.unlink(missing_ok=True)
 
 
 def _draw_group(axis: "Axes", group: Group, column: str, by: str) -> None:

@@ -1,5 +1,6 @@
 """Test of `daedalus plot`."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,26 @@ def test_plot_writes_a_picture_of_groups_and_single_runs(
     assert capsys.readouterr().err == ""
 
 
+def test_a_full_disk_leaves_the_picture_that_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    def savefig(_figure: Figure, path: Path, **_options: object) -> None:
+        path.write_bytes(b"half of it")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    record(tmp_path / "one")
+    picture = tmp_path / "curve.png"
+    picture.write_bytes(b"the one before")
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    assert plot([str(tmp_path / "one"), "--output", str(picture)]) == 1
+    assert capsys.readouterr().err == f"daedalus plot: {picture}: No space left on device\n"
+    assert picture.read_bytes() == b"the one before"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["curve.png", "one"]
+
+
 def test_a_curve_is_drawn_for_each_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seeds of one setting are one curve."""
     pytest.importorskip("matplotlib")
@@ -54,7 +75,12 @@ def test_a_curve_is_drawn_for_each_group(tmp_path: Path, monkeypatch: pytest.Mon
             settings = [f"collection.rollout_length={length}"]
             record(tmp_path / f"{length}-{seed}", seed=seed, settings=settings, returns=(10.0 * seed,) * 3)
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_words, **_options: figures.append(figure))
+
+    def savefig(figure: Figure, path: Path, **_options: object) -> None:
+        figures.append(figure)
+        path.touch()
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
     assert plot([str(tmp_path), "--output", str(tmp_path / "curve.png")]) == 0
     axis = figures[0].axes[0]
     assert [line.get_label() for line in axis.get_lines()] == [
