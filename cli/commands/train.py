@@ -283,6 +283,8 @@ def _run(
             print(f"{command}: {str(error).rstrip()}", file=sys.stderr)
         if not (resume or output.withheld or isinstance(error, UnsavedError)):
             run_directory.remove_failed(directory)
+        if not isinstance(error, UnsavedError) and checkpoints(directory):
+            print(f"when that is corrected, continue with: {resume_command(run)}", file=sys.stderr)
         return error.status
     show(report(run, end.summary), command)
     return end.status

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.commands import train as train_command
 from daedalus.cli.running import final_evaluation, training
-from daedalus.cli.running.local_run import LocalRun
+from daedalus.cli.running.local_run import LocalRun, RunFailedError
 from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.supervisor import Supervised
 from daedalus.protocol.spec import RunSpec
@@ -42,6 +43,28 @@ def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
         for process in started:
             process.kill()
             process.wait()
+
+
+@pytest.mark.parametrize("reason", ["all actors failed: joint 3 is stuck", ""], ids=["a reason", "printed by a child"])
+def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], reason: str
+) -> None:
+    directory = tmp_path / "run"
+
+    def fail(*_: Any) -> None:
+        (directory / "checkpoints" / "0000000001").mkdir(parents=True)
+        raise RunFailedError(reason)
+
+    monkeypatch.setattr(train_command, "run_locally", fail)
+    monkeypatch.setattr(train_command, "checked_spaces", lambda *_, **_others: None)
+    monkeypatch.setattr(train_command, "configure_logging", lambda *_, **_others: None)
+    monkeypatch.setattr(train_command, "stop_on_signals", threading.Event)
+    monkeypatch.setattr(train_command.signal, "signal", lambda *_: None)
+    assert train_command.train(["cartpole", "--run-dir", str(directory)]) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        *([f"daedalus train: {reason}"] if reason else []),
+        f"when that is corrected, continue with: daedalus resume {directory}",
+    ]
 
 
 @pytest.mark.parametrize(("algorithm", "played"), [("impala", ["greedy", "sampled"]), ("n_step_q", ["greedy"])])
