@@ -1,6 +1,8 @@
 """Environments of this process, stepped one after the other: gymnasium's SyncVectorEnv for actors."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -17,7 +19,20 @@ class EnvironmentsInTurn(SyncVectorEnv):
     """
 
     def __init__(self, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
-        super().__init__(makers, autoreset_mode=AutoresetMode.NEXT_STEP)
+        """Make the environments. If one cannot be made, close the others: a simulator may outlive this process."""
+        made: list[gymnasium.Env] = []
+
+        def make(maker: Callable[[], gymnasium.Env]) -> gymnasium.Env:
+            made.append(maker())
+            return made[-1]
+
+        try:
+            super().__init__([partial(make, maker) for maker in makers], autoreset_mode=AutoresetMode.NEXT_STEP)
+        except BaseException:
+            for environment in made:
+                with suppress(Exception, SystemExit):  # of the user's code
+                    environment.close()
+            raise
         self._collecting = False
 
     def _add_info(self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int) -> dict[str, Any]:

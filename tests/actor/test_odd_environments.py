@@ -1,8 +1,10 @@
 """Environments of users that keep to gymnasium's interface in ways that few do: they are checked and played."""
 
 import logging
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from collectors import collect, started_collector
@@ -10,6 +12,7 @@ from plain import PlainPolicy
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.noise import Noise
 from daedalus.policy.user_modules import UserModules
@@ -106,3 +109,24 @@ def test_component_without_a_fixed_shape_can_be_left_out(processes: bool) -> Non
 @pytest.mark.parametrize("seed", range(8))
 def test_seeds_of_training_fit_an_int_of_c(seed: int) -> None:
     collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
+
+
+def test_environments_are_closed_if_another_cannot_be_made() -> None:
+    """Simulators that were started would go on, and occupy the ports of those that the next process starts."""
+    closed: list[int] = []
+
+    class Simulator(gymnasium.Env[Any, Any]):
+        observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
+
+        def __init__(self, number: int) -> None:
+            self._number = number
+            if number == 3:
+                raise ConnectionError("all licences are in use")
+
+        def close(self) -> None:
+            closed.append(self._number)
+            raise RuntimeError("has no connection")
+
+    with pytest.raises(ConnectionError, match="licences"):
+        EnvironmentsInTurn([partial(Simulator, number) for number in range(1, 5)])
+    assert closed == [1, 2]
