@@ -48,6 +48,7 @@ _OTHER_LEARNER_SECONDS = 2.0  # to wait for the answer of another learner of thi
 _LEAVE_SECONDS = 5.0  # after the end of the run, for the actors to leave
 _ASK_SECONDS = 2.0  # in which an actor asks again that was refused because its name is in use
 _REPEAT_SECONDS = 0.5  # between repetitions of the message that the run is over
+_START = "`daedalus actor --connect ADDRESS`"
 _HINT_SECONDS = 3.0  # without an actor for so long, log how to start one
 
 _logger = logging.getLogger(__name__)
@@ -193,14 +194,15 @@ class ActorServer:
 
         `on_wait` is called again and again meanwhile.
         """
-        hint_at: float | None = time.monotonic() + _HINT_SECONDS
+        hint_at, hinted = time.monotonic() + _HINT_SECONDS, None
         with self.lock:
             while not self.fleet.has_had_actors and not stop.is_set():
                 on_wait()
                 self.lock.wait(HEARTBEAT_SECONDS)
-                if hint_at is not None and time.monotonic() > hint_at:
-                    _logger.info("waiting for the first actor: start one with `daedalus actor --connect ADDRESS`")
-                    hint_at = None
+                if time.monotonic() > hint_at and hinted != self._responses.preparing:
+                    hinted = self._responses.preparing
+                    doing = f"{hinted} makes its environments" if hinted else f"start one with {_START}"
+                    _logger.info("waiting for the first actor: %s", doing)
             return self.fleet.has_had_actors
 
     def offer_policy(self, program: bytes, state_size: int, gradient_shapes: Shapes = MappingProxyType({})) -> None:

@@ -44,6 +44,7 @@ class QueryResponses:
         self._program: Program | None = None
         self._encoded_program = b""
         self._ending: Refusal | None = None  # of joins after the end
+        self.preparing = ""  # the first actor that asked for the specification, and makes its environments
         self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
 
     def join(self, name: str, data: bytes, now: float) -> bytes:
@@ -74,6 +75,7 @@ class QueryResponses:
         if is_new and isinstance(message, Join) and message.spaces is not None:
             text = f"joined with {message.environments} environments{_where(origin)}"
             self._events.add("joined", text, actor=name)
+        self.preparing = self.preparing or name
         welcome = Welcome(run=self._run, learner_epoch=self._epoch, seed=seed, epsilon=epsilon, spec=self._spec)
         return encode(welcome)
 
