@@ -2,12 +2,14 @@
 
 import faulthandler
 import json
+import math
 import os
 import select
 import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +69,12 @@ class EnvironmentCheck:
 
 
 def check_in_process(
-    check: EnvironmentCheck, *, fork: bool = False, stop: threading.Event | None = None
+    check: EnvironmentCheck,
+    *,
+    fork: bool = False,
+    stop: threading.Event | None = None,
+    slow_seconds: float = math.inf,
+    on_slow: Callable[[], object] = lambda: None,
 ) -> "EnvironmentReport":
     """Run a check in a process of its own, and return what was found. An environment that ends it has a problem.
 
@@ -76,6 +83,7 @@ def check_in_process(
       fork: start the process by a fork if it is safe, which takes 0.1 s instead of 0.5 s. For commands, whose process
         has nothing that does not work after a fork. Only for a check that is not shown.
       stop: ends the check early when it is set.
+      slow_seconds, on_slow: call this function once if the check takes so long.
 
     Raises CheckTimeoutError.
     """
@@ -90,7 +98,7 @@ def check_in_process(
         finally:
             os.close(writing)
         try:
-            answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds)
+            answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds, slow_seconds, on_slow)
             if answer:
                 os.kill(pid, signal.SIGKILL)  # threads of the environment could keep it alive
         except BaseException:
@@ -105,12 +113,18 @@ def check_in_process(
     return EnvironmentReport.model_validate_json(answer)
 
 
-def _read(descriptor: int, stop: threading.Event, seconds: float) -> bytes:
+def _read(
+    descriptor: int, stop: threading.Event, seconds: float, slow_seconds: float, on_slow: Callable[[], object]
+) -> bytes:
     """Read one line, or nothing if the other end closes before. Raises CheckTimeoutError."""
-    data, until = b"", time.monotonic() + seconds
+    data, began = b"", time.monotonic()
     while not data.endswith(b"\n"):  # not to the end: processes of the environment may hold the descriptor
-        if stop.is_set() or time.monotonic() > until:
+        passed = time.monotonic() - began
+        if stop.is_set() or passed > seconds:
             raise CheckTimeoutError(f"not done within {seconds:g} s")
+        if passed > slow_seconds:
+            slow_seconds = math.inf
+            on_slow()
         if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
             continue
         part = os.read(descriptor, 1 << 16)

@@ -6,6 +6,7 @@ The process ends before the actors start, so that a simulator of which only one 
 import logging
 import os
 import threading
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
@@ -22,6 +23,7 @@ _logger = logging.getLogger(__name__)
 
 _PLAY_SECONDS, _PLAY_ENV_STEPS = 0.3, 50
 _MOST_SECONDS = 20.0  # a simulator may need long to start; the run does not wait for it any longer
+_MOST_SECONDS_FOR_SETTINGS = 120.0  # unless its settings depend on the spaces
 
 
 class EnvironmentProblemError(Exception):
@@ -44,14 +46,15 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
     A text that never changes is left out, and logged.
     """
-    return _defaults(_checked(spec, fork), spec)
+    return _defaults(_checked(spec, fork, for_settings=True), spec)
 
 
-def _checked(spec: RunSpec, fork: bool) -> "EnvironmentReport":
+def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
     from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps, uninformative_bounds
 
     try:
-        report = quick_check(spec.environment, UserModules(frozenset(modules_of(spec.user_modules))), fork=fork)
+        modules = UserModules(frozenset(modules_of(spec.user_modules)))
+        report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings)
     except CheckTimeoutError as error:
         _logger.warning("the check of the environment was %s: the run starts without it", error)
         return EnvironmentReport()
@@ -108,16 +111,18 @@ def expected_defaults(
     spec: RunSpec, modules: UserModules, stop: threading.Event
 ) -> tuple[Spaces | None, dict[str, Any]]:
     """Return the spaces of an environment without settings, and the default settings for it. See expected_spaces."""
-    return _defaults(_expected(spec, modules, stop), spec)
+    return _defaults(_expected(spec, modules, stop, for_settings=True), spec)
 
 
-def _expected(spec: RunSpec, modules: UserModules, stop: threading.Event) -> "EnvironmentReport":
+def _expected(
+    spec: RunSpec, modules: UserModules, stop: threading.Event, *, for_settings: bool = False
+) -> "EnvironmentReport":
     from daedalus.actor.checking.report import EnvironmentReport
 
     try:
-        report = quick_check(spec.environment, modules, play=False, stop=stop)
+        report = quick_check(spec.environment, modules, play=False, stop=stop, for_settings=for_settings)
     except CheckTimeoutError as error:
-        reason = str(error)
+        reason = f"the check of environment {spec.environment.id} was {error}"
     else:
         if report.spaces is not None and not report.problems:
             return report
@@ -129,6 +134,12 @@ def _expected(spec: RunSpec, modules: UserModules, stop: threading.Event) -> "En
 def _defaults(report: "EnvironmentReport", spec: RunSpec) -> tuple[Spaces | None, dict[str, Any]]:
     for name, text in report.constant_texts.items():
         _logger.info("observation component %r is left out (environment.leave_out): it is always %r", name, text)
+    if report.spaces is None:
+        _logger.warning(
+            "the default settings are those for numbers and discrete actions, because the spaces of environment %s are "
+            "not known: if it has images or continuous actions, name the settings with --set or in a TOML file",
+            spec.environment.id,
+        )
     return report.spaces, default_settings(report.spaces, [*spec.environment.leave_out, *report.constant_texts])
 
 
@@ -139,6 +150,7 @@ def quick_check(
     play: bool = True,
     fork: bool = False,
     stop: threading.Event | None = None,
+    for_settings: bool = False,
 ) -> "EnvironmentReport":
     """Make one environment, play it for up to 0.3 s, close it, and return what was found.
 
@@ -149,17 +161,22 @@ def quick_check(
       fork: start the process by a fork if it is safe, which takes 0.1 s instead of 0.5 s. For commands, whose process
         has nothing that does not work after a fork.
       stop: ends the check early when it is set.
+      for_settings: wait longer for a simulator that starts slowly: the settings of the run depend on its spaces.
 
     Raises CheckTimeoutError.
     """
+    most_seconds = _MOST_SECONDS_FOR_SETTINGS if for_settings else _MOST_SECONDS
+    waiting = "the check of environment %s takes long: waiting up to %g s, because its spaces decide the settings"
     return check_in_process(
         EnvironmentCheck(
             spec=spec,
             modules=modules,
             seconds=_PLAY_SECONDS if play else 0.0,
             env_steps=_PLAY_ENV_STEPS,
-            most_seconds=_MOST_SECONDS,
+            most_seconds=most_seconds,
         ),
         fork=fork,
         stop=stop,
+        slow_seconds=_MOST_SECONDS,
+        on_slow=partial(_logger.info, waiting, spec.id, most_seconds),
     )

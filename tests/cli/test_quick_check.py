@@ -23,6 +23,7 @@ from daedalus.cli.quick_check import (
     quick_check,
     transformed_spaces,
 )
+from daedalus.learner.run.default_settings import default_settings
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
@@ -59,6 +60,21 @@ def test_a_run_does_not_wait_for_an_environment_that_hangs(monkeypatch: pytest.M
     monkeypatch.setattr(module, "_MOST_SECONDS", 0.5)
     assert checked_spaces(run(faulty("hang"))) is None
     assert "the check of the environment was not done within 0.5 s: the run starts without it" in "\n".join(LINES)
+
+
+def test_a_run_waits_longer_where_its_settings_depend_on_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_SECONDS", 0.0)
+    spaces, _ = checked_defaults(run(faulty("")))
+    assert spaces is not None
+    assert "takes long: waiting up to 120 s, because its spaces decide the settings" in LINES[-1]
+
+
+def test_default_settings_without_spaces_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_SECONDS_FOR_SETTINGS", 0.5)
+    spaces, defaults = expected_defaults(run(faulty("hang")), MODULES, threading.Event())
+    assert (spaces, defaults) == (None, default_settings(None))
+    assert "the check of environment faulty_environments:Faulty-v0 was not done within 0.5 s" in LINES[-2]
+    assert "the default settings are those for numbers and discrete actions" in LINES[-1]
 
 
 def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
