@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +103,7 @@ def check_in_process(
             if answer:
                 os.kill(pid, signal.SIGKILL)  # threads of the environment could keep it alive
         except BaseException:
-            os.kill(pid, signal.SIGKILL)
+            _end(pid, own_group=not check.shown)
             raise
         finally:
             _, status = os.waitpid(pid, 0)
@@ -134,6 +135,14 @@ def _read(
     return data
 
 
+def _end(pid: int, *, own_group: bool) -> None:
+    """Kill a check, with the programs that its environment has started: another simulator could not start."""
+    if own_group:
+        with suppress(OSError):  # a fork has not begun, and has none yet
+            os.killpg(pid, signal.SIGKILL)
+    os.kill(pid, signal.SIGKILL)
+
+
 def _forked(check: EnvironmentCheck, writing: int) -> int:
     """Return the process id of a fork that writes the report to a descriptor."""
     sys.stdout.flush()
@@ -142,6 +151,7 @@ def _forked(check: EnvironmentCheck, writing: int) -> int:
     if pid:
         return pid
     try:
+        os.setpgid(0, 0)  # see _end
         silent = os.open(os.devnull, os.O_RDWR)
         for standard in range(3):
             os.dup2(silent, standard)
@@ -156,8 +166,10 @@ def _spawned(check: EnvironmentCheck, writing: int) -> int:
     command = [sys.executable, "-P", "-m", "daedalus.cli.check_process", str(writing), check.words()]
     silent = [(os.POSIX_SPAWN_OPEN, standard, os.devnull, os.O_RDWR, 0) for standard in range(3)]
     shown = [(os.POSIX_SPAWN_DUP2, 2, 1)]  # a debugger of the user reads standard input
+    own_group: dict[str, Any] = {} if check.shown else {"setpgroup": 0}  # see _end
     with interrupts_held():
-        return os.posix_spawn(sys.executable, command, os.environ, file_actions=shown if check.shown else silent)
+        file_actions = shown if check.shown else silent
+        return os.posix_spawn(sys.executable, command, os.environ, file_actions=file_actions, **own_group)
 
 
 def _report(check: EnvironmentCheck, writing: int) -> None:

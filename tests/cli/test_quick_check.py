@@ -10,6 +10,7 @@ import pytest
 from building import run_spec
 from log_lines import LINES
 from plain import array_space, vector_spaces
+from processes import until
 
 from daedalus.cli import check_process
 from daedalus.cli import quick_check as module
@@ -92,6 +93,46 @@ def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         quick_check(faulty("hang"), MODULES, stop=stop)
     with pytest.raises(ChildProcessError):
         os.waitpid(started[0], os.WNOHANG)  # it has ended
+
+
+@pytest.mark.parametrize("fork", [False, True])
+def test_a_check_that_is_not_done_in_time_ends_the_programs_that_its_environment_started(
+    tmp_path: Path, fork: bool
+) -> None:
+    """A simulator that starts slowly would occupy the port that the actor's needs."""
+    (tmp_path / "slow_simulator.py").write_text(
+        "import gymnasium, pathlib, subprocess, sys, time\n"
+        "def start(file):\n"
+        "    simulator = subprocess.Popen([sys.executable, '-S', '-c', 'import time; time.sleep(1000)'])\n"
+        "    pathlib.Path('new').write_text(str(simulator.pid))\n"
+        "    pathlib.Path('new').rename(file)\n"
+        "    time.sleep(1000)\n"
+        "gymnasium.register('Slow-v0', start)\n"
+    )
+    file = tmp_path / "pid"
+    program = (
+        "import sys\n"
+        "from daedalus.cli import quick_check as module\n"
+        "from daedalus.policy.user_modules import UserModules\n"
+        "from daedalus.protocol.spec import EnvironmentSpec\n"
+        "class Stop:\n"
+        "    def is_set(self): return __import__('os').path.exists('pid')\n"
+        "spec = EnvironmentSpec(id='slow_simulator:Slow-v0', kwargs={'file': 'pid'})\n"
+        f"module.quick_check(spec, UserModules(frozenset({{'slow_simulator'}})), fork={fork}, stop=Stop())\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert "CheckTimeoutError" in result.stderr
+    until(lambda: _has_ended(int(file.read_text())))
+
+
+def _has_ended(pid: int) -> bool:
+    """Return whether a process has ended; one that nobody waits for counts, too."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 def test_a_fork_gives_the_same_report_and_leaves_the_module_out_of_the_parent() -> None:
