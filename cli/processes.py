@@ -124,12 +124,16 @@ def _exit_if_stuck(stop: threading.Event, handled: Sequence[int]) -> None:
 def exit_with_parent(stop: threading.Event, on_line: Callable[[bytes], None] = lambda _: None) -> None:
     """Set `stop` when standard input ends: the parent holds it open while it runs.
 
-    `on_line` is called with each line that the parent writes, on a thread of its own.
+    `on_line` is called with each line that the parent writes, on a thread of its own. For everybody else standard input
+    is empty from now on: an environment that reads it, such as one with `breakpoint()`, would wait for ever.
     """
+    held, empty = os.dup(sys.stdin.fileno()), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(empty, sys.stdin.fileno())
+    os.close(empty)
 
     def watch() -> None:
         rest = b""
-        while data := os.read(sys.stdin.fileno(), 4096):
+        while data := os.read(held, 4096):
             *lines, rest = (rest + data).split(b"\n")
             rest = rest[-_LONGEST_LINE:]
             for line in lines:

@@ -1,9 +1,12 @@
 """cli/processes.py: limits and the end of a process."""
 
 import resource
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
+from processes import LIMIT
 
 from daedalus.cli.processes import exit_status, raise_descriptor_limit
 
@@ -30,3 +33,25 @@ def test_ctrl_c_prints_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert exit_status(interrupted) == 1
     assert capsys.readouterr().err == "stopped\n"
+
+
+def test_a_child_process_that_asks_a_question_gets_no_answer() -> None:
+    """Nobody could answer; the end of the parent is noticed as before."""
+    program = (
+        "import threading\n"
+        "from daedalus.cli.processes import exit_with_parent\n"
+        "stop = threading.Event()\n"
+        "exit_with_parent(stop)\n"
+        "try: input()\n"
+        "except EOFError: print('no answer', stop.is_set(), flush=True)\n"
+        "stop.wait()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        try:
+            assert child.stdin is not None
+            assert child.stdout is not None
+            assert child.stdout.readline() == b"no answer False\n"
+            child.stdin.close()
+            assert child.wait(LIMIT) == 0
+        finally:
+            child.kill()
