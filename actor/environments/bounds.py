@@ -6,6 +6,7 @@ import numpy as np
 from daedalus.protocol.spaces import ContinuousSpace
 
 _UNBOUNDED = 1e30  # a bound beyond this value is none: environments write the largest float for infinity
+_WIDE_BYTES = 4  # integers of fewer bytes use all their range, such as the colours of a pixel
 
 
 def continuous_space(space: gymnasium.spaces.Box) -> ContinuousSpace:
@@ -18,8 +19,8 @@ class BoundedActions:
 
     def __init__(self, space: gymnasium.spaces.Box) -> None:
         self._space = space
-        self._low, self._high = (bound.ravel().astype(np.float64) for bound in (space.low, space.high))
-        self._bounded = (np.abs(self._low) < _UNBOUNDED) & (np.abs(self._high) < _UNBOUNDED)
+        self._low, self._high = space.low.ravel().astype(np.float64), _highest(space.high)
+        self._bounded = _is_bound(space.low) & _is_bound(space.high)
         with np.errstate(invalid="ignore", over="ignore"):
             self._range = self._high - self._low
         self._rounded = space.dtype is not None and space.dtype.kind != "f"
@@ -39,4 +40,22 @@ class BoundedActions:
 
 
 def _bounds(values: np.ndarray) -> tuple[float | None, ...]:
-    return tuple(float(value) if abs(value) < _UNBOUNDED else None for value in values.ravel().astype(np.float64))
+    numbers = values.ravel().astype(np.float64)
+    return tuple(float(value) if is_bound else None for value, is_bound in zip(numbers, _is_bound(values), strict=True))
+
+
+def _highest(values: np.ndarray) -> np.ndarray:
+    """Return upper bounds as float64 that the dtype of the bounds can hold: the largest int64 is rounded up."""
+    bounds = values.ravel().astype(np.float64)
+    if values.dtype.kind not in "iu":
+        return bounds
+    return np.where(bounds >= float(np.iinfo(values.dtype).max) + 1.0, np.nextafter(bounds, 0.0), bounds)
+
+
+def _is_bound(values: np.ndarray) -> np.ndarray:
+    """Return whether each number limits anything. gymnasium writes the largest integer for infinity."""
+    bounds = np.abs(values.ravel().astype(np.float64)) < _UNBOUNDED
+    if values.dtype.kind in "iu" and values.dtype.itemsize >= _WIDE_BYTES:
+        limits = np.iinfo(values.dtype)
+        bounds &= (values.ravel() != limits.max) & ((values.ravel() != limits.min) | (limits.min == 0))
+    return bounds

@@ -97,6 +97,18 @@ def test_action_has_the_form_of_its_space_and_its_bounds() -> None:
     assert ACTION.contains({**action, "grip": np.int64(action["grip"])})
 
 
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_whole_numbers_without_a_bound_are_not_scaled_and_stay_in_their_space(dtype: type) -> None:
+    """gymnasium writes the largest integer for infinity; float64 rounds that of int64 up to one that overflows."""
+    space = gym.Box(0, np.inf, (2,), dtype)
+    components = ActionComponents(space)
+    assert components.spaces == {"action": ContinuousSpace(low=(0.0, 0.0), high=(None, None))}
+    actions = components.env_actions({"action": np.array([[1.2, 1.0], [-3.0, 1e20]], np.float32)})
+    assert actions[:, 0].tolist() == [1, 0]
+    assert all(action in space for action in actions)
+    assert actions[1, 1] > 2**30
+
+
 leaf_spaces = st.one_of(
     st.integers(1, 5).flatmap(lambda n: st.integers(-3, 3).map(lambda start: gym.Discrete(n, start=start))),
     st.lists(st.integers(1, 4), min_size=1, max_size=3).map(gym.MultiDiscrete),
