@@ -173,11 +173,26 @@ def batch_of_one(space: gymnasium.Space, value: Any, where: str = "the observati
     array = np.asarray(value)
     if array.shape != space.shape:
         raise ValueError(f"{where} has shape {array.shape}, but its space has shape {space.shape}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{where} has a value that is not finite")
-    if not isinstance(space, gym.Box) and not space.contains(array.astype(space.dtype)):
+    converted = _converted(space, array, where)
+    if not isinstance(space, gym.Box) and not space.contains(converted):
         raise ValueError(f"{where} is {value}, which is outside {described(space)}")
-    return array.astype(space.dtype)[None]
+    return converted[None]
+
+
+def _converted(space: gymnasium.Space, array: np.ndarray, where: str) -> np.ndarray:
+    """Return an array in the dtype of its space. Raises ValueError if that would change it."""
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{where} has dtype {array.dtype}: it must have numbers, of dtype {space.dtype}")
+    with np.errstate(over="ignore"):
+        if array.dtype.kind == "f" and not np.isfinite(array.astype(np.float32)).all():  # as the policy sees it
+            raise ValueError(f"{where} has a value that is not finite")
+    converted = array.astype(space.dtype)
+    if converted.dtype.kind != "f" and array.dtype != converted.dtype and (changed := converted != array).any():
+        raise ValueError(
+            f"{where} has the value {array[changed].flat[0]:g}, but its space has dtype {space.dtype}: "
+            "pass it as the environment returns it"
+        )
+    return converted
 
 
 def only_of_batch(space: gymnasium.Space, batch: Any) -> Any:

@@ -223,6 +223,29 @@ def test_value_that_does_not_fit_is_refused_with_its_component(value: Any, reaso
         batch_of_one(space, value)
 
 
+@pytest.mark.parametrize(
+    ("space", "value", "reason"),
+    [
+        (gym.Box(0, 255, (2,), np.uint8), [0.0, 0.5], r"has the value 0.5, but its space has dtype uint8: pass it as"),
+        (gym.Box(0, 255, (2,), np.uint8), np.array([3, 300]), "has the value 300, but its space has dtype uint8"),
+        (gym.Discrete(3), 1.7, "has the value 1.7, but its space has dtype int64"),
+        (gym.Discrete(3), "1", "has dtype <U1: it must have numbers, of dtype int64"),
+        (gym.Box(0, 1, (2,)), np.array([None, 0.5]), "has dtype object: it must have numbers, of dtype float32"),
+        (gym.Box(-np.inf, np.inf, (1,), np.float64), [1e300], "has a value that is not finite"),
+    ],
+)
+def test_value_is_refused_that_its_space_would_change(space: gymnasium.Space, value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        batch_of_one(space, value)
+
+
+def test_numbers_of_another_dtype_with_the_same_values_are_taken() -> None:
+    taken = batch_of_one(gym.Box(0, 255, (2,), np.uint8), [3.0, 255.0])
+    assert taken.dtype == np.uint8
+    assert taken.tolist() == [[3, 255]]
+    assert batch_of_one(gym.Discrete(3), True).tolist() == [1]
+
+
 def test_discrete_observation_outside_its_space_is_refused() -> None:
     (component,) = observation_components(gym.Discrete(3))
     with pytest.raises(
