@@ -1,11 +1,13 @@
 """`daedalus.evaluate`: the command `daedalus evaluate` as a function."""
 
+import argparse
 import io
+import operator
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -80,6 +82,7 @@ def evaluate(
     arguments.video = None if video is None else Path(video)
     arguments.width, arguments.max_seconds = width, max_seconds
     arguments.allow_module = list(allow_modules)
+    _check_values(arguments)
     check(arguments)
     try:
         result = run_evaluation(arguments, threading.Event(), io.StringIO())
@@ -105,3 +108,17 @@ def evaluate(
             )
         },
     )
+
+
+def _check_values(arguments: argparse.Namespace) -> None:
+    """Raise ValueError for values that the command line cannot have."""
+    for name, choices in (("actions", ("greedy", "sampled")), ("backend", get_args(Backend))):
+        value = getattr(arguments, name)
+        if value is not None and value not in choices:
+            raise ValueError(f"{name} is {value!r}: choose from {', '.join(choices)}")
+    for name in ("episodes", "seed", "width"):
+        value = getattr(arguments, name)
+        try:
+            setattr(arguments, name, None if value is None else operator.index(value))
+        except TypeError:
+            raise ValueError(f"{name} is {value!r}: it must be a whole number") from None

@@ -266,6 +266,21 @@ def play(policy: daedalus.Policy, environment: gymnasium.Env, seed: int, steps: 
     return total
 
 
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"actions": "best"}, "actions is 'best': choose from greedy, sampled"),
+        ({"backend": "gym"}, "backend is 'gym': choose from gymnasium, envpool, ale, fast"),
+        ({"episodes": 2.5}, "episodes is 2.5: it must be a whole number"),
+        ({"seed": "1"}, "seed is '1': it must be a whole number"),
+        ({"width": 64.0, "video": "play.gif"}, "width is 64.0: it must be a whole number"),
+    ],
+)
+def test_evaluate_refuses_values_that_the_command_cannot_have(arguments: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        daedalus.evaluate(pretrained="car_racing", **arguments)
+
+
 def evaluated(directory: Path, seed: int) -> tuple[float, int]:
     """Evaluate one episode; return its return and the seed of its environment."""
     saved = find_policy(directory)
