@@ -7,6 +7,8 @@ of the program: the caller only draws random numbers.
 
 import io
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -93,7 +95,7 @@ def _export(network: ActorCritic, spaces: Spaces) -> bytes:
     epsilon = torch.zeros((_ROWS, 1), device=device)
     outputs = [*map(action_name, spaces.actions), LOG_PROB, *([NEXT_STATE] if network.state_size else [])]
     program: Any = io.BytesIO()  # torch accepts a file, although its annotation does not
-    with warnings.catch_warnings(), torch.no_grad():
+    with warnings.catch_warnings(), torch.no_grad(), _separate_operations():
         # The TorchScript exporter is deprecated, but takes 0.2 s; its successor takes several times as long.
         warnings.simplefilter("ignore")
         torch.onnx.export(
@@ -116,3 +118,14 @@ def _export(network: ActorCritic, spaces: Spaces) -> bytes:
 
 def _dtype(space: ArraySpace | DiscreteSpace) -> torch.dtype:
     return torch.int64 if isinstance(space, DiscreteSpace) else getattr(torch, space.dtype)
+
+
+@contextmanager
+def _separate_operations() -> Iterator[None]:
+    """Let torch compute attention in separate operations: without gradients it fuses them, which cannot be exported."""
+    before = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(before)

@@ -234,6 +234,16 @@ class Net(Base):
         return """
 
 
+def test_encoder_with_attention_dropout_and_code_over_shapes_is_accepted(build: Building) -> None:
+    source = FORWARD.replace(
+        "self.constant =",
+        "self.attention = nn.TransformerEncoderLayer(12, 2, 16, batch_first=True)\n        self.constant =",
+    )
+    network = build(source + "self.attention(x.view(-1, 10, 12)).flatten(1) if x.shape[1] == 120 else None")
+    assert all(module.training for module in network.encoder.modules())  # the learner has dropout
+    export_program(network, SPACES)
+
+
 def test_shared_weights_and_constants_are_exported(build: Building) -> None:
     network = build(FORWARD + "self.tied(self.first(x) * self.constant)")
     for parameter in network.parameters():
