@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.custom_module import find_class
+from daedalus.policy.network.encoder_trial import Tensors, check_recording
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_modules import UserModuleError, UserModules
@@ -34,7 +35,9 @@ class CustomEncoder(nn.Module):
             encoder = find_class("policy.encoder", name, nn.Module, modules)
             contract = f"; {_contract(spec, spaces)}"
             self.module = encoder(shapes if self._only is None else shapes[self._only])
-            self.features = _checked_features(self.module, self._inputs(_zeros(spaces)))
+            zeros = _zeros(spaces)
+            self.features = _checked_features(self.module, self._inputs(zeros))
+            check_recording(Tensors(self.module, self.forward, tuple(zeros)), tuple(zeros.values()), spaces)
         except UserModuleError as error:
             raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:

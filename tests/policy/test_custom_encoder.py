@@ -234,6 +234,36 @@ class Net(Base):
         return """
 
 
+COUNT = """
+
+    def count(self):
+        self.calls = getattr(self, "calls", 0) + 1
+        return self.calls
+"""
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ("x if observations.float().mean() > 9 else -x", "other features than its exported program"),
+        (
+            "x + torch.tensor(observations.flatten(1).float().mean(1).tolist())[:, None]",
+            "other features than its exported program",
+        ),
+        ("x - x.mean(0)", "alone in its call: .*batch_first=True"),
+        ("x.view(2, 120) if torch.jit.is_tracing() else x", "other features than its exported program"),
+        ("x + torch.randn_like(x)", "called again with the same observations"),
+        ("x + self.count()", "called again with the same observations"),
+    ],
+)
+def test_encoder_that_actors_would_compute_in_another_way_is_rejected(
+    build: Building, returned: str, message: str
+) -> None:
+    with pytest.raises(NetworkError, match=message) as caught:
+        build(FORWARD + returned + COUNT)
+    assert "\n" not in str(caught.value)
+
+
 def test_encoder_with_attention_dropout_and_code_over_shapes_is_accepted(build: Building) -> None:
     source = FORWARD.replace(
         "self.constant =",
