@@ -73,6 +73,8 @@ class GradientComputer:
         bonus = torch.tensor(entropy_bonus, device=batch.valid.device)
         updates = 0
         for losses in self._algorithm.losses(batch, self.forward):
+            if not isinstance(losses, Losses | MinibatchLosses):
+                raise TypeError(f"losses() gives {type(losses).__name__}: it must yield Losses or MinibatchLosses")
             updates += 1
             self._first_pass = losses.first_pass
             if isinstance(losses, MinibatchLosses):
@@ -104,9 +106,7 @@ class GradientComputer:
 
     def _differentiated(self, losses: Losses, bonus: Tensor) -> tuple[Tensor, ...]:
         """Return the gradient [P] of the weighted sum of losses, and their Terms."""
-        if not losses.values.shape == losses.targets.shape == losses.shares.shape:
-            shapes = [tuple(each.shape) for each in (losses.values, losses.targets, losses.shares)]
-            raise ValueError(f"the shapes of values, targets and shares differ: {shapes}")
+        _check_shapes(losses)
         value_term = value_loss(losses.values, losses.targets, losses.shares, self._spec.value_loss)
         entropy = mean(losses.entropies, losses.shares)
         loss = losses.policy_loss + self._spec.value_coefficient * value_term - bonus * entropy
@@ -151,3 +151,16 @@ class GradientComputer:
         if self._algorithm.record.target_network:
             statistics["target_network"] = self.forward.target_values
         return statistics
+
+
+def _check_shapes(losses: Losses) -> None:
+    """Raise TypeError or ValueError for terms that are no tensors, or that torch would take in another shape."""
+    for name in ("policy_loss", "entropies", "values", "targets", "shares"):
+        if not isinstance(term := getattr(losses, name), Tensor):
+            zero = "torch.zeros(())" if name == "policy_loss" else "torch.zeros_like(shares)"
+            raise TypeError(f"{name} is {type(term).__name__}: it must be a tensor; zero is {zero}")
+    if losses.policy_loss.shape:
+        raise ValueError(f"policy_loss has shape {tuple(losses.policy_loss.shape)}: it must be a scalar")
+    shapes = [tuple(each.shape) for each in (losses.entropies, losses.values, losses.targets, losses.shares)]
+    if len(set(shapes)) > 1:
+        raise ValueError(f"the shapes of entropies, values, targets and shares differ: {shapes}")

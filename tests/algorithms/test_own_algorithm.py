@@ -44,6 +44,25 @@ class WrongShape(A3c):
         for losses in super().losses(batch, forward):
             yield losses._replace(targets=losses.targets[:-1])
 
+class Other(A3c):
+    change = staticmethod(lambda losses: losses)
+
+    def losses(self, batch, forward):
+        for losses in super().losses(batch, forward):
+            yield self.change(losses)
+
+class Transposed(Other):
+    change = staticmethod(lambda losses: losses._replace(entropies=losses.entropies.T))
+
+class NoScalar(Other):
+    change = staticmethod(lambda losses: losses._replace(policy_loss=losses.policy_loss[None]))
+
+class NoTensor(Other):
+    change = staticmethod(lambda losses: losses._replace(policy_loss=0.0))
+
+class NoLosses(Other):
+    change = staticmethod(lambda losses: losses.policy_loss)
+
 class NoRecord(A3c):
     record = {"synchronous": True}
 
@@ -134,7 +153,11 @@ def test_arguments_reach_the_constructor(modules: UserModules) -> None:
     [
         (f"{MODULE}:Unfinished", "NotImplementedError"),
         (f"{MODULE}:Twice", "its losses make 2 updates of a batch, and its record says 1"),
-        (f"{MODULE}:WrongShape", "ValueError: the shapes of values, targets and shares differ"),
+        (f"{MODULE}:WrongShape", "ValueError: the shapes of entropies, values, targets and shares differ"),
+        (f"{MODULE}:Transposed", "ValueError: the shapes of entropies, values, targets and shares differ"),
+        (f"{MODULE}:NoScalar", "ValueError: policy_loss has shape (1,): it must be a scalar"),
+        (f"{MODULE}:NoTensor", "TypeError: policy_loss is float: it must be a tensor; zero is torch.zeros(())"),
+        (f"{MODULE}:NoLosses", "TypeError: losses() gives Tensor: it must yield Losses or MinibatchLosses"),
         (f"{MODULE}:FaultyAfter", "there is no target network: set target_network in the record of the algorithm"),
         (f"{MODULE}:NoRecord", "its record is not an AlgorithmRecord"),
         (f"{MODULE}:number", "it is not a class of daedalus.algorithms.algorithm.Algorithm"),
