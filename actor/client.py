@@ -38,6 +38,7 @@ from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import credentials_to_connect
 
+_REFUSAL_SECONDS = 12.0  # after `timeout`, for the last two queries of the client's thread, if nobody answers them
 _numbers = itertools.count(1)  # of the clients of this process
 
 
@@ -120,7 +121,9 @@ class Client:
             self._service = ActorService(config, transport, self._stop, self._collector, report=self._report)
             self._collector.on_rollout = self._service.wake
             self._thread.start()
-            if not self._collector.policy_loaded.wait(timeout):
+            if not self._collector.policy_loaded.wait(timeout) and not self._collector.has_joined:
+                self._collector.policy_loaded.wait(_REFUSAL_SECONDS)  # the thread knows why it cannot join
+            if not self._collector.policy_loaded.is_set():
                 raise ActorError(f"no policy came within {timeout:g} s: check that the learner is training")
             self._check()
         except BaseException:  # also Ctrl-C: a process that ends with an open session aborts

@@ -63,6 +63,11 @@ class ClientCollector:
         """Number of rollouts, finished or not, that the service never took."""
         return self._exchange.dropped
 
+    @property
+    def has_joined(self) -> bool:
+        """Whether a learner has accepted the client, and its program has come."""
+        return self._program is not None
+
     def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
         """See Collector."""
         check_run(spec)

@@ -96,6 +96,13 @@ def test_ctrl_c_while_waiting_for_a_policy_closes_the_session(
     assert "actor" not in {thread.name for thread in threading.enumerate()}
 
 
+def test_reason_why_nobody_lets_the_client_join_is_raised(learner: ScriptedLearner) -> None:
+    """The client's thread notices the end of `timeout` when it asks again, a moment later than the caller's."""
+    learner.refusal = Refusal(code="name_taken", reason="actor name 'robot' is already in use")
+    with pytest.raises(ActorError, match="actor name 'robot' is already in use"):
+        Client("tcp/127.0.0.1:1", **SPACES, name="robot", timeout=0.1)
+
+
 def test_run_that_is_over_has_no_client(learner: ScriptedLearner) -> None:
     learner.refusal = Refusal(code="finished", reason="the run is over")
     with pytest.raises(ActorError, match="the run ended before a policy came"):
