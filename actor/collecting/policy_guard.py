@@ -1,5 +1,6 @@
 """Decides whether a client's policy may act, and what is played in its place. State without threads or I/O."""
 
+import copy
 import logging
 from typing import Any
 
@@ -33,7 +34,9 @@ class PolicyGuard:
             raise ValueError(f"max_policy_age is {max_policy_age}: it must be above 0 seconds")
         if safe_action is not None and not callable(safe_action) and not action_space.contains(safe_action):
             raise ValueError(f"safe_action {safe_action!r} is not in the action space {action_space}")
-        self._action, self._untrained = safe_action, untrained
+        # Of an array a copy, here and for each caller: a loop may scale the action that it got.
+        self._action = safe_action if callable(safe_action) else copy.deepcopy(safe_action)
+        self._untrained = untrained
         self.max_age = DEFAULT_MAX_AGE if max_policy_age is None else max_policy_age
         self.reason = ""  # why the safe action is played now; empty while the policy acts
 
@@ -55,7 +58,7 @@ class PolicyGuard:
 
     def action(self, observation: Any) -> Any:
         """Return the safe action for an observation."""
-        return self._action(observation) if callable(self._action) else self._action
+        return self._action(observation) if callable(self._action) else copy.deepcopy(self._action)
 
     def _reason(self, policy_version: int, age: float) -> str:
         if age > self.max_age:

@@ -324,6 +324,14 @@ def test_override_has_precedence_over_the_safe_action() -> None:
     assert (client.agents[0].overridden_actions, client.agents[0].safe_actions) == (1, 0)
 
 
+def test_safe_action_is_what_it_was_although_the_loop_changes_an_action_that_it_got() -> None:
+    given = np.zeros(2, np.float32)
+    guard = PolicyGuard(gymnasium.spaces.Box(-1.0, 1.0, (2,)), given, None, untrained=False)
+    guard.action(None)[:] = 0.5
+    given[:] = 1.0
+    assert guard.action(None).tolist() == [0.0, 0.0]
+
+
 def test_safe_action_may_depend_on_the_observation() -> None:
     guard = PolicyGuard(gymnasium.spaces.Discrete(9), lambda observation: observation + 1, None, untrained=False)
     assert guard.action(4) == 5
