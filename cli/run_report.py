@@ -14,14 +14,16 @@ from daedalus.protocol.texts import short_number
 def report(run: LocalRun, summary: dict[str, Any]) -> str:
     """Return the result of a run from its summary.json, with the evaluation."""
     target = run.spec.training.target_return
+    skipped = f" ({summary['updates_skipped']:,} skipped)" if summary.get("updates_skipped") else ""
+    updates = f"{summary['updates']:,} updates{skipped}"
     if summary["solved"]:
         trained = (
             f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s, "
-            f"{summary['env_steps']:,} env_steps, {summary['updates']:,} updates"
+            f"{summary['env_steps']:,} env_steps, {updates}"
         )
     else:
         goal = "" if target is None else f" (the target {target:g} was not reached)"
-        trained = f"done: {summary['env_steps']:,} env_steps, {summary['updates']:,} updates{goal}"
+        trained = f"done: {summary['env_steps']:,} env_steps, {updates}{goal}"
     evaluation = summary["evaluation"]
     evaluated = (
         f"evaluation: return {short_number(evaluation['return_mean'])} +- {short_number(evaluation['return_std'])} "

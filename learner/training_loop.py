@@ -106,7 +106,10 @@ class TrainingLoop:
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
         if skipped and not self._health.gradient_fault:
-            _logger.warning("update skipped: the gradient is not finite; the weights are unchanged")
+            _logger.warning(
+                "update skipped: the gradient is not finite; the weights are unchanged. Look for nan in the losses of "
+                "an algorithm of your own, and for very large observations and rewards, or lower training.learning_rate"
+            )
         self._health.gradient_fault = skipped > 0
         self._counters.updates_skipped += skipped
 

@@ -44,3 +44,9 @@ def test_plot_command_can_be_typed_also_with_special_characters_in_the_path(monk
     spec = RunSpec(environment=EnvironmentSpec(id="CartPole-v1"))
     text = report(LocalRun(directory=Path("runs/one;two"), spec=spec, started=time.monotonic()), SUMMARY)
     assert text.endswith("daedalus plot 'runs/one;two' --output curve.png")
+
+
+def test_skipped_updates_are_counted() -> None:
+    run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
+    assert "5 updates (2 skipped)" in report(run, {**SUMMARY, "updates_skipped": 2})
+    assert "skipped" not in report(run, {**SUMMARY, "updates_skipped": 0})
