@@ -37,7 +37,7 @@ class TrainingRun:
         Raises ValueError for another name or number.
         """
         for name, value in metrics.items():
-            if not is_name(name) or not math.isfinite(value):
+            if not (isinstance(name, str) and is_name(name)) or not _is_finite(value):
                 raise ValueError(f"metric {name!r} is {value!r}: use a finite number, and letters, digits, . _ or -")
             self._metrics[name] = float(value)
 
@@ -45,6 +45,14 @@ class TrainingRun:
         """Return the metrics that were not sent to the learner yet."""
         metrics, self._metrics = self._metrics, {}
         return metrics
+
+
+def _is_finite(value: object) -> bool:
+    """Return whether a value of any type is a finite number."""
+    try:
+        return math.isfinite(value)  # pyright: ignore[reportArgumentType]  # it raises for other types
+    except (TypeError, ValueError):
+        return False
 
 
 class Callback:

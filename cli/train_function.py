@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -93,12 +94,12 @@ def train(
       log: trackers to log the run to, of "wandb", "mlflow" and "trackio".
       quiet: print nothing.
 
-    Raises SettingsError for invalid settings, TypeError for an environment or a callback of another type, TrainingError
-    if a process failed.
+    Raises SettingsError for invalid settings, TypeError for an argument of another type, TrainingError if a process
+    failed.
     """
     started = time.monotonic()
     preset = str(preset) if isinstance(preset, Path) else preset
-    _check_types(preset, env, callback)
+    _check_types(preset, env, callback, settings, processes)
     log = (log,) if isinstance(log, str) else log
     if unknown := set(log) - set(TRACKERS):
         raise SettingsError(f"log: unknown tracker {sorted(unknown)[0]!r}: choose from {', '.join(TRACKERS)}")
@@ -140,13 +141,17 @@ def train(
     return _result(lock.directory, end, control.stop_reason)
 
 
-def _check_types(preset: object, env: object, callback: object) -> None:
+def _check_types(preset: object, env: object, callback: object, settings: object, processes: object) -> None:
     """Raise TypeError for objects that are often given in place of a name, or of an instance."""
     for name in (preset, env):
         if not isinstance(name, str | None):
             raise TypeError(f'env must be the id of a registered environment, such as "CartPole-v1", not {name}')
     if not isinstance(callback, Callback | None):
         raise TypeError(f"callback must be an instance of a subclass of daedalus.Callback, not {callback}")
+    if not isinstance(settings, Mapping | None) or not all(isinstance(path, str) for path in settings or ()):
+        raise TypeError(f'settings must be a map such as {{"training.learning_rate": 0.001}}, not {settings!r}')
+    if not isinstance(processes, Integral):
+        raise TypeError(f"processes must be a whole number, not {processes!r}")
 
 
 def _assign(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:

@@ -150,6 +150,10 @@ def test_a_failed_train_raises_the_error_of_the_process(tmp_path: Path) -> None:
         ({"preset": "cartpole", "init_from": "nowhere"}, "--init-from: nowhere does not exist"),
         ({"preset": "cartpole", "log": "tensorboard"}, "log: unknown tracker 'tensorboard': choose from wandb, mlflow"),
         ({"preset": "cartpole", "log": ["wandb", "x"]}, "log: unknown tracker 'x'"),
+        (
+            {"preset": "cartpole", "settings": {"environment.kwargs.x": np.zeros(2)}},
+            "setting environment.kwargs.x input was not a valid JSON value, not array",
+        ),
     ],
 )
 def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
@@ -174,6 +178,9 @@ def test_invalid_settings_are_refused(arguments: dict, message: str) -> None:
             {"preset": "cartpole", "callback": daedalus.Callback},
             "callback must be an instance of a subclass of daedalus.Callback",
         ),
+        ({"preset": "cartpole", "settings": "training.seed=1"}, "settings must be a map such as {"),
+        ({"preset": "cartpole", "settings": {1: 2}}, "settings must be a map such as {"),
+        ({"preset": "cartpole", "processes": 1.5}, "processes must be a whole number, not 1.5"),
     ],
 )
 def test_objects_of_other_types_are_refused(arguments: dict, message: str, tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def _one_line(error: ValidationError) -> str:
     value, message = first["input"], first["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if not name:
         return message
-    if value == "" and first["type"] == "string_too_short":
+    if first["type"] == "string_too_short" and value == "":  # a NumPy array has no truth value
         return f"setting {name} is empty"
     if first["type"] == "tuple_type":
         return f"setting {name} is {value!r}{_as_list(name, value)}"

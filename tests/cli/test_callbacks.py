@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -76,8 +77,8 @@ def test_a_row_that_was_cut_off_is_left_out(tmp_path: Path, learner: subprocess.
     observer.close()
 
 
-@pytest.mark.parametrize("metrics", [{"a b": 1.0}, {"nan": float("nan")}, {"": 1.0}])
-def test_a_metric_that_cannot_be_written_is_refused(tmp_path: Path, metrics: dict[str, float]) -> None:
+@pytest.mark.parametrize("metrics", [{"a b": 1.0}, {"nan": float("nan")}, {"": 1.0}, {"text": "1"}, {1: 1.0}])
+def test_a_metric_that_cannot_be_written_is_refused(tmp_path: Path, metrics: dict[Any, Any]) -> None:
     with pytest.raises(ValueError, match="use a finite number"):
         TrainingRun(tmp_path).log(metrics)
 
