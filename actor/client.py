@@ -21,7 +21,7 @@ import socket
 import threading
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium
 
@@ -89,11 +89,16 @@ class Client:
             is random, unless the run began with trained weights.
           agents: number of agents in the loop, each with these spaces: robots, players, or copies of a simulator.
 
-        Raises ValueError for a safe action that is not in the action space, or a number of agents that is not from 1
-        to 4096; ActorError, TransportError, EnvironmentSetupError, AddressError or CredentialsError.
+        Raises ValueError for a safe action that is not in the action space, a number of agents that is not from 1 to
+        4096, another link, or a timeout that is not above 0; ActorError, TransportError, EnvironmentSetupError,
+        AddressError or CredentialsError.
         """
-        if not 1 <= agents <= MAX_ENVIRONMENTS:
-            raise ValueError(f"agents is {agents}: it must be from 1 to {MAX_ENVIRONMENTS}")
+        if not isinstance(agents, int) or not 1 <= agents <= MAX_ENVIRONMENTS:
+            raise ValueError(f"agents is {agents!r}: it must be from 1 to {MAX_ENVIRONMENTS}")
+        if link not in get_args(LinkChoice):
+            raise ValueError(f"link is {link!r}: choose from {', '.join(get_args(LinkChoice))}")
+        if not isinstance(timeout, int | float) or not timeout > 0.0:
+            raise ValueError(f"timeout is {timeout!r}: it must be a number of seconds above 0")
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         config = ActorConfig(

@@ -9,6 +9,7 @@ from daedalus.algorithms.algorithm import Algorithm
 from daedalus.algorithms.batch import Batch, BatchAssembler, each
 from daedalus.algorithms.errors import AlgorithmError
 from daedalus.policy.network.distributions.joint import ActionDistribution
+from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.spaces import Spaces
@@ -80,5 +81,4 @@ def check_updates(
 
 
 def _fault(name: str, error: Exception) -> AlgorithmError:
-    first_line = next(iter(str(error).strip().splitlines()), "")
-    return AlgorithmError(f"{_SETTING}={name}: {type(error).__name__}: {first_line}")
+    return AlgorithmError(f"{_SETTING}={name}: {first_line(error)}{place_of(error)}")

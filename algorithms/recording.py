@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.operation_tape import OperationTape
+from daedalus.policy.user_code import first_line
 
 EARLIER_CALLS = 20  # before a recording is made, which saves about as many calls of the function
 _LARGEST_NUMBER = 4  # of recordings
@@ -59,8 +60,7 @@ class OperationRecorder:
             recording = _recording(function, tensors)
             repeated = _repeated(recording, tensors)
         except Exception as error:  # torch raises whatever its tracer meets
-            first_line = next(iter(str(error).strip().splitlines()), "")
-            return self._refuse(f"{type(error).__name__}: {first_line}", results)
+            return self._refuse(first_line(error), results)
         if not all(map(_are_close, repeated, results)):
             return self._refuse("the recording gives other results", results)
         self._recordings[key] = recording

@@ -50,13 +50,20 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
 
 def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import EnvironmentReport, float_images, slow_steps, uninformative_bounds
+    from daedalus.actor.checking.report import (
+        EnvironmentReport,
+        float_images,
+        slow_start,
+        slow_steps,
+        uninformative_bounds,
+    )
 
     try:
         modules = UserModules(frozenset(modules_of(spec.user_modules)))
         report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings)
     except CheckTimeoutError as error:
-        _logger.warning("the check of the environment was %s: the run starts without it", error)
+        advice = slow_start(spec)
+        _logger.warning("the check of the environment was %s: the run starts without it%s", error, advice)
         return EnvironmentReport()
     if report.problems:
         raise EnvironmentProblemError(with_preset(report.problems[0], spec))

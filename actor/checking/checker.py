@@ -11,10 +11,11 @@ from gymnasium.utils.env_checker import check_env
 
 from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.texts import Texts
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors, first_line
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, creation_errors
 from daedalus.actor.environments.gymnasium_backend import registration
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 

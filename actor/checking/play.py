@@ -15,10 +15,10 @@ from daedalus.actor.checking.single import make_one
 from daedalus.actor.checking.texts import Texts
 from daedalus.actor.checking.vectorized import vectorized_problem
 from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.actor.environments.user_code import place_of
+from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 

@@ -42,9 +42,9 @@ def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str
 
     Processes help where steps wait for something else, or where processors would be idle.
     """
-    environment, environments = spec.environment, spec.collection.envs_per_actor
-    if environment.processes or environment.backend != "gymnasium" or environments == 1:
+    if not _in_turn(spec):
         return ""
+    environments = spec.collection.envs_per_actor
     idle = report.busy_share < _BUSY or processors > spec.collection.actors
     if report.step_seconds < _SLOW_SECONDS or not idle:
         return ""
@@ -54,6 +54,22 @@ def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str
         f"a step takes {_duration(report.step_seconds)}, and an actor steps its {environments} environments in turn: "
         f"{_duration(row)} a row, {_duration(first)} a rollout; use --set environment.processes=true"
     )
+
+
+def slow_start(spec: RunSpec) -> str:
+    """Return advice for an environment that takes long to make, if each actor makes several in turn; else nothing."""
+    if not _in_turn(spec):
+        return ""
+    return (
+        f"; an actor makes its {spec.collection.envs_per_actor} environments in turn: --set environment.processes=true "
+        "makes them at the same time, --set collection.envs_per_actor=1 only one"
+    )
+
+
+def _in_turn(spec: RunSpec) -> bool:
+    """Return whether an actor makes and steps several environments, one after the other."""
+    environment = spec.environment
+    return not environment.processes and environment.backend == "gymnasium" and spec.collection.envs_per_actor > 1
 
 
 def float_images(report: EnvironmentReport, spec: RunSpec) -> str:

@@ -9,10 +9,10 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import (
     OTHER_BACKEND,
     EnvironmentSetupError,
-    first_line,
     import_extra,
     unknown_environment,
 )
+from daedalus.policy.user_code import first_line
 from daedalus.protocol.spec import EnvironmentSpec
 
 _SIZE = (210, 160)

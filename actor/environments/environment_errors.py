@@ -11,7 +11,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
 
-from daedalus.actor.environments.user_code import frames_of, is_of_user, place_of
+from daedalus.policy.user_code import first_line, frames_of, is_of_user, place_of
 from daedalus.policy.user_modules import file_of, hidden_file
 
 _logger = logging.getLogger(__name__)
@@ -24,12 +24,6 @@ _CLOSE = 0.7  # similarity of two names that could be meant for each other
 
 class EnvironmentSetupError(Exception):
     """The environment cannot be created or stepped; the message says why and what to do."""
-
-
-def first_line(error: BaseException) -> str:
-    """Return the type of an error and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
 
 
 def reason_of(error: ValidationError) -> str:

@@ -13,10 +13,10 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import (
     OTHER_BACKEND,
     EnvironmentSetupError,
-    first_line,
     import_extra,
     unknown_environment,
 )
+from daedalus.policy.user_code import first_line
 from daedalus.protocol.spec import EnvironmentSpec
 
 _ATARI_OPTIONS = {"stack_num", "frame_skip", "gray_scale", "img_height", "img_width", "reward_clip"}

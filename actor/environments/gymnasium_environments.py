@@ -8,11 +8,11 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from daedalus.actor.checking.violations import observation_violations
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line, playing_error
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
-from daedalus.actor.environments.user_code import place_of
+from daedalus.policy.user_code import first_line, place_of
 
 _logger = logging.getLogger(__name__)
 

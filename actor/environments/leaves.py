@@ -34,17 +34,16 @@ class Leaf(NamedTuple):
 def leaves(space: gymnasium.Space, whole: str) -> tuple[Leaf, ...]:
     """Return all leaves of a nested space, in gymnasium's order. `whole` is the name of a space that is not composite.
 
-    Raises EnvironmentSetupError if there are none, or two get the same name.
+    Of leaves that would have the same name, as keys in Chinese may, the second is numbered 2, and so on. Raises
+    EnvironmentSetupError if there are none.
     """
-    found = tuple(Leaf(_name(path) if path else whole, path, leaf) for path, leaf in _walk(space, ()))
-    names = [leaf.name for leaf in found]
+    found: dict[str, Leaf] = {}
+    for path, leaf in _walk(space, ()):
+        name = _unused(_name(path) if path else whole, found)
+        found[name] = Leaf(name, path, leaf)
     if not found:
         raise EnvironmentSetupError(f"{whole} space {described(space)} is empty: it must have at least one component")
-    if len(set(names)) < len(names):
-        raise EnvironmentSetupError(
-            f"{whole} space {described(space)} has components with like names: {', '.join(names)}"
-        )
-    return found
+    return tuple(found.values())
 
 
 def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
@@ -61,6 +60,16 @@ def _walk(space: gymnasium.Space, path: tuple[str | int, ...]) -> Iterator[tuple
 def _name(path: tuple[str | int, ...]) -> str:
     """Return the keys in the letters that a name may have, joined by dots: the last 64, which tell most."""
     return ".".join(re.sub(r"[^\w-]", "_", str(key), flags=re.ASCII) or "_" for key in path)[-_LONGEST_NAME:]
+
+
+def _unused(name: str, used: Collection[str]) -> str:
+    """Return a name that is not used yet, with a number at its end if need be."""
+    unused, number = name, 1
+    while unused in used:
+        number += 1
+        ending = f"_{number}"
+        unused = name[: _LONGEST_NAME - len(ending)] + ending
+    return unused
 
 
 class LeftOut(gymnasium.Space):

@@ -6,9 +6,9 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import MASK_KEY
-from daedalus.actor.environments.user_code import place_of
+from daedalus.policy.user_code import first_line, place_of
 
 Camera = Callable[[np.ndarray], None]
 

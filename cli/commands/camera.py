@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, first_line
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, Moment, jpeg
 from daedalus.cli.arguments import add_allow_module
 from daedalus.cli.checkpoint_values import CheckpointValues
@@ -21,6 +21,7 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.gateway.watching.camera import LENGTH, frame, note
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
+from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import LEARNER_LIMITS

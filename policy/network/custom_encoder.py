@@ -14,6 +14,7 @@ from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.encoder_trial import Tensors, check_recording
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.normalized import normalized_components
+from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
 from daedalus.protocol.spec import PolicySpec
@@ -43,8 +44,7 @@ class CustomEncoder(nn.Module):
         except NetworkError as error:
             raise NetworkError(f"policy.encoder={name}: {error}{contract}") from error.__cause__
         except Exception as error:  # the user's code may raise anything
-            first_line = next(iter(str(error).strip().splitlines()), "")
-            raise NetworkError(f"policy.encoder={name}: {type(error).__name__}: {first_line}{contract}") from error
+            raise NetworkError(f"policy.encoder={name}: {first_line(error)}{place_of(error)}{contract}") from error
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""

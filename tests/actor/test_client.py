@@ -103,6 +103,21 @@ def test_reason_why_nobody_lets_the_client_join_is_raised(learner: ScriptedLearn
         Client("tcp/127.0.0.1:1", **SPACES, name="robot", timeout=0.1)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("agents", "2", "agents is '2': it must be from 1 to 4096"),
+        ("link", "slow", "link is 'slow': choose from auto, lan, wan"),
+        ("timeout", None, "timeout is None: it must be a number of seconds above 0"),
+        ("timeout", "5", "timeout is '5'"),
+        ("timeout", float("nan"), "timeout is nan"),
+    ],
+)
+def test_arguments_without_a_meaning_are_refused(name: str, value: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        Client("tcp/127.0.0.1:1", **SPACES, **{name: value})
+
+
 def test_run_that_is_over_has_no_client(learner: ScriptedLearner) -> None:
     learner.refusal = Refusal(code="finished", reason="the run is over")
     with pytest.raises(ActorError, match="the run ended before a policy came"):

@@ -60,6 +60,21 @@ def test_any_key_makes_a_name(key: str, name: str) -> None:
     assert set(Transforms(SPEC, long, gym.Discrete(2)).spaces.observations) == {f"{'robot' * 10}.{name}"[-64:]}
 
 
+def test_keys_that_would_make_the_same_name_are_numbered() -> None:
+    """Keys of letters outside ASCII are all underscores, and long keys are cut."""
+    first, second = "a" * 70, "b" + "a" * 69
+    parts = {"位置": 1, "速度": 2, "___2": 3, first: 4, second: 5}
+    space = gym.Dict({key: gym.Box(0, 1, (size,)) for key, size in parts.items()})
+    transforms = Transforms(SPEC, space, gym.Dict({"a b": gym.Discrete(2), "a_b": gym.Discrete(3)}))
+    shapes = {name: array.shape[0] for name, array in transforms.spaces.observations.items()}
+    assert shapes == {"___2": 3, "a" * 64: 4, "a" * 62 + "_2": 5, "__": 1, "___3": 2}
+    value = {key: np.full(size, 0.5, np.float32) for key, size in parts.items()}
+    frames = transforms.observe_one(value, None).frames
+    assert {name: len(frame[0]) for name, frame in frames.items()} == shapes
+    assert list(transforms.spaces.actions) == ["a_b", "a_b_2"]
+    assert transforms.env_action({"a_b": np.array([[1]]), "a_b_2": np.array([[2]])}) == {"a b": 1, "a_b": 2}
+
+
 def test_spaces_that_are_not_composite_have_one_component() -> None:
     spaces = Transforms(SPEC, gym.Discrete(5), gym.MultiBinary((2, 2))).spaces
     assert spaces.observations == {"observation": DiscreteSpace(counts=(5,))}
@@ -192,7 +207,6 @@ VARIED = gym.Box(np.zeros((30, 9), np.float32), np.float32(np.eye(30, 9) + 1))  
         (gym.Box(0, 1, (1, 1, 1, 1, 1)), gym.Discrete(2), "is not supported"),
         (gym.Box(0, 1, (0,)), gym.Discrete(2), "is not supported"),
         (gym.Dict({}), gym.Discrete(2), "is empty"),
-        (gym.Dict({"a b": gym.Box(0, 1), "a_b": gym.Box(0, 1)}), gym.Discrete(2), "like names: a_b, a_b"),
         (gym.Box(0, 1), gym.Discrete(70_000), "70,000 choices of one variable: use at most 65,536"),
         (gym.Box(0, 1), gym.MultiDiscrete([40_000, 40_000]), "80,000 choices together"),
         (gym.Box(0, 1), gym.Tuple((VARIED,) * 40), "at most 8,192"),

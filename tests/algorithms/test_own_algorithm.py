@@ -158,7 +158,7 @@ def test_arguments_reach_the_constructor(modules: UserModules) -> None:
         (f"{MODULE}:NoScalar", "ValueError: policy_loss has shape (1,): it must be a scalar"),
         (f"{MODULE}:NoTensor", "TypeError: policy_loss is float: it must be a tensor; zero is torch.zeros(())"),
         (f"{MODULE}:NoLosses", "TypeError: losses() gives Tensor: it must yield Losses or MinibatchLosses"),
-        (f"{MODULE}:FaultyAfter", "there is no target network: set target_network in the record of the algorithm"),
+        (f"{MODULE}:FaultyAfter", "there is no target network: set target_network in the record of the algorithm ("),
         (f"{MODULE}:NoRecord", "its record is not an AlgorithmRecord"),
         (f"{MODULE}:number", "it is not a class of daedalus.algorithms.algorithm.Algorithm"),
         (f"{MODULE}:absent", "has no 'absent'"),

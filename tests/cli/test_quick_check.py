@@ -60,7 +60,10 @@ def test_an_environment_that_ends_its_process_is_a_problem() -> None:
 def test_a_run_does_not_wait_for_an_environment_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MOST_SECONDS", 0.5)
     assert checked_spaces(run(faulty("hang"))) is None
-    assert "the check of the environment was not done within 0.5 s: the run starts without it" in "\n".join(LINES)
+    assert "the check of the environment was not done within 0.5 s: the run starts without it" in LINES[-1]
+    assert "an actor makes its 3 environments in turn: --set environment.processes=true makes them" in LINES[-1]
+    assert checked_spaces(run(faulty("hang").model_copy(update={"processes": True}))) is None
+    assert LINES[-1].endswith("the run starts without it")
 
 
 def test_a_run_waits_longer_where_its_settings_depend_on_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The user's part of a traceback: where the code of an environment raised an exception."""
+"""Errors that the user's code raised, in one line: what they are, and where they were raised."""
 
 import sys
 from collections.abc import Iterator
@@ -6,7 +6,13 @@ from types import TracebackType
 
 from daedalus.policy.user_modules import shown_path
 
-_NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", *sys.stdlib_module_names}  # packages
+_NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", "torch", *sys.stdlib_module_names}  # packages
+
+
+def first_line(error: BaseException) -> str:
+    """Return the type of an error and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
 
 
 def frames_of(error: BaseException | None) -> Iterator[TracebackType]:
@@ -18,7 +24,7 @@ def frames_of(error: BaseException | None) -> Iterator[TracebackType]:
 
 
 def is_of_user(frame: TracebackType) -> bool:
-    """Return whether a frame runs code of an environment, or of a package that it uses."""
+    """Return whether a frame runs code of the user, or of a package that it uses."""
     return frame.tb_frame.f_globals.get("__name__", "").partition(".")[0] not in _NOT_OF_USERS
 
 
