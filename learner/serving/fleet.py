@@ -81,7 +81,7 @@ class Fleet:
             return Refusal(
                 code="mismatch",
                 reason=f"the actor's environment has {join.spaces}, but this run has {self.spaces}: "
-                "install the version of the environment that the run uses",
+                "install the version of the environment that the run uses, or give a client the spaces of the run",
             )
         if join.actor not in self.actors:
             reason = self._make_room(keys.owner(join.actor))
