@@ -61,6 +61,7 @@ def test_ctrl_c_before_the_handlers_stops_the_process_in_order(
 # In place of a command without handlers: Ctrl-C arrives in code that replaces KeyboardInterrupt, as pydantic does.
 REPLACING = """
 import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores SIGINT in jobs of its background
 from daedalus.cli import main
 
 def build(_arguments):
