@@ -19,6 +19,7 @@ import re
 import secrets
 import socket
 import threading
+from numbers import Integral, Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any, get_args
@@ -93,12 +94,13 @@ class Client:
         4096, another link, or a timeout that is not above 0; ActorError, TransportError, EnvironmentSetupError,
         AddressError or CredentialsError.
         """
-        if not isinstance(agents, int) or not 1 <= agents <= MAX_ENVIRONMENTS:
+        if not isinstance(agents, Integral) or not 1 <= agents <= MAX_ENVIRONMENTS:
             raise ValueError(f"agents is {agents!r}: it must be from 1 to {MAX_ENVIRONMENTS}")
         if link not in get_args(LinkChoice):
             raise ValueError(f"link is {link!r}: choose from {', '.join(get_args(LinkChoice))}")
-        if not isinstance(timeout, int | float) or not timeout > 0.0:
+        if not isinstance(timeout, Real) or not timeout > 0.0:
             raise ValueError(f"timeout is {timeout!r}: it must be a number of seconds above 0")
+        agents, timeout = int(agents), float(timeout)  # threading takes no number of NumPy
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         config = ActorConfig(

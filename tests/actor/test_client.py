@@ -118,6 +118,12 @@ def test_arguments_without_a_meaning_are_refused(name: str, value: Any, reason: 
         Client("tcp/127.0.0.1:1", **SPACES, **{name: value})
 
 
+def test_numbers_of_numpy_are_numbers(learner: ScriptedLearner) -> None:
+    learner.refusal = Refusal(code="finished", reason="the run is over")
+    with pytest.raises(ActorError, match="the run ended before a policy came"):
+        Client("tcp/127.0.0.1:1", **SPACES, agents=np.int64(2), timeout=np.float32(30.0))  # pyright: ignore[reportArgumentType]  # on purpose
+
+
 def test_run_that_is_over_has_no_client(learner: ScriptedLearner) -> None:
     learner.refusal = Refusal(code="finished", reason="the run is over")
     with pytest.raises(ActorError, match="the run ended before a policy came"):
