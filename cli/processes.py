@@ -104,13 +104,14 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
 def _exit_if_stuck(stop: threading.Event, handled: Sequence[int]) -> None:
     """Wait for `stop`, and end the process unless it ends by itself; the signal handler adds to `handled`."""
     stop.wait()
-    # Another part of the process may have set `stop`.
-    if hasattr(signal, "pthread_kill"):
-        os.kill(os.getpid(), signal.SIGTERM)
-    else:  # Windows, where os.kill would end the process at once
-        signal.raise_signal(signal.SIGTERM)
     deadline = time.monotonic() + _STUCK_SECONDS
     while not handled and time.monotonic() < deadline:
+        # Another part of the process may have set `stop`. And a signal just before the main thread begins to wait
+        # does not interrupt the wait: the next one does.
+        if hasattr(signal, "pthread_kill"):
+            os.kill(os.getpid(), signal.SIGTERM)
+        else:  # Windows, where os.kill would end the process at once
+            signal.raise_signal(signal.SIGTERM)
         time.sleep(_STUCK_POLL_SECONDS)
     if handled:
         time.sleep(_END_SECONDS)

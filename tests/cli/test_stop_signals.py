@@ -12,11 +12,11 @@ SECONDS = 60.0  # generous for slow machines; a process that ignores the signal 
 PREAMBLE = """
     import os, sys, threading
     from daedalus.cli import processes
-    processes._STUCK_SECONDS = 0.2
 """
 # A second lock of the same mutex never returns, and releases the interpreter's lock while it waits.
 STUCK = """
     import ctypes
+    processes._STUCK_SECONDS = 0.2
     processes._END_SECONDS = 0.2  # in case that the signal comes before the first lock
     processes.stop_on_signals(exit_if_stuck=True)
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
@@ -24,13 +24,31 @@ STUCK = """
     while True:
         libc.pthread_mutex_lock(mutex)
 """
-SLOW_END = """
-    import time
+# Once the watch has seen that the main thread calls signal handlers, it allows the end more time, and sleeps for it.
+SEEN = """
+    import functools, hashlib, operator, time, types
+    def sleep(seconds):
+        if seconds == processes._END_SECONDS:
+            seen.release()
+        time.sleep(seconds)
+    seen = threading.Lock()
+    seen.acquire()
+    processes.time = types.SimpleNamespace(monotonic=time.monotonic, sleep=sleep)
+    processes._STUCK_SECONDS = 40.0  # even a busy machine calls the handlers by then
     stop = processes.stop_on_signals(exit_if_stuck=True)
     processes.exit_with_parent(stop)
     print("ready", flush=True)
+"""
+SLOW_END = f"""{SEEN}
     stop.wait()
-    time.sleep(0.5)
+    seen.acquire()
+    os._exit(8)
+"""
+# Between two calls of native code the interpreter calls no handlers, and a signal that comes during the first does not
+# interrupt the wait.
+NATIVE_THEN_WAIT = f"""{SEEN}
+    busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 3_000_000)
+    list(map(operator.call, (busy, seen.acquire)))
     os._exit(8)
 """
 SEEN_BY_A_THREAD = """
@@ -75,11 +93,12 @@ CHILD = """
         (STUCK, True, 1),
         (SLOW_END, True, 8),
         (SLOW_END, False, 8),
+        (NATIVE_THEN_WAIT, True, 8),
         (SEEN_BY_A_THREAD, True, 7),
         (MANY, True, 9),
         (CHILD, True, 0),
     ],
-    ids=["stuck", "slow end", "slow end after the parent", "seen by a thread", "many signals", "child"],
+    ids=["stuck", "slow end", "slow end after the parent", "wait", "seen by a thread", "many signals", "child"],
 )
 def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:
     command = [sys.executable, "-c", textwrap.dedent(PREAMBLE) + textwrap.dedent(program)]
