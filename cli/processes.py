@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TextIO
 
 _logger = logging.getLogger(__name__)
@@ -22,8 +22,7 @@ RANK_LOST = 5  # exit status of a process of a learner that has lost another one
 UNSAVED = 6  # exit status of a supervised learner whose last checkpoint could not be saved
 UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other programs; Windows has no such signal
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
-_STUCK_SECONDS = 4.0  # in native code after a signal: a process that is stuck ends within 5 s
-_STUCK_POLL_SECONDS = 0.05
+_STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
@@ -64,6 +63,25 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+class _Stop(threading.Event):
+    """Event that knows whether the main thread has found it set."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.noticed = threading.Event()
+
+    def is_set(self) -> bool:
+        return self._note(super().is_set())
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self._note(super().wait(timeout))
+
+    def _note(self, found: bool) -> bool:
+        if found and threading.current_thread() is threading.main_thread():
+            self.noticed.set()
+        return found
+
+
 def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     """Return an event that SIGTERM and SIGINT set. Call it in the main thread.
 
@@ -71,14 +89,11 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     calls no handler while the main thread runs native code, such as a simulator or a policy. And a handler may
     interrupt the main thread, or another handler, inside the event: it would wait for ever for the event's lock.
 
-    With `exit_if_stuck`, the process ends with status 1 if the main thread does not return from native code within
-    `_STUCK_SECONDS` of the event, or does not end within `_END_SECONDS` more.
+    With `exit_if_stuck`, the process ends with status 1 if the main thread does not check the event within
+    `_STUCK_SECONDS`, because a call such as a step of a simulator does not return, or does not end within
+    `_END_SECONDS` more.
     """
-    stop = threading.Event()
-    handled: list[int] = []  # the signals that the main thread has responded to
-
-    def handle(number: int, _frame: object) -> None:
-        handled.append(number)
+    stop = _Stop()
 
     def watch() -> None:
         while number := os.read(reader, 1):
@@ -88,8 +103,8 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     reader, writer = os.pipe()
     if hasattr(os, "set_blocking"):  # Windows with Python 3.11 has none, and does not require it
         os.set_blocking(writer, False)
-    signal.signal(signal.SIGTERM, handle)
-    signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGTERM, _ignore)
+    signal.signal(signal.SIGINT, _ignore)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)  # the interpreter writes each signal's number at once
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see interrupts_held
@@ -97,26 +112,21 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
         os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
-        threading.Thread(target=_exit_if_stuck, args=(stop, handled), name="stuck-watch", daemon=True).start()
+        threading.Thread(target=_exit_if_stuck, args=(stop,), name="stuck-watch", daemon=True).start()
     return stop
 
 
-def _exit_if_stuck(stop: threading.Event, handled: Sequence[int]) -> None:
-    """Wait for `stop`, and end the process unless it ends by itself; the signal handler adds to `handled`."""
+def _ignore(_number: int, _frame: object) -> None:
+    """Handle a signal that a thread reads from the wakeup descriptor."""
+
+
+def _exit_if_stuck(stop: _Stop) -> None:
+    """Wait for `stop`, and end the process unless it ends by itself."""
     stop.wait()
-    deadline = time.monotonic() + _STUCK_SECONDS
-    while not handled and time.monotonic() < deadline:
-        # Another part of the process may have set `stop`. And a signal just before the main thread begins to wait
-        # does not interrupt the wait: the next one does.
-        if hasattr(signal, "pthread_kill"):
-            os.kill(os.getpid(), signal.SIGTERM)
-        else:  # Windows, where os.kill would end the process at once
-            signal.raise_signal(signal.SIGTERM)
-        time.sleep(_STUCK_POLL_SECONDS)
-    if handled:
+    if stop.noticed.wait(_STUCK_SECONDS):
         time.sleep(_END_SECONDS)
     try:
-        _logger.error("the process was asked to stop, but a call of native code does not return: it ends now")
+        _logger.error("asked to stop, but a call, such as a step of the environment, does not return: the process ends")
         sys.stdout.flush()
     finally:
         os._exit(1)

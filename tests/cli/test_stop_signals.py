@@ -1,4 +1,4 @@
-"""SIGTERM ends a process, also one whose main thread runs native code, in which Python calls no signal handler."""
+"""SIGTERM ends a process, also one whose main thread is in a call that does not return."""
 
 import signal
 import subprocess
@@ -17,14 +17,22 @@ PREAMBLE = """
 STUCK = """
     import ctypes
     processes._STUCK_SECONDS = 0.2
-    processes._END_SECONDS = 0.2  # in case that the signal comes before the first lock
     processes.stop_on_signals(exit_if_stuck=True)
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(128)
     print("ready", flush=True)
     while True:
         libc.pthread_mutex_lock(mutex)
 """
-# Once the watch has seen that the main thread calls signal handlers, it allows the end more time, and sleeps for it.
+# A call that Python repeats after each signal, such as a read of a simulator's answer.
+STUCK_IN_PYTHON = """
+    import time
+    processes._STUCK_SECONDS = 0.2
+    processes._END_SECONDS = 1000.0
+    processes.stop_on_signals(exit_if_stuck=True)
+    print("ready", flush=True)
+    time.sleep(1000)
+"""
+# Once the watch has seen that the main thread has noticed the stop, it allows the end more time, and sleeps for it.
 SEEN = """
     import functools, hashlib, operator, time, types
     def sleep(seconds):
@@ -34,7 +42,7 @@ SEEN = """
     seen = threading.Lock()
     seen.acquire()
     processes.time = types.SimpleNamespace(monotonic=time.monotonic, sleep=sleep)
-    processes._STUCK_SECONDS = 40.0  # even a busy machine calls the handlers by then
+    processes._STUCK_SECONDS = 40.0  # even a busy machine notices the stop by then
     stop = processes.stop_on_signals(exit_if_stuck=True)
     processes.exit_with_parent(stop)
     print("ready", flush=True)
@@ -48,7 +56,8 @@ SLOW_END = f"""{SEEN}
 # interrupt the wait.
 NATIVE_THEN_WAIT = f"""{SEEN}
     busy = functools.partial(hashlib.pbkdf2_hmac, "sha256", b"", b"", 3_000_000)
-    list(map(operator.call, (busy, seen.acquire)))
+    list(map(operator.call, (busy, stop.wait)))
+    seen.acquire()
     os._exit(8)
 """
 SEEN_BY_A_THREAD = """
@@ -91,6 +100,7 @@ CHILD = """
     ("program", "by_signal", "status"),
     [
         (STUCK, True, 1),
+        (STUCK_IN_PYTHON, True, 1),
         (SLOW_END, True, 8),
         (SLOW_END, False, 8),
         (NATIVE_THEN_WAIT, True, 8),
@@ -98,7 +108,16 @@ CHILD = """
         (MANY, True, 9),
         (CHILD, True, 0),
     ],
-    ids=["stuck", "slow end", "slow end after the parent", "wait", "seen by a thread", "many signals", "child"],
+    ids=[
+        "stuck",
+        "stuck in Python",
+        "slow end",
+        "slow end after the parent",
+        "wait",
+        "seen by a thread",
+        "many signals",
+        "child",
+    ],
 )
 def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:
     command = [sys.executable, "-c", textwrap.dedent(PREAMBLE) + textwrap.dedent(program)]
