@@ -2,7 +2,9 @@
 
 import multiprocessing.connection
 import multiprocessing.resource_tracker
+import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -65,9 +67,19 @@ class _Maker:
 
     name: str
     make: Callable[[], gymnasium.Env]
+    parent: int
 
     def __call__(self) -> gymnasium.Env:
+        threading.Thread(target=self._end_with_parent, name="parent-watch", daemon=True).start()
         return OfItsOwnProcess(self.make(), self.name)
+
+    def _end_with_parent(self) -> None:
+        """End this process after its parent has died: an environment that hangs would run on for ever."""
+        parent = multiprocessing.parent_process()
+        if parent is not None and parent.pid == self.parent:  # else gymnasium has called this maker in the parent
+            parent.join()
+            time.sleep(_CLOSE_SECONDS)  # one that does not hang ends by itself
+            os._exit(1)
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
@@ -85,7 +97,7 @@ class EnvironmentProcesses(AsyncVectorEnv):
         Raises EnvironmentSetupError if a process dies, and whatever the first environment raises.
         """
         self._name = name
-        wrapped = [_Maker(name, maker) for maker in makers]
+        wrapped = [_Maker(name, maker, os.getpid()) for maker in makers]
         with _interrupts_blocked():
             try:
                 self._start(wrapped)

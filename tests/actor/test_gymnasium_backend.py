@@ -16,6 +16,7 @@ from allowed_modules import TEST_MODULES
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 from plain import PlainEnvironments, choices
+from processes import processes_mentioning, until
 
 from daedalus.actor.environments import environment_processes, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
@@ -271,6 +272,48 @@ def test_killed_process_is_reported_and_close_ends_the_others() -> None:
         environments.step(np.zeros(2, np.int64))
     environments.close()
     assert not any(process.is_alive() for process in environments.processes)
+
+
+HANGING = """
+import time
+from counting_environment import Counting
+from daedalus.actor.environments import environment_processes
+
+
+class Hanging(Counting):
+    def __init__(self):
+        super().__init__()
+        environment_processes._CLOSE_SECONDS = 0.1  # of this process
+
+    def step(self, action):
+        print("ready", flush=True)
+        time.sleep(1000)
+"""
+PARENT = """
+import numpy
+from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from hanging import Hanging
+
+environments = EnvironmentProcesses("Mine-v0", [Hanging])
+environments.reset(seed=1)
+environments.step(numpy.zeros(1, numpy.int64))
+"""
+
+
+def test_process_whose_environment_hangs_ends_after_its_parent_was_killed(tmp_path: Path) -> None:
+    (tmp_path / "hanging.py").write_text(HANGING)
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    command = [sys.executable, "-c", PARENT]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "ready\n"
+        (process,) = (pid for pid in processes_mentioning("spawn_main") if _parent_of(pid) == parent.pid)
+        parent.kill()
+        until(lambda: not Path(f"/proc/{process}").exists())
+
+
+def _parent_of(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def test_processes_ignore_interrupts() -> None:
