@@ -26,7 +26,8 @@ class CsvWriter:
             self._columns = COLUMNS
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
-        """Append a line. See MetricsWriter."""
+        """Append a line. See MetricsWriter. Raises OSError also if the file was moved or removed."""
+        self._path.stat()
         new = [name for name in row if name not in self._columns]
         if new:
             self._add_columns(new)

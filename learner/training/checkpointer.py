@@ -1,11 +1,14 @@
 """Saving of checkpoints during training. A disk error is logged as a warning and does not end the run."""
 
+import errno
 import logging
 import threading
 import time
 from pathlib import Path
 
+from daedalus.learner.run.run_directory import CONFIG, write_config
 from daedalus.learner.run.run_state import RunState
+from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpoint import save_checkpoint
 from daedalus.learner.training.learner import Learner
@@ -54,6 +57,8 @@ class Checkpointer:
         with self._lock:
             counters = self._state.saved(time.monotonic())
         try:
+            if self._newest is not None and not (self._state.directory / CONFIG).exists():
+                self._restore_config()
             directory = save_checkpoint(
                 self._state.directory,
                 spec=self._spec,
@@ -86,3 +91,14 @@ class Checkpointer:
         self._health.saved, self._health.save_fault = time.monotonic(), ""
         self._newest = self._learner.policy_version, directory
         return directory
+
+    def _restore_config(self) -> None:
+        """Write config.toml again, without which nobody can resume the run. Raises OSError."""
+        directory = self._state.directory
+        directory.mkdir(parents=True, exist_ok=True)
+        try:
+            write_config(directory, self._spec)
+        except SettingsError as error:
+            raise OSError(errno.EIO, str(error)) from None
+        text = f"the run directory {directory} was moved or removed: the run continues in a new one of this name"
+        self._events.add("checkpoint", text, level=logging.WARNING)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from building import POLICY, SPACES, make_rollouts, run_spec
 
+from daedalus.learner.run import run_directory
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.training.checkpointer import Checkpointer
@@ -48,3 +49,20 @@ def test_a_version_whose_saving_failed_is_saved_again(tmp_path: Path, monkeypatc
     (tmp_path / "checkpoints").unlink()
     assert checkpointer.ensure_saved() is not None
     assert not health.save_fault
+
+
+def test_a_run_whose_directory_was_removed_can_be_resumed(tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    run_directory.create(directory, run_spec())
+    events, state = EventLog(), RunState(directory, run_spec(), started=0.0)
+    learner = Learner(TrainingSpec(), POLICY, SPACES)
+    checkpointer = Checkpointer(state, learner, b"program", SPACES, events=events, lock=threading.Condition())
+    checkpointer.save()
+    shutil.rmtree(directory)
+    saved = checkpointer.save()
+    assert saved is not None
+    assert run_directory.read_config(directory) == run_spec()
+    texts = [event.text for event in events.report()]
+    assert any("was moved or removed: the run continues in a new one" in text for text in texts)
+    checkpointer.save()
+    assert sum("moved or removed" in event.text for event in events.report()) == 1

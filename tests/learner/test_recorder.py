@@ -93,6 +93,22 @@ def test_full_disk_logs_one_warning_and_writing_resumes_when_there_is_space(
     assert env_steps(tmp_path)[-2:] == ["4", "5"]
 
 
+def test_rows_are_written_again_after_the_directory_was_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder, "_RETRY_SECONDS", 0.0)
+    directory = tmp_path / "run"
+    directory.mkdir()
+    recording = Recorder([lambda: CsvWriter(directory / "metrics.csv")], Progress(io.StringIO(), 100))
+    recording.record(row(1), Details())
+    until(lambda: (directory / "metrics.csv").exists() and env_steps(directory) == ["1"])
+    directory.rename(tmp_path / "moved")
+    recording.record(row(2), Details())
+    until(lambda: any("metrics not written: No such file or directory" in line for line in LINES))
+    directory.mkdir()
+    recording.record(row(3), Details())
+    recording.close()
+    assert env_steps(directory) == ["3"]
+
+
 def test_partly_written_line_is_removed_when_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = CsvWriter(tmp_path / "metrics.csv")
     writer.write(row(1), Details())
