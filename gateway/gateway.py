@@ -110,6 +110,8 @@ class Gateway:
           address: where the client is, for the status of the run.
           on_end: called if the gateway must end the connection: see connection.py.
         """
+        if self._stop.is_set():
+            raise ClientError("unavailable", "the gateway stops")
         name = self._config.actor_name(hello.name)
         spaces = ClientSpaces(hello.observations, hello.actions)
         if name in self._seats:

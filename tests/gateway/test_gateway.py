@@ -497,3 +497,18 @@ def test_gateway_stops_while_clients_play(learner: ScriptedLearner, network: Mem
     running.close()
     assert client.receive() == {"type": "error", "code": "unavailable", "reason": "the gateway stops"}
     client.close()
+
+
+def test_client_that_returns_while_the_gateway_stops_is_refused(
+    learner: ScriptedLearner, network: MemoryNetwork
+) -> None:
+    running = RunningGateway(network)
+    client = JsonClient(running.port)
+    client.hello("arm-1")
+    asyncio.run_coroutine_threadsafe(running.gateway.close(), running.loop).result(LIMIT)
+    returned = JsonClient(running.port)
+    assert returned.hello("arm-1") == {"type": "error", "code": "unavailable", "reason": "the gateway stops"}
+    assert ended(returned) == 1013
+    running.close()
+    client.close()
+    returned.close()
