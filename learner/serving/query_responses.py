@@ -44,7 +44,7 @@ class QueryResponses:
         self._program: Program | None = None
         self._encoded_program = b""
         self._ending: Refusal | None = None  # of joins after the end
-        self.preparing = ""  # the first actor that asked for the specification, and makes its environments
+        self.preparing = ""  # an actor that asked for the specification, and makes its environments
         self.postponed_at = -math.inf  # the last time that an actor was refused which will ask again
 
     def join(self, name: str, data: bytes, now: float) -> bytes:
@@ -70,6 +70,7 @@ class QueryResponses:
             seed, epsilon = self._fleet.seed_for(name, self._start_version), self._fleet.epsilon_for(name)
             is_new = self._fleet.lives(name) != lives
         if refusal is not None:
+            self.preparing = "" if self.preparing == name else self.preparing
             self._add_refusal(name, origin, refusal)
             return encode(refusal)
         if is_new and isinstance(message, Join) and message.spaces is not None:

@@ -50,10 +50,13 @@ def test_a_foreign_join_that_comes_first_is_refused_and_leaves_no_trace(tmp_path
         assert refusal.code == "mismatch"
         assert str(foreign) in refusal.reason
         assert str(SPACES) in refusal.reason
-        until(lambda: any("waiting for the first actor: start one with" in line for line in LINES))
+        until(lambda: sum("waiting for the first actor: start one with" in line for line in LINES) == 1)
         honest = encode(Join(actor="honest", incarnation=1, environments=0))
         assert isinstance(ask(keys.join("run", "honest"), honest), Welcome)
         until(lambda: any("waiting for the first actor: honest makes its environments" in line for line in LINES))
+        failed = encode(Join(actor="honest", incarnation=1, failure="no simulator"))
+        assert isinstance(ask(keys.join("run", "honest"), failed), Refusal)
+        until(lambda: sum("waiting for the first actor: start one with" in line for line in LINES) == 2)
     finally:
         stop.set()
         thread.join(LIMIT)
