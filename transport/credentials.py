@@ -97,9 +97,6 @@ def load(directory: Path, *roles: str) -> Credentials:
     Raises CredentialsError if a file is missing or damaged, the certificate is not valid now or not signed by the CA,
     or its role is not one of `roles`.
     """
-    for name in (CA, CERTIFICATE, KEY):
-        if not (directory / name).is_file():
-            raise CredentialsError(f"{directory} has no {name}: create such a folder with `daedalus certs`")
     subject = common_name_of(_verified(directory))
     role, _, name = subject.partition(":")
     if role not in roles:
@@ -168,6 +165,8 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
     Verifies by a TLS handshake with itself in memory: on the network the same failure would have no explanation.
     Raises CredentialsError.
     """
+    for name in (CA, CERTIFICATE, KEY):
+        _check_readable(directory / name)
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         server.load_cert_chain(directory / CERTIFICATE, directory / KEY)
@@ -191,6 +190,17 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
         raise CredentialsError(f"{directory}: {CERTIFICATE}: {with_remedy(error.verify_message)}") from None
     except ssl.SSLError:
         raise CredentialsError(f"{directory}: {CA} is damaged: copy it again") from None
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except PermissionError as error:
+        raise CredentialsError(f"{path}: {error.strerror}: let the user of this process read it") from None
+    except OSError:
+        raise CredentialsError(
+            f"{path.parent} has no {path.name}: create such a folder with `daedalus certs`"
+        ) from None
 
 
 def _handshake(client: ssl.SSLContext, server: ssl.SSLContext) -> dict[str, Any]:

@@ -297,6 +297,15 @@ def test_damaged_folder_is_reported(tmp_path: Path, damage: Callable[[Path], obj
         load(folder, "actor")
 
 
+def test_file_that_another_user_owns_is_reported(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(self: Path, mode: str) -> None:  # a test may run as root, who may read everything
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", refused)
+    with pytest.raises(CredentialsError, match=r"ca\.pem: Permission denied: let the user of this process read it"):
+        load(certificates / "actor-arm", "actor")
+
+
 def test_key_of_another_certificate_is_reported(certificates: Path, tmp_path: Path) -> None:
     for name, source in (("ca.pem", "actor-arm"), ("certificate.pem", "actor-arm"), ("key.pem", "actor-box")):
         (tmp_path / name).write_bytes((certificates / source / name).read_bytes())
