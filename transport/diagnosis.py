@@ -64,8 +64,11 @@ def _diagnose_socket(path: str) -> str:
 
 
 def _diagnose_refusal(link: socket.socket, host: str, endpoint: str, credentials: Credentials) -> Diagnosis:
-    context = ssl.create_default_context(cafile=str(credentials.directory / CA))
-    context.load_cert_chain(credentials.directory / CERTIFICATE, credentials.directory / KEY)
+    try:
+        context = ssl.create_default_context(cafile=str(credentials.directory / CA))
+        context.load_cert_chain(credentials.directory / CERTIFICATE, credentials.directory / KEY)
+    except OSError:  # also ssl.SSLError
+        return Diagnosis(f"the files in {credentials.directory} cannot be used any more: copy the folder again", False)
     try:
         with context.wrap_socket(link, server_hostname=host.strip("[]")) as secured:
             secured.recv(1)  # with TLS 1.3 a server refuses a certificate only after the client's handshake is done

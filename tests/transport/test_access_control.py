@@ -306,6 +306,18 @@ def test_file_that_another_user_owns_is_reported(certificates: Path, monkeypatch
         load(certificates / "actor-arm", "actor")
 
 
+def test_folder_that_is_damaged_after_the_start_is_reported_when_the_process_connects_again(
+    address: str, tmp_path: Path, certificates: Path
+) -> None:
+    folder = shutil.copytree(certificates / "actor-arm", tmp_path / "actor-arm")
+    credentials = load(folder, "actor")
+    with closing(connect([address], credentials)) as actor:
+        (folder / "key.pem").write_text("x")
+        with pytest.raises(TransportError, match=r"actor-arm cannot be used any more: copy the folder") as raised:
+            actor.reopen()
+    assert not isinstance(raised.value, RefusedError), "the files may still be being copied: it tries again"
+
+
 def test_key_of_another_certificate_is_reported(certificates: Path, tmp_path: Path) -> None:
     for name, source in (("ca.pem", "actor-arm"), ("certificate.pem", "actor-arm"), ("key.pem", "actor-box")):
         (tmp_path / name).write_bytes((certificates / source / name).read_bytes())
