@@ -130,6 +130,8 @@ def with_remedy(reason: str) -> str:
         return f"{reason}: renew it (daedalus certs renew)"
     if "issuer" in reason or "unknown ca" in reason or "self-signed" in reason or "decrypt error" in reason:
         return f"{reason}: the two ends use different CAs (ca.pem must be the same on both sides)"
+    if "not yet valid" in reason:
+        return f"{reason}: check the clock of this host, and of the host that issued it"
     if "mismatch" in reason:
         return f"{reason}: issue the certificate for this host (--host)"
     return reason

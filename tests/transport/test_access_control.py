@@ -11,7 +11,7 @@ import pytest
 from certificates import issue_expired, make_certificates, unchecked
 
 from daedalus.protocol import keys
-from daedalus.transport.credentials import CredentialsError, load
+from daedalus.transport.credentials import CredentialsError, load, with_remedy
 from daedalus.transport.interface import AddressInUseError, RefusedError, Transport, TransportError
 from daedalus.transport.zenoh_transport import connect, listen
 
@@ -295,6 +295,10 @@ def test_damaged_folder_is_reported(tmp_path: Path, damage: Callable[[Path], obj
     damage(folder)
     with pytest.raises(CredentialsError, match=message):
         load(folder, "actor")
+
+
+def test_remedy_for_a_certificate_of_the_future_is_the_clock() -> None:
+    assert "check the clock of this host" in with_remedy("certificate is not yet valid")
 
 
 def test_file_that_another_user_owns_is_reported(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
