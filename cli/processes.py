@@ -13,6 +13,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import TextIO
 
+from daedalus.transport.slow_calls import in_progress
+
 _logger = logging.getLogger(__name__)
 
 # Exit status of a learner that its supervisor stopped; of one that nobody supervises, the status is 0.
@@ -177,7 +179,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     try:
         try:
             with _interrupts_recognised():
-                return command()
+                return _ended(command())
         finally:
             sys.stdout.flush()
     except KeyboardInterrupt:  # before a command has handlers of its own, or without any
@@ -195,6 +197,15 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
         discard(*outputs, sys.stdout)
         print(f"daedalus: cannot write the output: {error.strerror}", file=sys.stderr)
         return 1
+
+
+def _ended(status: int) -> int:
+    """Return the status, or end the process with it now if a call of Zenoh is in progress, which would abort it."""
+    if in_progress():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
 @contextlib.contextmanager

@@ -3,10 +3,13 @@
 import logging
 import threading
 import time
+from concurrent.futures import Future
+from functools import partial
 
 from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.slow_calls import SlowCall
 from daedalus.transport.zenoh_transport import connect, listen
 
 __all__ = ["connect", "connect_with_retry", "listen"]
@@ -14,6 +17,10 @@ __all__ = ["connect", "connect_with_retry", "listen"]
 _logger = logging.getLogger(__name__)
 
 _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts
+
+
+class _StoppedError(Exception):
+    pass
 
 
 def connect_with_retry(
@@ -28,11 +35,20 @@ def connect_with_retry(
 
     Raises TransportError after `timeout` seconds, and RefusedError at once.
     """
+
+    def check() -> None:
+        if stop.is_set():
+            raise _StoppedError
+
     deadline = None if timeout is None else time.monotonic() + timeout
     pause, logged = _FIRST_PAUSE_SECONDS, False
     while True:
+        attempt = SlowCall(partial(connect, endpoints, credentials, max_message_bytes=max_message_bytes))
         try:
-            return connect(endpoints, credentials, max_message_bytes=max_message_bytes)
+            return attempt.wait(check)
+        except _StoppedError:
+            attempt.result.add_done_callback(_close)
+            return None
         except RefusedError:
             raise
         except TransportError as error:
@@ -46,3 +62,9 @@ def connect_with_retry(
         if stop.wait(pause):
             return None
         pause = min(2 * pause, _MAX_PAUSE_SECONDS)
+
+
+def _close(attempt: Future[Transport]) -> None:
+    """Close a transport that was opened when nobody waited for it any more."""
+    if attempt.exception() is None:
+        attempt.result().close()

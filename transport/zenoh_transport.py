@@ -20,6 +20,7 @@ from daedalus.transport.credentials import Credentials, CredentialsError
 from daedalus.transport.credentials_watch import CredentialsWatch
 from daedalus.transport.interface import Declaration, Inbox, OnAnswer, Request, Transport, TransportError
 from daedalus.transport.linger import linger_removal
+from daedalus.transport.slow_calls import SlowCall
 from daedalus.transport.zenoh_callbacks import Callbacks
 from daedalus.transport.zenoh_declarations import Declarations, Declared
 from daedalus.transport.zenoh_messages import ZenohInbox, ZenohPresence, ZenohRequest
@@ -29,6 +30,7 @@ from daedalus.transport.zenoh_settings import MAX_MESSAGE_BYTES
 
 _logger = logging.getLogger(__name__)
 
+_CLOSE_SECONDS = 2.0  # Zenoh waits up to 10 s for a router that does not answer
 _PROBE_SECONDS = 2.0  # for the query that checks whether a key is served
 _RENEW_SECONDS, _RENEW_PAUSE_SECONDS = 10.0, 0.05  # for the address of a closed session to become free
 
@@ -274,5 +276,6 @@ class ZenohTransport:
         if self._watch is not None:
             self._watch.close()
         if not session.is_closed():
-            session.close()
-            self._callbacks.await_release()
+            with contextlib.suppress(TimeoutError, zenoh.ZError):  # of a router that does not answer
+                SlowCall(session.close).result.result(_CLOSE_SECONDS)
+                self._callbacks.await_release()

@@ -25,6 +25,7 @@ from daedalus.protocol.messages import (
     Welcome,
 )
 from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.slow_calls import SlowCall
 
 _logger = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ class LearnerQueries:
             end.wait(pause)
             pause = min(2 * pause, _MAX_RETRY_SECONDS)
             if time.monotonic() > reopen_at:
-                self._reopen()
+                self._reopen(end)
                 reopen_at = time.monotonic() + _REOPEN_SECONDS
 
     def _remedy(self, run: str, join: Join) -> str:
@@ -104,10 +105,13 @@ class LearnerQueries:
                     runs.update({message.run} if isinstance(message, Welcome) else ())
         return sorted(runs)[:_MAX_RUNS]
 
-    def _reopen(self) -> None:
-        """Open another session in place of one that may be dead. Raises ActorError if the certificate is refused."""
+    def _reopen(self, end: RunEndWatch) -> None:
+        """Open another session in place of one that may be dead.
+
+        Raises ActorError if the certificate is refused, and as `end.check` does.
+        """
         try:
-            self._transport.reopen()
+            SlowCall(self._transport.reopen).wait(end.check)
         except RefusedError as error:  # it was revoked or has expired since the start
             raise ActorError(str(error)) from None
         except TransportError:

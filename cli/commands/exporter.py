@@ -18,6 +18,7 @@ from daedalus.transport.connecting import connect_with_retry
 from daedalus.transport.credentials import Credentials
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
+from daedalus.transport.slow_calls import SlowCall
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -147,6 +148,11 @@ def _follow(
     collector: StatusCollector, endpoints: list[str], credentials: Credentials | None, stop: threading.Event
 ) -> None:
     """Keep the collector connected until a signal. Raises TransportError if the router rejects the certificate."""
+
+    def check() -> None:
+        if stop.is_set():
+            raise TransportError("stopped")
+
     transport = connect_with_retry(endpoints, stop, credentials=credentials)
     if transport is None:
         return
@@ -156,7 +162,7 @@ def _follow(
             if collector.unanswered:
                 # Zenoh reconnects by itself, except if the connection died without an error.
                 with contextlib.suppress(TransportError):
-                    transport.reopen()
+                    SlowCall(transport.reopen).wait(check)
     finally:
         collector.transport = None
         transport.close()

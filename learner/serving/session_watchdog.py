@@ -3,8 +3,10 @@
 import logging
 import threading
 import time
+from functools import partial
 
 from daedalus.transport.interface import RefusedError, Transport, TransportError
+from daedalus.transport.slow_calls import SlowCall
 
 _logger = logging.getLogger(__name__)
 
@@ -44,7 +46,7 @@ class SessionWatchdog:
 
     def _reopen(self) -> None:
         try:
-            self._transport.reopen(unless_served=self._own_key)
+            SlowCall(partial(self._transport.reopen, unless_served=self._own_key)).result.result()
         except RefusedError as error:  # it was revoked or has expired since the start
             if not self._warned:
                 _logger.error("the learner cannot connect to its router: %s", error)

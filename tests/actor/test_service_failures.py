@@ -275,6 +275,26 @@ def test_actor_reopens_its_transport_while_nobody_answers(
     assert actor.error is None
 
 
+def test_actor_that_is_stopped_while_its_transport_is_reopened_ends(
+    network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner_queries, "_REOPEN_SECONDS", 0.0)
+    reopening, ended = threading.Event(), threading.Event()
+
+    def reopen(transport: MemoryTransport) -> bool:
+        reopening.set()
+        return ended.wait(LIMIT)
+
+    monkeypatch.setattr(MemoryTransport, "reopen", reopen)
+    actor = RunningActor(network)
+    assert reopening.wait(LIMIT)
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+    assert not ended.is_set()
+    ended.set()
+
+
 @pytest.mark.parametrize("stopped_in", ["join", "program"])
 def test_an_actor_that_is_stopped_during_a_query_sends_no_other_query(
     network: MemoryNetwork, monkeypatch: pytest.MonkeyPatch, stopped_in: str
