@@ -28,7 +28,7 @@ from daedalus.policy.saving.saved_policy import (
     checkpoints,
     read_policy,
 )
-from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, write_sealed
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -106,14 +106,15 @@ def load_newest(run_directory: Path) -> Checkpoint:
 
     The learner continues from the returned checkpoint, so that the newer ones are no longer the newest of the run.
 
-    Raises DamagedError if there is no undamaged checkpoint, OtherFormatError for a run of another release.
+    Raises DamagedError if there is no undamaged checkpoint, UnreadableError if a newer one may not be read,
+    OtherFormatError for a run of another release.
     """
     loaded, damaged = None, dict[Path, DamagedError]()
     for directory in checkpoints(run_directory):
         try:
             loaded = load_checkpoint(directory)
             break
-        except OtherFormatError:
+        except (OtherFormatError, UnreadableError):
             raise
         except DamagedError as error:
             damaged[directory] = error

@@ -25,6 +25,10 @@ class DamagedError(Exception):
     """A sealed directory that is missing, incomplete or changed."""
 
 
+class UnreadableError(DamagedError):
+    """A sealed directory that another user owns. Its content may be whole."""
+
+
 def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, Any]) -> None:
     """Write a sealed directory atomically.
 
@@ -111,7 +115,7 @@ class SealedDirectory:
             manifest = read_regular(directory / MANIFEST, MAX_MANIFEST_BYTES + 1)
             seal = read_regular(directory / SEAL, _SEAL_BYTES + 1)
         except OSError as error:
-            raise DamagedError(f"{directory}: {error.strerror}: {error.filename}") from None
+            raise _read_error(Path(error.filename or directory), error) from None
         if len(manifest) > MAX_MANIFEST_BYTES:
             raise DamagedError(f"{directory}: the manifest is too large")
         if hashlib.sha256(manifest).hexdigest().encode() != seal:
@@ -134,10 +138,16 @@ class SealedDirectory:
                 raise DamagedError(f"{self._directory / name}: {size} bytes instead of {entry.bytes}")
             data = read_regular(self._directory / name, entry.bytes)
         except OSError as error:
-            raise DamagedError(f"{self._directory / name}: {error.strerror}") from None
+            raise _read_error(self._directory / name, error) from None
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DamagedError(f"{self._directory / name}: damaged: the checksum differs")
         return data
+
+
+def _read_error(path: Path, error: OSError) -> DamagedError:
+    if isinstance(error, PermissionError):
+        return UnreadableError(f"{path}: {error.strerror}: let the user of this process read it")
+    return DamagedError(f"{path}: {error.strerror}")
 
 
 def _write_synced(path: Path, data: bytes) -> None:

@@ -12,8 +12,10 @@ from building import SPACES, run_spec
 from log_lines import LINES
 
 from daedalus.learner.training.checkpoint import load_checkpoint, load_newest, save_checkpoint
+from daedalus.policy.saving import sealed
+from daedalus.policy.saving.regular_files import read_regular
 from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkpoints, find_policy, read_policy
-from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
+from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, write_sealed
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
 COUNTERS = {"env_steps": 12, "returns": [1.5, -2.25], "rollouts_rejected": {"stale": 3}}
@@ -98,6 +100,24 @@ def test_damaged_checkpoints_are_no_longer_the_newest_after_a_resume(tmp_path: P
     flip(save(tmp_path, 2) / "learner.safetensors", 20)
     assert names(tmp_path) == ["0000000001", "0000000002"]
     assert load_newest(tmp_path).policy.policy_version == 1
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "parameters.safetensors"])
+def test_checkpoint_that_may_not_be_read_is_not_set_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    save(tmp_path, 1)
+    newest = save(tmp_path, 2)
+
+    def read(path: Path, limit: int) -> bytes:  # a test may run as root, who may read everything
+        if path == newest / name:
+            raise PermissionError(13, "Permission denied", str(path))
+        return read_regular(path, limit)
+
+    monkeypatch.setattr(sealed, "read_regular", read)
+    with pytest.raises(UnreadableError, match=f"{name}: Permission denied: let the user of this process read it"):
+        load_newest(tmp_path)
+    assert newest.is_dir()
 
 
 def test_learner_resumes_although_a_damaged_checkpoint_cannot_be_renamed(
