@@ -172,8 +172,8 @@ def open_standard_streams() -> None:
 def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     """Run a command and return its exit status; 141 if nobody reads its output any more, as in `daedalus ... | head`.
 
-    Every command runs in it. After Ctrl-C, or if the disk is full, the status is 1. `outputs` are the streams that the
-    command writes to, besides standard output and standard error.
+    Every command runs in it. After Ctrl-C, or if the disk is full or a file belongs to another user, the status is 1.
+    `outputs` are the streams that the command writes to, besides standard output and standard error.
     """
     open_standard_streams()
     try:
@@ -191,6 +191,11 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
             raise
         discard(*unread)
         return UNREAD
+    except PermissionError as error:
+        if error.filename is None:
+            raise
+        print(f"daedalus: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
     except OSError as error:
         if error.errno not in UNWRITABLE or error.filename is not None:
             raise

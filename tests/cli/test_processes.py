@@ -35,6 +35,14 @@ def test_ctrl_c_prints_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "stopped\n"
 
 
+def test_file_of_another_user_is_named_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    def refused() -> int:
+        raise PermissionError(13, "Permission denied", "runs/x/config.toml")
+
+    assert exit_status(refused) == 1
+    assert capsys.readouterr().err == "daedalus: runs/x/config.toml: Permission denied\n"
+
+
 def test_a_child_process_that_asks_a_question_gets_no_answer() -> None:
     """Nobody could answer; the end of the parent is noticed as before."""
     program = (
