@@ -196,13 +196,11 @@ def _verified(directory: Path, *, ignore_time: bool = False) -> dict[str, Any]:
 
 def _check_readable(path: Path) -> None:
     try:
+        if not path.is_file():  # to open a named pipe would wait for its writer
+            raise CredentialsError(f"{path.parent} has no {path.name}: create such a folder with `daedalus certs`")
         path.open("rb").close()
-    except PermissionError as error:
+    except OSError as error:
         raise CredentialsError(f"{path}: {error.strerror}: let the user of this process read it") from None
-    except OSError:
-        raise CredentialsError(
-            f"{path.parent} has no {path.name}: create such a folder with `daedalus certs`"
-        ) from None
 
 
 def _handshake(client: ssl.SSLContext, server: ssl.SSLContext) -> dict[str, Any]:

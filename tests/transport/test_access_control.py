@@ -1,5 +1,6 @@
 """Permissions of each role over real TLS on a real router, and rejected certificates."""
 
+import os
 import shutil
 import socket
 import time
@@ -281,10 +282,16 @@ def test_host_missing_in_the_certificate_is_not_trusted(certificates: Path) -> N
         connect([other], load(certificates / "actor-arm", "actor"))
 
 
+def replace_by_pipe(folder: Path) -> None:
+    (folder / "ca.pem").unlink()
+    os.mkfifo(folder / "ca.pem")
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda folder: (folder / "key.pem").unlink(), "has no key.pem"),
+        (replace_by_pipe, "has no ca.pem"),
         (lambda folder: (folder / "key.pem").write_text("x"), "is damaged"),
         (lambda folder: (folder / "certificate.pem").write_bytes(b"\xff"), "is damaged"),
         (lambda folder: (folder / "ca.pem").write_text("x"), "ca.pem is damaged"),
