@@ -184,7 +184,7 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
             sys.stdout.flush()
     except KeyboardInterrupt:  # before a command has handlers of its own, or without any
         print("stopped", file=sys.stderr)
-        return 1
+        return _ended(1)
     except BrokenPipeError:
         unread = [stream for stream in (*outputs, sys.stdout, sys.stderr) if _is_unread(stream)]
         if not unread:  # another pipe: a fault of ours

@@ -12,7 +12,7 @@ from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
 from daedalus.transport.zenoh_transport import connect, listen
 
-__all__ = ["connect", "connect_with_retry", "listen"]
+__all__ = ["connect", "connect_until_interrupted", "connect_with_retry", "listen"]
 
 _logger = logging.getLogger(__name__)
 
@@ -21,6 +21,14 @@ _FIRST_PAUSE_SECONDS, _MAX_PAUSE_SECONDS = 0.02, 1.0  # between attempts
 
 class _StoppedError(Exception):
     pass
+
+
+def connect_until_interrupted(endpoints: list[str], credentials: Credentials | None = None) -> Transport:
+    """Connect once, for a command without handlers of signals: Ctrl-C raises KeyboardInterrupt at once.
+
+    Zenoh itself waits up to 10 s for a host that does not answer. Raises as `connect` does.
+    """
+    return SlowCall(partial(connect, endpoints, credentials)).wait(lambda: None)
 
 
 def connect_with_retry(

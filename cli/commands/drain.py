@@ -11,7 +11,7 @@ from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Refusal
 from daedalus.protocol.status import RunStatus
-from daedalus.transport.connecting import connect
+from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
 
@@ -59,16 +59,16 @@ def drain(arguments: list[str]) -> int:
         print(f"daedalus drain: {error}", file=sys.stderr)
         return BAD_USAGE
     try:
-        transport = connect(parsed.connect, credentials)
+        transport = connect_until_interrupted(parsed.connect, credentials)
         try:
             drain_actors(transport, parsed.run, names, parsed.timeout)
+        except KeyboardInterrupt:
+            print("daedalus drain: interrupted; the requests remain in force", file=sys.stderr)
+            return FAILED
         finally:
             transport.close()
     except (TransportError, ProtocolError, DrainError) as error:
         print(f"daedalus drain: {error}", file=sys.stderr)
-        return FAILED
-    except KeyboardInterrupt:
-        print("daedalus drain: interrupted; the requests remain in force", file=sys.stderr)
         return FAILED
     return LEFT
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
@@ -15,7 +16,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
 from daedalus.protocol.texts import short_number
-from daedalus.transport.connecting import connect
+from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.credentials import WARNING_DAYS, Credentials
 from daedalus.transport.interface import TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -89,7 +90,7 @@ def status(arguments: list[str]) -> int:
     try:
         if parsed.watch:
             return _watch(parsed, credentials)
-        transport = connect(parsed.connect, credentials)
+        transport = connect_until_interrupted(parsed.connect, credentials)
         try:
             statuses = ask(transport, parsed.run, max_actors=0 if parsed.quiet or parsed.events else None)
             pages = [ask_events(transport, status) for status in statuses] if parsed.events else []
@@ -114,7 +115,8 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
     screen = Screen()
     frames = screen.shows_frames and not parsed.json
     shown = _json if parsed.json else _text
-    watch_status(lambda: connect(parsed.connect, credentials), parsed.run, screen, shown, frames=frames)
+    connect = partial(connect_until_interrupted, parsed.connect, credentials)
+    watch_status(connect, parsed.run, screen, shown, frames=frames)
     return HEALTHY
 
 

@@ -81,3 +81,45 @@ def test_ctrl_c_that_a_library_replaces_by_its_own_exception_shows_no_traceback(
         [sys.executable, "-c", REPLACING], capture_output=True, text=True, timeout=SECONDS, check=False
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", "stopped\n")
+
+
+# A connection attempt of Zenoh, which Ctrl-C does not interrupt and which lasts for ever here.
+CONNECTING = """
+import signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from daedalus.cli import main
+from daedalus.transport import connecting
+
+def connect(*_):
+    print("connecting", flush=True)
+    while True:
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            pass
+
+connecting.connect = connect
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [(["status"], "stopped\n"), (["status", "--watch"], ""), (["drain", "box"], "stopped\n")],
+)
+def test_ctrl_c_ends_a_command_that_waits_for_a_host(command: list[str], said: str) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", CONNECTING, *command, "--connect", "tcp/127.0.0.1:7447"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            assert process.stdout.readline() == "connecting\n"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(SECONDS) == (0 if command == ["status", "--watch"] else 1)
+            assert process.stderr.read() == said
+        finally:
+            process.kill()

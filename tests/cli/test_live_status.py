@@ -120,7 +120,7 @@ def test_status_watch_redraws_a_frame_until_ctrl_c(tty: Tty, monkeypatch: pytest
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(status_watch, "_FRAME_SECONDS", 0.0)
-    monkeypatch.setattr(status_module, "connect", learner.connect)
+    monkeypatch.setattr(status_module, "connect_until_interrupted", learner.connect)
     monkeypatch.setattr(status_module, "Screen", lambda: Interrupted(tty, tty))
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch"]) == 0
     shown = seen(tty)
@@ -151,7 +151,7 @@ def test_status_watch_prints_lines_elsewhere(
     original: Callable[[RunStatus], str] = getattr(status_module, name)
     monkeypatch.setattr(status_module, name, interrupted)
     monkeypatch.setattr(status_watch, "_TEXT_SECONDS", 0.0)
-    monkeypatch.setattr(status_module, "connect", connect)
+    monkeypatch.setattr(status_module, "connect_until_interrupted", connect)
     assert status_command(["--connect", "tcp/127.0.0.1:7447", "--watch", *options]) == 0
     printed = capsys.readouterr()
     assert (

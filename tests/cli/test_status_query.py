@@ -213,7 +213,7 @@ def test_exporter_has_totals_of_all_actors_and_series_of_the_first_thousand(
 def test_a_run_that_is_not_there_is_named_with_those_that_are(
     operator: MemoryTransport, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("daedalus.cli.commands.status.connect", lambda *_: operator)
+    monkeypatch.setattr("daedalus.cli.commands.status.connect_until_interrupted", lambda *_: operator)
     assert status_command(["--connect", "tcp/127.0.0.1:1", "--run", "other"]) == 1
     assert capsys.readouterr().err == "daedalus status: no learner of run 'other' answers; the runs here are 'r'\n"
 
