@@ -61,7 +61,7 @@ def run_locally(
 
 
 def _remedy(run: LocalRun) -> str:
-    return f"make room on the disk, then type: {resume_command(run)}"
+    return f"make room on the disk, or make it writable, then type: {resume_command(run)}"
 
 
 def _evaluated(run: LocalRun, stopping: threading.Event, output: ChildOutput) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from daedalus.protocol.spaces import Spaces
 
 _logger = logging.getLogger(__name__)
 
+_FULL = {errno.ENOSPC, errno.EDQUOT}  # errors of a disk or a quota without room
+
 
 class Checkpointer:
     """Writer of one learner's checkpoints into its run directory."""
@@ -75,7 +77,7 @@ class Checkpointer:
             fault = error.strerror or type(error).__name__
             if last:
                 text = f"the last checkpoint, at {counters['env_steps']:,} env_steps, could not be saved: {fault}; "
-                text += "make room, then resume the run"
+                text += f"{'make room' if error.errno in _FULL else 'correct this'}, then resume the run"
                 self._events.add("checkpoint", text, level=logging.ERROR)
             elif not self._health.save_fault:
                 text = (

@@ -55,7 +55,8 @@ def test_a_run_whose_last_checkpoint_cannot_be_saved_fails_and_resumes(start: St
     in_the_way.write_text("")
     assert running.wait() == 1, running.output
     running.expect(r"the last checkpoint, at [\d,]+ env_steps, could not be saved: ")
-    running.expect("so the run has no result: make room on the disk, then type: daedalus resume 'a run'$")
+    running.expect("so the run has no result: make room on the disk, or make it writable, then type: ")
+    running.expect("daedalus resume 'a run'$")
     assert "evaluat" not in running.output
     in_the_way.unlink()
     resumed = start("resume", "a run")

@@ -132,11 +132,14 @@ def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
     assert newest.counters["env_steps"] >= 1
 
 
+@pytest.mark.parametrize(
+    ("fault", "advice"), [(errno.ENOSPC, "make room"), (errno.EDQUOT, "make room"), (errno.EACCES, "correct this")]
+)
 def test_error_of_the_last_checkpoint_is_logged_and_promises_no_other_attempt(
-    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    network: MemoryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: int, advice: str
 ) -> None:
     def fail(*_: object, **_others: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(fault, os.strerror(fault))
 
     monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
     monkeypatch.setattr(checkpointer, "save_checkpoint", fail)
@@ -145,10 +148,10 @@ def test_error_of_the_last_checkpoint_is_logged_and_promises_no_other_attempt(
     actor.open_gate()
     outcome = learner.join()
     assert (outcome.finished, outcome.saved) == (True, False)
-    (error,) = (line for line in LINES if "No space left" in line)
+    (error,) = (line for line in LINES if "the last checkpoint" in line)
     assert re.fullmatch(
-        r"the last checkpoint, at \d+ env_steps, could not be saved: No space left on device; "
-        "make room, then resume the run",
+        rf"the last checkpoint, at \d+ env_steps, could not be saved: {os.strerror(fault)}; "
+        f"{advice}, then resume the run",
         error,
     )
     assert actor.join()
