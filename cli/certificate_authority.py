@@ -5,7 +5,6 @@ No other file imports `cryptography`.
 
 import datetime
 import ipaddress
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from daedalus.policy.saving.replacing import replacing
 from daedalus.transport.credentials import CA, CERTIFICATE, KEY, CredentialsError
 
 _HOSTS = x509.SubjectAlternativeName
@@ -147,9 +147,5 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write or replace a file that only its owner may read. Readers see the old or the new file."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with open(descriptor, "wb") as file:
-        file.write(data)
-    os.replace(partial, path)
+    with replacing(path, private=True) as beside:
+        beside.write_bytes(data)

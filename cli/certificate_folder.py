@@ -13,13 +13,13 @@ the certificate. The file needs the package `cryptography`.
 
 import datetime
 import json
-import os
 import shutil
 import socket
 from dataclasses import dataclass
 from pathlib import Path
 
 from daedalus.cli.certificate_authority import CertificateAuthority, Issued, read_issued
+from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol import keys
 from daedalus.transport.access_control import common_name
 from daedalus.transport.credentials import CA, CERTIFICATE, CLIENTS, Credentials, CredentialsError
@@ -136,12 +136,12 @@ class CertificateFolder:
         content = "".join(path.read_text("ascii") for path in (self.directory / "ca" / CA, *issuers))
         for role in _ZENOH_LISTENERS:
             if (self.directory / role).exists():
-                _replace(self.directory / role / CLIENTS, content)
+                replace_text(self.directory / role / CLIENTS, content)
         router = (self.directory / "router").resolve()
         if router.exists():
             security = Credentials(router, "router", "").settings(listens=True)
             zenohd = as_config_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security, Capacity()))
-            _replace(router / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
+            replace_text(router / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
 
 
 def _check_number(identities: set[Identity]) -> None:
@@ -162,9 +162,3 @@ def _check_name(identity: Identity) -> None:
         raise CredentialsError(
             f"{identity.name!r} has a '.': name it {first!r}, which may also act as {identity.name!r}"
         )
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, "ascii")
-    os.replace(partial, path)

@@ -7,12 +7,12 @@ operator-NAME/         token, beside the operator's certificate
 """
 
 import json
-import os
 import shutil
 import time
 from pathlib import Path
 
 from daedalus.gateway.tokens import OPERATOR, TOKENS, digest, new_token
+from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CA, CredentialsError
 
@@ -62,7 +62,7 @@ class ClientTokens:
         for name, folder in folders.items():
             token = new_token()
             known[name] = {"sha256": digest(token), "expires": time.time() + days * _DAY}
-            _replace(self.directory / folder / "token", token + "\n")
+            replace_text(self.directory / folder / "token", token + "\n", private=True)
         self._write(known)
 
     def revoke(self, names: list[str]) -> None:
@@ -79,19 +79,11 @@ class ClientTokens:
     def copy_to_gateway(self) -> None:
         """Write the gateway's copy, if the folder has a gateway."""
         if (self.directory / "gateway").exists():
-            _replace(self.directory / "gateway" / TOKENS, json.dumps(self._read(), indent=2) + "\n")
+            replace_text(self.directory / "gateway" / TOKENS, json.dumps(self._read(), indent=2) + "\n", private=True)
 
     def _read(self) -> dict[str, dict]:
         return json.loads(self._record.read_text("utf-8")) if self._record.exists() else {}
 
     def _write(self, known: dict[str, dict]) -> None:
-        _replace(self._record, json.dumps(known, indent=2) + "\n")
+        replace_text(self._record, json.dumps(known, indent=2) + "\n", private=True)
         self.copy_to_gateway()
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write a file that only its owner may read, at once."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-        file.write(text)
-    os.replace(partial, path)

@@ -1,7 +1,6 @@
 """`daedalus report`: write one HTML file about one or more runs."""
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.reports.page import comparison_page, run_page
 from daedalus.cli.reports.run_record import read_record
+from daedalus.policy.saving.replacing import replace_text
 
 _DESCRIPTION = """\
 Writes one HTML file about a run: settings, curves, statistics and a histogram of the evaluation, a video if there is
@@ -75,19 +75,9 @@ def report(arguments: list[str]) -> int:
         page = comparison_page(groups, records, parsed.by, threshold=parsed.threshold, left_out=problems)
         output = parsed.output or Path(_NAME)
     try:
-        _write(output, page)
+        replace_text(output, page)
     except OSError as error:
         print(f"daedalus report: {output}: {error.strerror}; choose another file with --output", file=sys.stderr)
         return 1
     print(f"wrote {output}")
     return 0
-
-
-def _write(output: Path, page: str) -> None:
-    """Write the file at once: nobody reads half of it. Raises OSError."""
-    beside = output.with_name(f".{output.name}.{os.getpid()}.partial")
-    try:
-        beside.write_text(page, "utf-8")
-        os.replace(beside, output)
-    finally:
-        beside.unlink(missing_ok=True)

@@ -25,6 +25,7 @@ from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, S
 from daedalus.cli.sweeping.sweep import Sweep
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.saving.replacing import replace_text
 
 _DESCRIPTION = """\
 Trains runs of several settings, each with several seeds, one after another or side by side (--jobs). Ends with a table
@@ -177,7 +178,7 @@ def _record(folder: Path, parsed: argparse.Namespace) -> None:
     """Write what the sweep is to sweep.toml, for its reader."""
     content = {key: str(value) if isinstance(value, Path) else value for key, value in vars(parsed).items()}
     known = {key: value for key, value in content.items() if value is not None}
-    (folder / _SWEEP).write_text(tomli_w.dumps(known), "utf-8")
+    replace_text(folder / _SWEEP, tomli_w.dumps(known))
 
 
 def _run(search: Search, folder: Path, axes: Sequence[Axis], parsed: argparse.Namespace, arguments: list[str]) -> int:

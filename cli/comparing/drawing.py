@@ -1,6 +1,5 @@
 """Pictures of groups of runs. Imports matplotlib, an extra, when a picture is drawn."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from daedalus.cli.comparing.curves import group_curve, points
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, RETURN, RecordedRun, RunDataError
 from daedalus.cli.comparing.statistics import performance_profile, profile_interval
+from daedalus.policy.saving.replacing import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,16 +91,14 @@ def _pyplot():
 
 
 def _save(figure, output: Path) -> None:
-    """Write the picture at once: on a full disk the one before it stays. Raises OSError."""
+    """Write the picture. Raises OSError."""
     import matplotlib.pyplot as plt
 
-    beside = output.with_name(f".{output.stem}.{os.getpid()}.partial{output.suffix}")
     try:
-        figure.savefig(beside, dpi=110)
-        os.replace(beside, output)
+        with replacing(output) as beside:
+            figure.savefig(beside, dpi=110, format=output.suffix[1:])
     finally:
         plt.close(figure)
-        beside.unlink(missing_ok=True)
 
 
 def _draw_group(axis: "Axes", group: Group, column: str, by: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
+from daedalus.policy.saving.replacing import replacing
 
 
 class CsvWriter:
@@ -47,17 +48,12 @@ class CsvWriter:
     def _add_columns(self, names: Sequence[str]) -> None:
         """Write the file anew with further columns, which are blank in the rows so far."""
         columns = (*self._columns, *names)
-        beside = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
-        try:
-            rows = _rows(self._path)
-            next(rows)
-            with open(beside, "wb") as new:
-                new.write(_line(columns))
-                for cells in rows:
-                    new.write(_line([*cells, *[""] * len(names)]))
-            os.replace(beside, self._path)
-        finally:
-            beside.unlink(missing_ok=True)
+        rows = _rows(self._path)
+        next(rows)
+        with replacing(self._path) as beside, open(beside, "wb") as new:
+            new.write(_line(columns))
+            for cells in rows:
+                new.write(_line([*cells, *[""] * len(names)]))
         self._file.close()
         self._file = open(self._path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         self._columns = columns

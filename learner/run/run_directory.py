@@ -29,6 +29,7 @@ import tomli_w
 from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, read_file, run_spec
+from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
@@ -163,7 +164,7 @@ def write_config(directory: Path, spec: RunSpec) -> None:
     derived = {"training": {"algorithm_record"}}  # it is read from the class of the algorithm again
     text = tomli_w.dumps(spec.model_dump(mode="json", exclude_none=True, exclude=derived))
     try:
-        _replace(directory / CONFIG, text)
+        replace_text(directory / CONFIG, text)
     except OSError as error:
         raise SettingsError(f"{directory / CONFIG} cannot be written: {error.strerror}") from None
 
@@ -177,7 +178,7 @@ def read_config(directory: Path) -> RunSpec:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file atomically. Raises OSError."""
-    _replace(path, json.dumps(content, indent=2) + "\n")
+    replace_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -188,17 +189,6 @@ def read_json(path: Path) -> dict[str, Any]:
         raise SettingsError(f"{path}: {error.strerror}") from None
     except ValueError:
         raise SettingsError(f"{path} is damaged: it is not valid JSON") from None
-
-
-def _replace(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        beside.write_text(text, "utf-8")
-        os.replace(beside, path)
-    except OSError:
-        with suppress(OSError):
-            beside.unlink()
-        raise
 
 
 def _versions() -> dict[str, Any]:

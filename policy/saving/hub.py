@@ -4,7 +4,6 @@ huggingface_hub is an extra, imported on first use. A repository may contain any
 pulled, by their names, after a check of their sizes. SealedDirectory checks their contents.
 """
 
-import os
 import re
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
+from daedalus.policy.saving.replacing import replace_text
 from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE
 from daedalus.policy.saving.sealed import MANIFEST, MAX_MANIFEST_BYTES, SEAL
 from daedalus.protocol.texts import bounded_text
@@ -125,9 +125,7 @@ def _note_commit(folder: Path, name: str, commit: str) -> None:
     """Note in the cache of huggingface_hub which commit a branch or tag stands for, as a download by name would."""
     note = folder.parents[1] / "refs" / name
     note.parent.mkdir(parents=True, exist_ok=True)
-    beside = note.with_name(f"{note.name}.{os.getpid()}.tmp")
-    beside.write_text(commit)
-    os.replace(beside, note)
+    replace_text(note, commit)
 
 
 def _cached(api: "HfApi", repository: str, revision: str | None) -> Path | None:
