@@ -23,9 +23,9 @@ def test_the_audit_hook_ends_a_process_that_unpickles() -> None:
 
 def test_training_resuming_and_evaluating_unpickle_nothing(start: Callable[..., Running], tmp_path: Path) -> None:
     saving = ("--set", "service.checkpoint_seconds=0.2", "--set", "evaluation.seconds=0.2")
-    first = start("train", "cartpole", "--env-steps", 200_000, "--run-dir", "run", *saving)
+    first = start("train", "cartpole", "--env-steps", 60_000, "--run-dir", "run", *saving)
     assert first.wait() in (0, 3), first.output
-    again = start("resume", "run", "--env-steps", 400_000)
+    again = start("resume", "run", "--env-steps", 120_000)
     assert again.wait() in (0, 3), again.output
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["evaluation_return_mean"] > 5

@@ -19,9 +19,8 @@ from daedalus.learner.service import LearnerService, Outcome
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
-SETTINGS = ("training.env_steps=80000", "training.stop_when_solved=false")
+SETTINGS = ("training.env_steps=24000", "training.stop_when_solved=false")
 NORMALIZATION = (
-    "training.env_steps=40000",
     "evaluation.final_episodes=10",
     "policy.normalize_observations=true",
     "training.normalize_rewards=true",
@@ -89,7 +88,7 @@ def test_one_actor_gives_equal_weights_with_rollouts_and_with_gradients(tmp_path
     settings = read_preset("cartpole")
     choose_algorithm(settings, "a2c")
     annealed = ("training.entropy_bonus=0.02", "training.entropy_bonus_final=0.001", "collection.actors=1")
-    override(settings, (*SETTINGS, *NORMALIZATION, *annealed, "training.env_steps=20000"))
+    override(settings, (*SETTINGS, *NORMALIZATION, *annealed, "training.env_steps=12000"))
     train_in_one_process(run_spec(settings), tmp_path / "rollouts")
     override(settings, (GRADIENTS,))
     train_in_one_process(run_spec(settings), tmp_path / "gradients")

@@ -24,7 +24,7 @@ SETTINGS = (
 )
 
 
-@pytest.mark.parametrize(("memory", "budget", "status"), [("gru", 200_000, 0), ("none", 100_000, 3)])
+@pytest.mark.parametrize(("memory", "budget", "status"), [("gru", 200_000, 0), ("none", 50_000, 3)])
 def test_only_a_policy_with_memory_solves_the_cue_task(
     start: Start, tmp_path: Path, memory: str, budget: int, status: int
 ) -> None:
