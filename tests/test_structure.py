@@ -1,6 +1,7 @@
 """Test of the structure: which package imports which, and that no code executes what it reads."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ ALLOWED = {
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
 
 
+@functools.cache
 def sources(package: str) -> list[tuple[Path, ast.Module]]:
     paths = sorted((ROOT / package).rglob("*.py"))
     assert paths

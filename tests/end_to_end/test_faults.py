@@ -173,12 +173,12 @@ def test_a_killed_learner_is_restarted_and_training_reaches_its_end(start: Start
 
 
 def test_the_same_command_with_resume_continues_a_killed_learner(
-    start: Start, address: str, status: Status, learner: Callable[..., Running]
+    start: Start, address: str, tmp_path: Path, status: Status, learner: Callable[..., Running]
 ) -> None:
     first = learner("--resume", *SAVING)
     start("actor", "--connect", address, "--name", "loyal")
     wait_for_training(status, "loyal")
-    until(lambda: status().get("checkpoint_age_seconds") is not None)
+    until(lambda: int(newest_checkpoint(tmp_path / "run") or 0) > 0)  # not only that of the first weights
     first.process.kill()
     first.wait()
     second = learner("--resume", *SAVING)
