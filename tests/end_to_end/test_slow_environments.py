@@ -16,21 +16,19 @@ def test_slow_actors_wait_for_a_stopped_learner_and_leave_a_finished_run(
     # An actor's rollout of 64 env_steps takes 0.26 s.
     sizes = ("collection.envs_per_actor=2", "collection.rollout_length=32", "service.log_seconds=0.1")
     settings = [word for each in sizes for word in ("--set", each)]
-    words = ("learner", "--env", "slow_environment:Slow-v0", "--env-steps", 2000, "--listen", address, *settings)
+    words = ("learner", "--env", "slow_environment:Slow-v0", "--listen", address, *settings, "--run-dir", "run")
     allowing = ("--allow-module", "slow_environment")
+    learner = start(*words, "--env-steps", 10**9)
     actors = [start("actor", "--connect", address, "--name", name, *allowing) for name in ("a", "b")]
-    for actor in actors:
-        actor.expect("waiting for it")  # so that both join before the budget is used up
-    learner = start(*words, "--run-dir", "run", "--resume")
     for actor in actors:
         actor.expect("joined run")
     learner.expect(r"updates .*/s")
     learner.process.terminate()
     assert learner.wait() == 0, learner.output
-    learner.expect(r"stopped; checkpoint saved at [\d,]+ env_steps: run/checkpoints/0")
+    saved = learner.expect(r"stopped; checkpoint saved at ([\d,]+) env_steps: run/checkpoints/0").group(1)
     for actor in actors:
         actor.expect("the learner was stopped; waiting for it to return")
-    resumed = start(*words, "--run-dir", "run", "--resume")
+    resumed = start(*words, "--env-steps", int(saved.replace(",", "")) + 600, "--resume")
     resumed.expect("resuming from checkpoint")
     assert resumed.wait() == 0, resumed.output
     for actor in actors:
