@@ -106,7 +106,7 @@ def load_newest(run_directory: Path) -> Checkpoint:
 
     The learner continues from the returned checkpoint, so that the newer ones are no longer the newest of the run.
 
-    Raises DamagedError if there is no undamaged checkpoint, UnreadableError if a newer one may not be read,
+    Raises DamagedError if there is no undamaged checkpoint, UnreadableError if a newer one cannot be read now,
     OtherFormatError for a run of another release.
     """
     loaded, damaged = None, dict[Path, DamagedError]()
@@ -114,8 +114,10 @@ def load_newest(run_directory: Path) -> Checkpoint:
         try:
             loaded = load_checkpoint(directory)
             break
-        except (OtherFormatError, UnreadableError):
+        except OtherFormatError:
             raise
+        except UnreadableError as error:
+            raise UnreadableError(f"{error}, or remove {directory} to continue without it") from None
         except DamagedError as error:
             damaged[directory] = error
     if damaged:

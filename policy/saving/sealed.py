@@ -5,6 +5,7 @@ all. `manifest.json` holds the size and SHA-256 of every file, and `seal` the SH
 them before anything is parsed. No content can execute: raw bytes, JSON and safetensors.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -19,6 +20,9 @@ from daedalus.policy.saving.regular_files import read_regular
 MANIFEST, SEAL = "manifest.json", "seal"
 MAX_MANIFEST_BYTES = 16 << 20
 _SEAL_BYTES = 64
+# What the system answers where a file is missing or something else has its name. Any other error may pass, as those
+# of a network's file system do.
+_NO_SUCH_FILE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ELOOP, errno.ENXIO})
 
 
 class DamagedError(Exception):
@@ -26,7 +30,7 @@ class DamagedError(Exception):
 
 
 class UnreadableError(DamagedError):
-    """A sealed directory that another user owns. Its content may be whole."""
+    """A sealed directory that cannot be read now: another user owns it, or the disk has an error. It may be whole."""
 
 
 def write_sealed(directory: Path, files: dict[str, bytes], content: dict[str, Any]) -> None:
@@ -147,6 +151,8 @@ class SealedDirectory:
 def _read_error(path: Path, error: OSError) -> DamagedError:
     if isinstance(error, PermissionError):
         return UnreadableError(f"{path}: {error.strerror}: let the user of this process read it")
+    if error.errno not in _NO_SUCH_FILE:
+        return UnreadableError(f"{path}: {error.strerror}: the file may be whole: try again")
     return DamagedError(f"{path}: {error.strerror}")
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -103,19 +104,29 @@ def test_damaged_checkpoints_are_no_longer_the_newest_after_a_resume(tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "parameters.safetensors"])
-def test_checkpoint_that_may_not_be_read_is_not_set_aside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (errno.EACCES, "let the user of this process read it"),
+        (errno.EIO, "the file may be whole: try again"),
+        (errno.ESTALE, "the file may be whole: try again"),
+        (errno.EMFILE, "the file may be whole: try again"),
+    ],
+)
+def test_checkpoint_that_cannot_be_read_now_is_not_set_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, error: int, advice: str
 ) -> None:
     save(tmp_path, 1)
     newest = save(tmp_path, 2)
 
     def read(path: Path, limit: int) -> bytes:  # a test may run as root, who may read everything
         if path == newest / name:
-            raise PermissionError(13, "Permission denied", str(path))
+            raise OSError(error, os.strerror(error), str(path))
         return read_regular(path, limit)
 
     monkeypatch.setattr(sealed, "read_regular", read)
-    with pytest.raises(UnreadableError, match=f"{name}: Permission denied: let the user of this process read it"):
+    expected = f"{newest / name}: {os.strerror(error)}: {advice}, or remove {newest} to continue without it"
+    with pytest.raises(UnreadableError, match=f"^{re.escape(expected)}$"):
         load_newest(tmp_path)
     assert newest.is_dir()
 
