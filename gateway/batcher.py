@@ -1,6 +1,7 @@
 """The choice of actions for all clients that wait, in one call of the policy. For the gateway's event loop."""
 
 import asyncio
+import logging
 from collections.abc import Callable
 
 import numpy as np
@@ -10,6 +11,8 @@ from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.policy_versions import PolicyVersion
 from daedalus.policy.acting.noise import draw_noise
 from daedalus.policy.acting.runtime import Choice, PolicyError
+
+_logger = logging.getLogger(__name__)
 
 _MAX_ROWS = 64  # in one call: the event loop waits for it
 _PAUSE_SECONDS = 0.001  # between calls: a call for four clients costs little more than a call for one
@@ -27,6 +30,7 @@ class Batcher:
         current: Callable[[], PolicyVersion],
         clients: Callable[[], int],
         on_failure: Callable[[PolicyError], None],
+        on_fault: Callable[[ClientActor, Exception], None],
     ) -> None:
         """Construct the batcher in a running event loop.
 
@@ -34,8 +38,9 @@ class Batcher:
           current: returns the newest version; called when a client waits.
           clients: returns the number of clients.
           on_failure: called if the policy does not run.
+          on_fault: called with an actor that cannot take its action; the others have theirs.
         """
-        self._current, self._clients, self._on_failure = current, clients, on_failure
+        self._current, self._clients, self._on_failure, self._on_fault = current, clients, on_failure, on_fault
         self._loop = asyncio.get_running_loop()
         self._random = np.random.default_rng()
         self._waiting: dict[ClientActor, None] = {}
@@ -78,8 +83,12 @@ class Batcher:
         for row, actor in enumerate(actors):
             actions = {name: values[row : row + 1] for name, values in choice.actions.items()}
             one = Choice(actions, choice.log_probs[row : row + 1], choice.state[row : row + 1])
-            if not actor.take(one):
-                self.add(actor)
+            try:
+                if not actor.take(one):
+                    self.add(actor)
+            except Exception as error:  # broad: whatever one client brings may not keep actions from the others
+                _logger.exception("client %s cannot take its action", actor.name)
+                self._on_fault(actor, error)
 
 
 def _joined(inputs: list[RowInputs]) -> RowInputs:

@@ -1,12 +1,13 @@
 """A client's spaces as it states them, and values of them between its messages and gymnasium. Pure functions.
 
-Spaces are those of protocol/spaces.py: maps of named components. A value is a map by component name too; a space whose
-only component is named `observation` or `action` has bare values.
+Spaces are those of protocol/spaces.py: maps of named components. A value is a map by component name too; an observation
+whose only component is named `observation`, and an action whose only one is named `action`, are bare values.
 """
 
 import itertools
 import math
 from array import array
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -53,8 +54,8 @@ class ClientSpaces:
                 raise ClientError("misfit", f"{name}.frames must be 1: the run stacks frames, and the client sends one")
             if isinstance(space, DiscreteSpace) and space.masked:
                 raise ClientError("misfit", f"{name}.masked is for actions")
-        self.observation_space = _nested_space({name: _gym(space) for name, space in self._observations.items()})
-        self.action_space = _nested_space({name: _gym(space) for name, space in self._actions.items()})
+        self.observation_space = _nested_space(self._observations, bare="observation")
+        self.action_space = _nested_space(self._actions, bare="action")
         self._masks = self.stated.masks
         self.example_mask = {name: np.ones(size, np.bool_) for name, size in self._masks.items()} or None
 
@@ -127,18 +128,21 @@ def _gym(space: _Component) -> gymnasium.Space:
             return gym.Box(low, high, dtype=np.float32)
 
 
-def _nested_space(components: dict[str, gymnasium.Space]) -> gymnasium.Space:
-    """Return a space whose components have these names: the actor joins the keys of nested spaces by dots."""
-    if components.keys() in ({"observation"}, {"action"}):
-        return next(iter(components.values()))
+def _nested_space(components: Mapping[str, _Component], *, bare: str) -> gymnasium.Space:
+    """Return a space whose components have these names: the actor joins the keys of nested spaces by dots.
+
+    A space whose only component is named `bare` is no map.
+    """
+    if components.keys() == {bare}:
+        return _gym(components[bare])
 
     def built(tree: Any) -> gymnasium.Space:
-        return gym.Dict({key: built(part) for key, part in tree.items()}) if isinstance(tree, dict) else tree
+        return gym.Dict({key: built(part) for key, part in tree.items()}) if isinstance(tree, dict) else _gym(tree)
 
     return built(_nested(components))
 
 
-def _nested(components: dict[str, Any]) -> dict[str, Any]:
+def _nested(components: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested maps from names with dots. Raises ClientError if a name is also the beginning of another."""
     nested: dict[str, Any] = {}
     for name, value in components.items():

@@ -59,7 +59,7 @@ class Gateway:
         self._joining = Joining(transport, self._link, self.run)
         self._versions = PolicyVersions()
         self._seats: dict[str, Seat] = {}  # by the name towards the learner
-        self._batcher = Batcher(lambda: self._versions.current, lambda: len(self._seats), on_failure)
+        self._batcher = Batcher(lambda: self._versions.current, lambda: len(self._seats), on_failure, self._on_fault)
         self._outbox = Outbox()
         self._parked = ParkedActors(MAX_CLIENTS)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -166,6 +166,11 @@ class Gateway:
         """
         actor.observe(message, self._versions.current, on_action)
         self._batcher.add(actor)
+
+    def _on_fault(self, actor: ClientActor, error: Exception) -> None:
+        seat = self._seats.get(actor.name)
+        if seat is not None and seat.actor is actor:
+            seat.on_end(ClientError("refused", f"the gateway failed on an action ({type(error).__name__}): see its log"))
 
     # ---------------------------------------------------------------------------------------------- the tick
 

@@ -35,6 +35,10 @@ def client(name: str) -> ClientActor:
     return cast(ClientActor, WaitingClient(name))
 
 
+def fault(actor: ClientActor, error: Exception) -> None:
+    pytest.fail(f"{actor.name}: {error}")
+
+
 async def turns(count: int = 3) -> None:
     for _ in range(count):
         await asyncio.sleep(0)
@@ -47,7 +51,7 @@ def test_client_waits_for_others_only_after_a_call_and_while_others_may_come(mon
 
     async def run() -> None:
         first, second = client("first"), client("second")
-        chooser = Batcher(lambda: cast(Any, "version"), lambda: 2, lambda error: pytest.fail(str(error)))
+        chooser = Batcher(lambda: cast(Any, "version"), lambda: 2, lambda error: pytest.fail(str(error)), fault)
         chooser.add(first)
         await turns()
         assert calls == [["first"]], "an idle gateway chooses at once"

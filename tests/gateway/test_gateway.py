@@ -15,9 +15,10 @@ from websockets.exceptions import ConnectionClosed
 
 from daedalus.gateway import connection, policy_versions, server
 from daedalus.gateway import gateway as gateway_module
+from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.messages import Act
-from daedalus.policy.acting.runtime import OnnxRuntime
+from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
@@ -119,6 +120,32 @@ def test_clients_that_wait_are_chosen_for_in_one_call(
     together = asyncio.run_coroutine_threadsafe(act_together(gateway.gateway), gateway.loop)
     assert set(together.result(30)) <= {0, 1}
     assert rows == [3]
+
+
+def test_client_whose_action_cannot_be_sent_is_disconnected_and_the_others_act(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clients = [connect() for _ in range(3)]
+    for number, client in enumerate(clients):
+        client.hello(f"c-{number}")
+    take = ClientActor.take
+
+    def failing(actor: ClientActor, choice: Choice) -> bool:
+        if actor.name == "c-0":
+            raise IndexError("no such component")
+        return take(actor, choice)
+
+    monkeypatch.setattr(ClientActor, "take", failing)
+    for client in clients:
+        client.send("act", observation=[1.0, 2.0, 3.0, 4.0])
+    assert all(client.receive()["type"] == "action" for client in clients[1:])
+    assert clients[0].receive() == {
+        "type": "error",
+        "code": "refused",
+        "reason": "the gateway failed on an action (IndexError): see its log",
+    }
+    assert ended(clients[0]) == 1008
+    assert clients[1].act([1.0, 2.0, 3.0, 4.0])["type"] == "action"
 
 
 def test_each_rollout_has_the_newest_version_at_its_start(learner: ScriptedLearner, connect: Connect) -> None:
