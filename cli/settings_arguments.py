@@ -178,7 +178,11 @@ class Choice:
 
     def _applied(self, settings: dict[str, Any], change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
         """Return settings after the choices, which change them in place. Raises SettingsError."""
-        choose_algorithm(settings, self.algorithm)
+        changed = copy.deepcopy(settings)
+        if self.algorithm is not None:
+            changed.setdefault("training", {})["algorithm"] = self.algorithm
+        change(changed)  # which may choose the algorithm, too
+        choose_algorithm(settings, changed.get("training", {}).get("algorithm"))
         shortcuts = {
             ("training", "seed"): self.seed,
             ("training", "env_steps"): self.env_steps,

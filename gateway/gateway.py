@@ -170,7 +170,9 @@ class Gateway:
     def _on_fault(self, actor: ClientActor, error: Exception) -> None:
         seat = self._seats.get(actor.name)
         if seat is not None and seat.actor is actor:
-            seat.on_end(ClientError("refused", f"the gateway failed on an action ({type(error).__name__}): see its log"))
+            seat.on_end(
+                ClientError("refused", f"the gateway failed on an action ({type(error).__name__}): see its log")
+            )
 
     # ---------------------------------------------------------------------------------------------- the tick
 

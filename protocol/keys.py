@@ -1,10 +1,12 @@
 """Functions that return every key expression. All keys are under `daedalus/{run}/`."""
 
+import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterable
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_KEPT, _DIGEST = 55, 8  # characters of a name that is made from a text, which is no name itself
 _MAX_SHOWN = 80  # characters of an invalid name, which may come from a peer
 
 ANY_RUN = "*"
@@ -23,6 +25,15 @@ def check_name(name: str, what: str) -> str:
             "digit"
         )
     return name
+
+
+def as_name(text: str) -> str:
+    """Return a text that can be one chunk of a key: `text` itself, or what is left of it with a digest of the whole."""
+    if is_name(text):
+        return text
+    kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip("._-")[:_KEPT].rstrip("._-")
+    digest = hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()[:_DIGEST]
+    return f"{kept or 'run'}-{digest}"
 
 
 def join(run: str, actor: str) -> str:

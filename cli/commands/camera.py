@@ -20,6 +20,7 @@ from daedalus.cli.checkpoint_values import CheckpointValues
 from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, stop_on_signals
 from daedalus.gateway.watching.camera import LENGTH, frame, note
+from daedalus.learner.run.run_directory import run_name
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
@@ -132,7 +133,7 @@ def _film(
 ) -> None:
     welcome, program = given.begin()
     runtime = OnnxRuntime(program.model.tobytes(), stop)
-    is_its_directory = checkpoints is not None and checkpoints.resolve().name == welcome.run
+    is_its_directory = checkpoints is not None and run_name(checkpoints) == welcome.run
     values = CheckpointValues(checkpoints, modules) if checkpoints is not None and is_its_directory else None
     camera = EpisodeCamera(welcome.spec, modules) if values is None else EpisodeCamera(welcome.spec, modules, values)
     try:

@@ -117,7 +117,7 @@ def main() -> int:
         return BAD_USAGE
     display = SilentProgress if arguments.no_progress else Progress
     progress = display(sys.stdout, run.spec.training.env_steps)
-    context = {"run": run.directory.name}
+    context = {"run": run_directory.run_name(run.directory)}
     process = "" if arguments.prepared else "learner"  # the launcher shows the lines to a person
     configure_logging(
         arguments.log_level, as_json=arguments.log_json, process=process, context=context, write=progress.say
@@ -181,7 +181,7 @@ def _serve(
         new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
         lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
         run = replace(run, directory=lock.directory)
-        context["run"] = run.directory.name
+        context["run"] = run_directory.run_name(run.directory)
     try:
         service = LearnerService(
             run.spec,

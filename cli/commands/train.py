@@ -266,7 +266,7 @@ def _run(
         log=chosen_trackers(parsed.log, directory),
         log_level=parsed.log_level,
         log_json=parsed.log_json,
-        observer=TrainingDisplay(screen, directory.name) if live else RunObserver(),
+        observer=TrainingDisplay(screen, run_directory.run_name(directory)) if live else RunObserver(),
     )
     output = ChildOutput(directory / run_directory.OUTPUT, screen.out, screen.err)
     stopping = stop_on_signals()

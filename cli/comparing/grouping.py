@@ -52,7 +52,7 @@ def by_settings(runs: Sequence[RecordedRun], keys: Sequence[str] = ()) -> list[G
     groups = list(parts.values())
     chosen = list(keys) or _telling(groups)
     if chosen:
-        groups.sort(key=lambda group: [_sortable(group[0].settings.get(key)) for key in chosen])
+        groups.sort(key=lambda group: [_sortable(group[0].setting(key)) for key in chosen])
     return _named(groups, chosen)
 
 
@@ -106,12 +106,12 @@ def _own_name(group: Sequence[RecordedRun]) -> str:
     if len(group) > 1 and settings and len({_identity(run) for run in group}) == 1:
         return f"{settings.get(ENVIRONMENT)}, {settings.get('training.algorithm')}"
     if len(group) > 1:
-        return f"{group[0].directory.name} and {len(group) - 1} more"
-    return group[0].directory.name
+        return f"{group[0].directory.resolve().name} and {len(group) - 1} more"
+    return group[0].directory.resolve().name
 
 
 def _text(run: RecordedRun, key: str) -> str:
-    return text(run.settings.get(key))
+    return text(run.setting(key))
 
 
 def text(value: Any) -> str:

@@ -35,6 +35,14 @@ class RecordedRun:
     metrics: Mapping[str, np.ndarray]  # columns of metrics.csv, [rows]; NaN: no value
     summary: Mapping[str, Any]  # summary.json; empty before the end of training
 
+    def setting(self, path: str) -> Any:
+        """Return a setting, or the part of one that is a table, such as `environment.kwargs.size`; None if unset."""
+        section, *keys = path.split(".")
+        value = self.settings.get(".".join((section, *keys[:1])))
+        for key in keys[1:]:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        return value
+
     @property
     def unfinished(self) -> str:
         """Why the run has no result yet, or an empty string."""

@@ -15,7 +15,6 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import allow_settings
 from daedalus.protocol.spec import RunSpec
 
-_ALGORITHM = "training.algorithm"
 _LONGEST_NAME = 120
 
 Point = Mapping[str, str]  # a value, as it is written after `=`, of each setting that the sweep varies
@@ -69,11 +68,10 @@ class Planner:
 
 
 def _with_point(parsed: argparse.Namespace, point: Point, seed: int) -> argparse.Namespace:
-    """Return the options with the settings of a point. An algorithm also brings the settings of its preset."""
+    """Return the options with the settings of a point."""
     options = copy.copy(parsed)
-    options.algorithm = point.get(_ALGORITHM, parsed.algorithm)
     options.seed = seed
-    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items() if key != _ALGORITHM)]
+    options.set = [*parsed.set, *(f"{key}={value}" for key, value in point.items())]
     return options
 
 

@@ -15,6 +15,7 @@ from daedalus.cli.logs import configure_logging
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_with_parent, stop_on_signals
 from daedalus.learner.reporting.trackers.tracker import TRACKERS, tracker_class
 from daedalus.learner.reporting.trackers.tracking import Tracking
+from daedalus.learner.run.run_directory import run_name
 
 _END_SECONDS = 60.0  # after the end of the run; a parent that lives ends this process before
 
@@ -28,7 +29,7 @@ def main() -> int:
     options.add_argument("--log-json", action="store_true")
     options.add_argument("--exit-with-parent", action="store_true")
     parsed = options.parse_args()
-    process, context = "tracker" if parsed.service else "", {"run": parsed.directory.name}
+    process, context = "tracker" if parsed.service else "", {"run": run_name(parsed.directory)}
     configure_logging(as_json=parsed.log_json, process=process, context=context, write=_own_output())
     finish = stop_on_signals()
     exit_with_parent(finish)

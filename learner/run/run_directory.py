@@ -30,6 +30,7 @@ from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
 from daedalus.learner.run.settings import SettingsError, read_file, run_spec
 from daedalus.policy.saving.replacing import replace_text
+from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
 
 CONFIG, VERSIONS, SUMMARY, METRICS = "config.toml", "versions.json", "summary.json", "metrics.csv"
@@ -48,6 +49,11 @@ _PACKAGES = (
     "onnxruntime",
     "pydantic",
 )
+
+
+def run_name(directory: Path) -> str:
+    """Return the name of the run in a directory: the directory's own, in the characters that a name may have."""
+    return keys.as_name(directory.resolve().name)
 
 
 def default_directory(name: str, spec: RunSpec) -> Path:

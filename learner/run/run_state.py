@@ -9,6 +9,7 @@ from daedalus.learner.run.annealing import Annealing
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.evaluations import Evaluations
 from daedalus.learner.run.health import Health
+from daedalus.learner.run.run_directory import run_name
 from daedalus.protocol.spec import RunSpec
 
 
@@ -17,6 +18,7 @@ class RunState:
 
     Attributes:
       directory: the run directory.
+      name: name of the run, in all keys.
       spec: specification of the run.
       learner_epoch: epoch of this learner process.
       counters: the lock of the actor server guards them.
@@ -33,7 +35,7 @@ class RunState:
         certificate_days_left: Callable[[], float | None] = lambda: None,
     ) -> None:
         """Begin a run. `started` is on the monotonic clock, in seconds; for the last argument see Health."""
-        self.directory, self.spec, self._started = directory, spec, started
+        self.directory, self.name, self.spec, self._started = directory, run_name(directory), spec, started
         self.learner_epoch = secrets.randbits(62)
         self.counters = RunCounters(spec.training.target_episodes)
         self.annealing = Annealing(budget=spec.training.env_steps)
@@ -41,11 +43,6 @@ class RunState:
         self.health = Health(
             started=started, updated=started, actor_seen=started, certificate_days_left=certificate_days_left
         )
-
-    @property
-    def name(self) -> str:
-        """Name of the run."""
-        return self.directory.name
 
     @property
     def progress(self) -> float:

@@ -112,7 +112,8 @@ def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
         training["algorithm"] = algorithm
     tables = settings.pop("for_algorithm", {})
     _check_for_algorithm(tables)
-    for section, values in tables.get(training.get("algorithm"), {}).items():
+    chosen = training.get("algorithm")
+    for section, values in (tables.get(chosen, {}) if isinstance(chosen, str) else {}).items():
         for key, value in values.items():
             _assign(settings.setdefault(section, {}), key, value)
 

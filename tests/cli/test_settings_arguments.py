@@ -58,6 +58,22 @@ def test_a_repeated_config_is_named_after_its_environment(
     assert directory.name.startswith(f"{named}-appo-s5-")
 
 
+@pytest.mark.parametrize("algorithm", ["a2c", "n_step_q"])
+def test_an_algorithm_that_set_chooses_brings_the_settings_of_its_preset(algorithm: str) -> None:
+    words = ["cartpole", "--seed", "3", "--set", "collection.rollout_length=7"]
+    chosen, _ = resolve(learner_parser().parse_args([*words, "--algorithm", algorithm]))
+    also, _ = resolve(learner_parser().parse_args([*words, "--set", f"training.algorithm={algorithm}"]))
+    assert also == chosen
+    assert also.training.algorithm == algorithm
+    assert also.collection.rollout_length == 7
+
+
+def test_an_algorithm_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text("[environment]\nid = 'CartPole-v1'\n[training]\nalgorithm = ['a2c']\n")
+    with pytest.raises(SettingsError, match=r"^setting training.algorithm should be a valid string, not \['a2c'\]"):
+        resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+
+
 def test_default_settings_of_a_policy_with_memory_have_fewer_updates_unless_they_are_chosen() -> None:
     words = ["--env", "CartPole-v1", "--set", "policy.memory=gru"]
     spec, _ = resolve(learner_parser().parse_args(words))

@@ -151,6 +151,16 @@ def test_settings_that_cannot_be_written_are_named_and_leave_the_former_ones(
     assert [file.name for file in tmp_path.iterdir()] == [run_directory.CONFIG]
 
 
+def test_name_of_a_run_is_that_of_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = tmp_path / "try-1"
+    directory.mkdir()
+    monkeypatch.chdir(directory)
+    assert {run_directory.run_name(path) for path in (directory, Path(), Path("../try-1"), directory / "checkpoints" / "..")} == {
+        "try-1"
+    }
+    assert run_directory.run_name(tmp_path / "try#1") != run_directory.run_name(tmp_path / "try 1")
+
+
 def test_default_directory_is_named_after_the_run() -> None:
     directory = run_directory.default_directory("ALE/Pong-v5", run_spec(algorithm="a3c", seed=4))
     assert directory.parent == Path("runs")

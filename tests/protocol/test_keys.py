@@ -1,3 +1,5 @@
+import re
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,6 +22,31 @@ def test_valid_name_is_returned(name: str) -> None:
 def test_invalid_name_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match="actor name"):
         keys.check_name(name, "actor name")
+
+
+@offline
+@given(text=st.text(), other=st.text())
+def test_any_text_becomes_a_name_of_its_own(text: str, other: str) -> None:
+    assert keys.is_name(keys.as_name(text))
+    assert (keys.as_name(text) == keys.as_name(other)) == (text == other)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("cartpole-a2c", "cartpole-a2c"),
+        ("a run", "a-run-"),
+        (".try#1", "try-1-"),
+        ("配置", "run-"),
+        ("\udcff", "run-"),
+        ("", "run-"),
+        ("x" * 65, "x" * 55 + "-"),
+    ],
+)
+def test_name_of_a_text_shows_what_it_can_of_it(text: str, name: str) -> None:
+    made = keys.as_name(text)
+    assert made == name if keys.is_name(text) else re.fullmatch(re.escape(name) + "[0-9a-f]{8}", made)
+    assert keys.is_name(made)
 
 
 @offline

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from daedalus.learner.reporting.metrics import Details, MetricsWriter, tag
+from daedalus.learner.run.run_directory import run_name
 
 PROJECT = "daedalus"  # project or experiment of the runs, unless the tracker's environment variable names another
 SUMMARY = "summary/"  # prefix of the results of a run
@@ -32,7 +33,7 @@ class TrackedRun:
     @property
     def name(self) -> str:
         """Name of the run."""
-        return self.directory.name
+        return run_name(self.directory)
 
 
 class Tracker(MetricsWriter, Protocol):

@@ -70,6 +70,14 @@ def test_named_settings_name_the_groups(tmp_path: Path) -> None:
     ]
 
 
+def test_part_of_a_setting_that_is_a_table_names_the_groups(tmp_path: Path) -> None:
+    runs = [run(tmp_path, f"g{value}", f"environment.kwargs.gravity={value}") for value in (9.5, 1.5, "low")]
+    named = by_settings([*runs, run(tmp_path, "plain")], ["environment.kwargs.gravity"])
+    assert [group.name for group in named] == ["gravity=1.5", "gravity=9.5", "gravity=low", "gravity=unset"]
+    assert runs[0].setting("environment.kwargs.gravity.deeper") is None
+    assert runs[0].setting("environment") is None
+
+
 def test_groups_of_the_user_keep_their_order(tmp_path: Path) -> None:
     parts = [[run(tmp_path, "b", "policy.hidden=[64]")], [run(tmp_path, "a", "policy.hidden=[32,32]")]]
     assert [group.name for group in by_user(parts)] == ["hidden=[64]", "hidden=[32,32]"]
