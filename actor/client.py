@@ -14,10 +14,7 @@ plays a safe action. A loop with several agents passes their number and uses `cl
 """
 
 import itertools
-import os
-import re
 import secrets
-import socket
 import threading
 from numbers import Integral, Real
 from pathlib import Path
@@ -31,12 +28,12 @@ from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.config import ActorConfig, LinkChoice
+from daedalus.actor.session.own_name import own_name
 from daedalus.actor.session.service import ActorService
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.messages import MAX_ENVIRONMENTS
 from daedalus.transport.connecting import connect_with_retry
-from daedalus.transport.credentials import Credentials
 from daedalus.transport.security import credentials_to_connect
 
 _REFUSAL_SECONDS = 12.0  # after `timeout`, for the last two queries of the client's thread, if nobody answers them
@@ -59,7 +56,7 @@ class Client:
         action_space: gymnasium.Space,
         name: str | None = None,
         run: str = keys.ANY_RUN,
-        tls: Path | None = None,
+        tls: str | Path | None = None,
         link: LinkChoice = "auto",
         timeout: float = 60.0,
         action_mask: Any = None,
@@ -104,7 +101,9 @@ class Client:
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         config = ActorConfig(
-            name=keys.check_name(name or _default_name(credentials), "actor name"),
+            name=keys.check_name(
+                name or own_name(credentials.name if credentials else "", next(_numbers)), "actor name"
+            ),
             incarnation=secrets.randbits(62),
             run=run,
             link=link,
@@ -215,9 +214,3 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _default_name(credentials: Credentials | None) -> str:
-    host = credentials.name if credentials else re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40]
-    number = next(_numbers)
-    return f"{host}.{os.getpid()}" + (f".{number}" if number > 1 else "")

@@ -5,7 +5,9 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+from daedalus.protocol.texts import MAX_NAME
+
+_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME - 1}}}")
 _KEPT, _DIGEST = 55, 8  # characters of a name that is made from a text, which is no name itself
 _MAX_SHOWN = 80  # characters of an invalid name, which may come from a peer
 

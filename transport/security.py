@@ -15,10 +15,10 @@ def credentials_to_listen(endpoints: list[str], tls: Path | None, role: str, *, 
     return None if tls is None else load(tls, role)
 
 
-def credentials_to_connect(endpoints: list[str], tls: Path | None, *roles: str) -> Credentials | None:
+def credentials_to_connect(endpoints: list[str], tls: str | Path | None, *roles: str) -> Credentials | None:
     """Return the certificate to connect with, or None without `tls`. Raises one of SECURITY_ERRORS."""
     check_connecting(endpoints, tls=tls is not None)
-    return None if tls is None else load(tls, *roles)
+    return None if tls is None else load(Path(tls), *roles)
 
 
 def certificate_days_left(credentials: Credentials | None) -> float | None:

@@ -1,12 +1,10 @@
 """The command line of `daedalus actor`."""
 
 import argparse
-import os
-import re
 import secrets
-import socket
 
 from daedalus.actor.session.config import ActorConfig
+from daedalus.actor.session.own_name import own_name
 from daedalus.cli.arguments import add_allow_module, add_connect, add_tls, command_parser, seconds
 from daedalus.cli.logs import add_logging
 from daedalus.policy.user_modules import UserModules
@@ -101,7 +99,7 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         raise ValueError(f"--envs is {arguments.envs}: choose a number from 1 to 4096")
     if arguments.run != keys.ANY_RUN:
         keys.check_name(arguments.run, "run")
-    name = arguments.name or (f"{credentials.name}.{os.getpid()}" if credentials else _default_name())
+    name = arguments.name or own_name(credentials.name if credentials else "")
     if credentials and credentials.name not in (name, name.partition(".")[0]):
         raise ValueError(
             f"the certificate in {credentials.directory} is not for {name!r}: "
@@ -118,8 +116,3 @@ def config(arguments: argparse.Namespace, credentials: Credentials | None) -> Ac
         timeout=arguments.timeout,
         any_run=arguments.any_run,
     )
-
-
-def _default_name() -> str:
-    host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-") or "actor"
-    return f"{host[:40]}-{os.getpid()}"

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from daedalus.protocol.algorithms import check_algorithm
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import RunSpec, TrainingSpec
 from daedalus.protocol.specification import meanings
 
 _FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
@@ -112,7 +112,7 @@ def choose_algorithm(settings: dict[str, Any], algorithm: str | None) -> None:
         training["algorithm"] = algorithm
     tables = settings.pop("for_algorithm", {})
     _check_for_algorithm(tables)
-    chosen = training.get("algorithm")
+    chosen = training.get("algorithm", TrainingSpec.model_fields["algorithm"].default)
     for section, values in (tables.get(chosen, {}) if isinstance(chosen, str) else {}).items():
         for key, value in values.items():
             _assign(settings.setdefault(section, {}), key, value)

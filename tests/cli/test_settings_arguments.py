@@ -9,6 +9,8 @@ from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parse
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 
+RATES = {"impala": 0.25, "appo": 0.5, "a3c": 0.125}
+
 
 def test_two_environments_are_refused() -> None:
     words = ["--env", "CartPole-v1", "--set", "environment.id=Acrobot-v1"]
@@ -66,6 +68,13 @@ def test_an_algorithm_that_set_chooses_brings_the_settings_of_its_preset(algorit
     assert also == chosen
     assert also.training.algorithm == algorithm
     assert also.collection.rollout_length == 7
+
+
+def test_a_file_without_an_algorithm_has_the_settings_for_the_default_one(tmp_path: Path) -> None:
+    tables = "".join(f"[for_algorithm.{name}.training]\nlearning_rate = {rate}\n" for name, rate in RATES.items())
+    (tmp_path / "own.toml").write_text("[environment]\nid = 'CartPole-v1'\n" + tables)
+    spec, _ = resolve(learner_parser().parse_args([str(tmp_path / "own.toml")]))
+    assert spec.training.learning_rate == RATES[spec.training.algorithm]
 
 
 def test_an_algorithm_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> None:
