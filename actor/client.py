@@ -100,10 +100,9 @@ class Client:
         agents, timeout = int(agents), float(timeout)  # threading takes no number of NumPy
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
+        identity = credentials.name if credentials else ""
         config = ActorConfig(
-            name=keys.check_name(
-                name or own_name(credentials.name if credentials else "", next(_numbers)), "actor name"
-            ),
+            name=keys.check_name(name or own_name(identity, next(_numbers)), "actor name"),
             incarnation=secrets.randbits(62),
             run=run,
             link=link,
