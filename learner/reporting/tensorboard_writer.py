@@ -13,6 +13,11 @@ import numpy as np
 
 from daedalus.learner.reporting.metrics import Details, tag
 
+_BINS = 30  # of returns and lengths
+_SMALLEST_RANGE = (
+    1e-9  # of the values of a histogram, relative to the largest: between them are fewer numbers than bins
+)
+
 
 class TensorBoardWriter:
     """Writer of scalars, histograms and images against env_steps.
@@ -45,7 +50,9 @@ class TensorBoardWriter:
             if name != "env_steps"
         ]
         values += [
-            self._summary.Value(tag=f"rollout/{name}", histo=self._histogram(*np.histogram(numbers, bins=30), numbers))
+            self._summary.Value(
+                tag=f"rollout/{name}", histo=self._histogram(*np.histogram(numbers, _edges(numbers)), numbers)
+            )
             for name, numbers in (("episode_return", details.returns), ("episode_length", details.lengths))
             if len(numbers)
         ]
@@ -96,3 +103,13 @@ class TensorBoardWriter:
     def close(self) -> None:
         """Close the file. See MetricsWriter."""
         self._writer.close()
+
+
+def _edges(numbers: Sequence[float]) -> np.ndarray:
+    """Return the edges of the bins of some values, also if the values are equal or very large."""
+    low, high = min(numbers), max(numbers)
+    largest = max(abs(low), abs(high))
+    if high - low <= _SMALLEST_RANGE * largest:
+        margin = max(0.5, 1e-6 * largest)
+        low, high = low - margin, high + margin
+    return np.linspace(low, high, _BINS + 1)

@@ -150,6 +150,34 @@ def test_tensorboard_contains_histograms_and_the_observation_image(tmp_path: Pat
     assert (image.step, image.width, image.height) == (100, 8, 6)
 
 
+LARGEST = float(np.finfo(np.float32).max)  # returns are float32 on the wire
+
+
+@pytest.mark.parametrize(
+    "returns",
+    [
+        [3e14, 3e14],
+        [LARGEST, LARGEST],
+        [-LARGEST, LARGEST],
+        [1e-30, 1e-30],
+        [0.0, 0.0],
+        [1e15, float(np.nextafter(np.float32(1e15), np.float32(2e15)))],
+        [1e-8, 3e-8],
+    ],
+)
+def test_tensorboard_has_a_histogram_of_equal_and_of_very_large_returns(tmp_path: Path, returns: list[float]) -> None:
+    writer = TensorBoardWriter(tmp_path)
+    writer.write({"env_steps": 1}, Details(returns=returns, lengths=[1, 1]))
+    writer.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    (found,) = events.Histograms("rollout/episode_return")
+    histogram = found.histogram_value
+    assert (histogram.min, histogram.max, sum(histogram.bucket)) == (min(returns), max(returns), 2.0)
+    assert (np.diff(histogram.bucket_limit) > 0.0).all()
+    assert np.count_nonzero(histogram.bucket) == len(set(returns))
+
+
 def test_histogram_of_actions_takes_no_memory_for_each_action(tmp_path: Path) -> None:
     writer = TensorBoardWriter(tmp_path)
     tracemalloc.start()
