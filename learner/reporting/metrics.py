@@ -66,7 +66,7 @@ def tag(column: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Details:
-    """Metrics that are not single numbers: distributions and a picture of an observation."""
+    """Metrics that are not single numbers: distributions and a picture of an observation. Most rows have none."""
 
     returns: Sequence[float] = ()  # of the newest episodes
     lengths: Sequence[int] = ()

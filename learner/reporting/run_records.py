@@ -41,7 +41,7 @@ class RunRecords:
         """Record a row of metrics and the new events, and log a hint if one is due. `last` marks the row of a stop."""
         row = self._reporter.row(learner, now, last=last)
         self._history.add(row)
-        self._recorder.record(row, self._reporter.details(learner))
+        self._recorder.record(row, self._reporter.details(learner, now, last=last))
         self._event_file.add(self._events.take_new())
         if not last and (hint := self._reporter.hint()):
             _logger.warning("%s", hint)

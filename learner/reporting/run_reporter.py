@@ -1,5 +1,6 @@
 """Metrics rows, status and summary of one run, from its counters, fleet and health."""
 
+import math
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner
 
 
+_DETAILS_SECONDS = 10.0  # between details: they take far more space than a row
+
+
 class RunReporter:
     """Reporter of one run. Reads the counters and the fleet under their lock. No I/O."""
 
@@ -22,6 +26,7 @@ class RunReporter:
         """Construct the reporter. `lock` guards the counters and the fleet."""
         self._state, self._counters, self._fleet, self._lock = state, state.counters, fleet, lock
         self._user_metrics = user_metrics
+        self._details_at = -math.inf  # when the next details are due
         training = state.spec.training
         self._meter = RateMeter(self._counters, state.health.started)
         self._episode_hint = EpisodeHint(training.env_steps)
@@ -57,8 +62,11 @@ class RunReporter:
             hint = self._episode_hint.take(self._counters, self._fleet)
         return hint or self._learning_hint.take()
 
-    def details(self, learner: "Learner") -> Details:
-        """Return the distributions and the picture that belong to a metrics row."""
+    def details(self, learner: "Learner", now: float, *, last: bool = False) -> Details:
+        """Return the distributions and the picture that belong to a metrics row; most rows have none."""
+        if now < self._details_at and not last:
+            return Details()
+        self._details_at = now + _DETAILS_SECONDS
         with self._lock:
             returns, lengths = list(self._counters.returns), list(self._counters.lengths)
         return Details(

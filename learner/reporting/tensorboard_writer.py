@@ -14,9 +14,8 @@ import numpy as np
 from daedalus.learner.reporting.metrics import Details, tag
 
 _BINS = 30  # of returns and lengths
-_SMALLEST_RANGE = (
-    1e-9  # of the values of a histogram, relative to the largest: between them are fewer numbers than bins
-)
+_MOST_BINS = 256  # of actions
+_SMALLEST_RANGE = 1e-9  # of values, relative to the largest: a float has few numbers within a smaller one
 
 
 class TensorBoardWriter:
@@ -59,8 +58,7 @@ class TensorBoardWriter:
         for name, counts in details.action_counts.items():
             if sum(counts):
                 under = "rollout/action" if name == "action" else f"rollout/action/{name}"
-                histogram = self._histogram(np.array(counts), np.arange(len(counts) + 1) - 0.5, ())
-                values.append(self._summary.Value(tag=under, histo=histogram))
+                values.append(self._summary.Value(tag=under, histo=self._histogram(*_merged(counts), ())))
         if details.picture is not None:
             values.append(self._summary.Value(tag="rollout/observation", image=self._image(details.picture)))
         self._add(self._event(wall_time=time.time(), step=int(row["env_steps"]), summary=self._summary(value=values)))
@@ -113,3 +111,9 @@ def _edges(numbers: Sequence[float]) -> np.ndarray:
         margin = max(0.5, 1e-6 * largest)
         low, high = low - margin, high + margin
     return np.linspace(low, high, _BINS + 1)
+
+
+def _merged(counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return counts of choices, those of neighbouring choices added up if there are many, and the edges between."""
+    firsts = np.arange(0, len(counts), -(-len(counts) // _MOST_BINS))
+    return np.add.reduceat(counts, firsts), np.append(firsts, len(counts)) - 0.5

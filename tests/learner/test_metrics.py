@@ -178,6 +178,19 @@ def test_tensorboard_has_a_histogram_of_equal_and_of_very_large_returns(tmp_path
     assert np.count_nonzero(histogram.bucket) == len(set(returns))
 
 
+def test_neighbouring_choices_share_a_bucket_where_there_are_many(tmp_path: Path) -> None:
+    choices = 4672  # of chess: 19 in a bucket
+    writer = TensorBoardWriter(tmp_path)
+    writer.write({"env_steps": 1}, Details(action_counts={"action": [1] * (choices - 1) + [5]}))
+    writer.close()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    (found,) = events.Histograms("rollout/action")
+    buckets, limits = found.histogram_value.bucket, found.histogram_value.bucket_limit
+    assert (buckets[:-1], buckets[-1]) == ([19.0] * 245, 17.0 + 4.0)
+    assert limits == [*np.arange(19, choices, 19) - 0.5, choices - 0.5]
+
+
 def test_histogram_of_actions_takes_no_memory_for_each_action(tmp_path: Path) -> None:
     writer = TensorBoardWriter(tmp_path)
     tracemalloc.start()

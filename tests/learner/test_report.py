@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from building import EPOCH, joined_fleet, make_rollout, run_spec
+from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
 from daedalus.learner.reporting.metrics import COLUMNS
@@ -18,8 +20,12 @@ from daedalus.learner.reporting.report import (
     run_status,
     summary,
 )
+from daedalus.learner.reporting.run_reporter import RunReporter
+from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.run.health import Health
+from daedalus.learner.run.run_state import RunState
+from daedalus.learner.training.learner import Learner
 from daedalus.learner.training.update_metrics import METRICS
 
 DIAGNOSTICS = (
@@ -205,3 +211,17 @@ def test_summary_of_an_empty_run_does_not_divide_by_0() -> None:
     )
     assert made["rollout_bytes_per_env_step"] == 0.0
     assert (made["solved"], made["seconds_to_target"], made["episode_return_mean"]) == (False, None, None)
+
+
+def test_distributions_come_every_ten_seconds_and_with_the_last_row(tmp_path: Path) -> None:
+    spec = run_spec()
+    state, learner = RunState(tmp_path, spec, 0.0), Learner(spec.training, POLICY, SPACES)
+    reporter = RunReporter(state, joined_fleet(), threading.Condition(), UserMetrics())
+    state.counters.returns.append(2.0)
+    counted = []
+    for now, last in ((0.5, False), (1.0, False), (10.4, False), (10.5, False), (11.0, False), (11.5, True)):
+        learner.step([make_rollout(valid=EVERYTHING)], 0.0)
+        details = reporter.details(learner, now, last=last)
+        counted.append(sum(details.action_counts.get("action", ())))
+        assert list(details.returns) == ([2.0] if counted[-1] else [])
+    assert counted == [18, 0, 0, 3 * 18, 0, 2 * 18]
