@@ -68,6 +68,7 @@ class CertificateFolder:
             raise CredentialsError(
                 f"{directory} is not empty: add certificates with `daedalus certs issue`, or name a new folder"
             )
+        _check_hosts(hosts)
         CertificateAuthority.create(directory / "ca", "Daedalus CA", _CA_LIFETIME)
         made = cls(directory)
         made.issue([*map(Identity, _ZENOH_LISTENERS), Identity("operator", "operator")], lifetime, hosts)
@@ -90,6 +91,7 @@ class CertificateFolder:
         """
         for identity in identities:
             _check_name(identity)
+        _check_hosts(hosts or [])
         _check_number({*self.identities(), *identities})
         for identity in identities:
             record, folder = self.directory / "ca" / identity.folder, self.directory / identity.folder
@@ -122,7 +124,8 @@ class CertificateFolder:
         known = self.identities()
         if hosts is None and identity in known:
             return known[identity].hosts
-        return list(dict.fromkeys([*(hosts or []), socket.gethostname(), "localhost", "127.0.0.1", "::1"]))
+        own = [name for name in (socket.gethostname(),) if name.isascii()]
+        return list(dict.fromkeys([*(hosts or []), *own, "localhost", "127.0.0.1", "::1"]))
 
     def _issuer(self, record: Path, identity: Identity) -> CertificateAuthority:
         """Return the issuer of a client's certificates, which is created with the first certificate."""
@@ -142,6 +145,15 @@ class CertificateFolder:
             security = Credentials(router, "router", "").settings(listens=True)
             zenohd = as_config_file(session_settings("router", ["tls/0.0.0.0:7447"], [], security, Capacity()))
             replace_text(router / _ZENOHD, json.dumps(zenohd, indent=2) + "\n")
+
+
+def _check_hosts(hosts: list[str]) -> None:
+    for host in hosts:
+        if not host or not host.isascii():
+            raise CredentialsError(
+                f"--host {host!r} is not a name for a certificate: write it in the letters of ASCII, as DNS has it "
+                "(a name such as `größe` begins with xn-- there)"
+            )
 
 
 def _check_number(identities: set[Identity]) -> None:

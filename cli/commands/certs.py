@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     issue.add_argument("role", choices=(*_NAMED, *_LISTENERS), help="kind of process that uses the certificate")
     issue.add_argument("names", nargs="*", metavar="NAME", help="name of an actor, operator or client")
     _add_host(issue)
-    renew = verbs.add_parser("renew", help="create new certificates in place of those that expire soon")
+    renew = verbs.add_parser("renew", help="create new certificates and tokens in place of those that expire soon")
     renew.add_argument(
         "role", nargs="?", choices=(*_NAMED, *_LISTENERS), help="kind of process whose certificate is renewed now"
     )
@@ -161,6 +161,8 @@ def _issue_tokens(folder: "CertificateFolder", names: list[str], days: int) -> l
 
 
 def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    if parsed.role is None:
+        return _renew_expiring(folder, parsed)
     if parsed.role == "client":
         tokens = ClientTokens(folder.directory).days_left()
         unknown = [name for name in parsed.names if name not in tokens]
@@ -168,17 +170,28 @@ def _renew(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]
             raise CredentialsError(f"no token was issued for {', '.join(unknown)}: see `daedalus certs list`")
         return _issue_tokens(folder, parsed.names or list(tokens), parsed.days)
     known = folder.identities()
-    if parsed.role is None:
-        identities = [identity for identity, issued in known.items() if issued.days_left < WARNING_DAYS]
-        if not identities:
-            return [f"no certificate expires within {WARNING_DAYS} days"]
-    elif parsed.role in _NAMED and not parsed.names:
+    if parsed.role in _NAMED and not parsed.names:
         identities = [identity for identity in known if identity.role == parsed.role]
     else:
         identities = _named(parsed)
         unknown = [identity.folder for identity in identities if identity not in known]
         if unknown:
             raise CredentialsError(f"no certificate was issued for {', '.join(unknown)}: see `daedalus certs list`")
+    return _renew_certificates(folder, identities, parsed)
+
+
+def _renew_expiring(folder: "CertificateFolder", parsed: argparse.Namespace) -> list[str]:
+    identities = [identity for identity, issued in folder.identities().items() if issued.days_left < WARNING_DAYS]
+    tokens = ClientTokens(folder.directory).days_left()
+    names = [name for name, days in tokens.items() if days < WARNING_DAYS]
+    lines = _renew_certificates(folder, identities, parsed) if identities else []
+    lines += _issue_tokens(folder, names, parsed.days) if names else []
+    return lines or [f"no certificate {'or token ' if tokens else ''}expires within {WARNING_DAYS} days"]
+
+
+def _renew_certificates(
+    folder: "CertificateFolder", identities: "list[Identity]", parsed: argparse.Namespace
+) -> list[str]:
     folder.issue(identities, _lifetime(parsed))
     _issue_operators(folder, identities, parsed.days)
     return _issued(folder, identities)

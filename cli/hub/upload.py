@@ -32,7 +32,7 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
     Args:
       directory: the run directory.
       repository: USER/NAME; it is created if it does not exist.
-      private: create it as a private repository.
+      private: create it as a private repository; an existing one must be private.
 
     Raises HubError, RunDataError, NoPolicyError, DamagedError.
     """
@@ -55,6 +55,10 @@ def push(directory: Path, repository: str, *, private: bool) -> str:
         info = api.model_info(repository)
         present = {file.rfilename for file in info.siblings or []}
         _check_ours(repository, present)
+        if private and not info.private:  # `private` of create_repo has no effect on one that exists
+            raise HubError(
+                f"{repository} is public: make it private in its settings on the Hub, or choose another name"
+            )
         additions = [CommitOperationAdd(path_in_repo=name, path_or_fileobj=data) for name, data in files.items()]
         stale = [CommitOperationDelete(path_in_repo=name) for name in sorted((present & _OURS) - files.keys())]
         commit = api.create_commit(

@@ -1,5 +1,6 @@
 """What `--over SECTION.KEY=...` says: a list of values, or a range. Pure functions."""
 
+import math
 import re
 import tomllib
 from dataclasses import dataclass
@@ -9,7 +10,8 @@ from daedalus.learner.run.settings import SettingsError
 from daedalus.protocol.spec import RunSpec
 
 _LOG_FACTOR = 10.0  # a range that spans more is sampled on a logarithmic scale
-_NUMBER = r"[+-]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_DIGITS = r"\d+(?:_\d+)*"
+_NUMBER = rf"[+-]?(?:{_DIGITS}\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,9 +61,11 @@ def read_axis(text: str) -> Axis:
     ends = re.fullmatch(rf"({_NUMBER})\.\.({_NUMBER})", rest)
     if ends is not None:
         low, high = float(ends[1]), float(ends[2])
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise SettingsError(f"--over {text}: an end of the range is too large")
         if not low < high:
             raise SettingsError(f"--over {text}: the range is empty: write the lower end first")
-        whole = all(re.fullmatch(r"[+-]?\d[\d_]*", end) for end in ends.groups())
+        whole = all(re.fullmatch(rf"[+-]?{_DIGITS}", end) for end in ends.groups())
         return Range(key=key, low=low, high=high, whole=whole)
     values = split_values(rest)
     if "" in values:

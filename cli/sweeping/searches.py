@@ -130,8 +130,8 @@ class SampledSearch:
         if trial.asked is not None:
             self._study.tell(trial.asked, value)
             return
-        values = {axis.key: _read_value(axis, trial.point[axis.key]) for axis in self._axes}
         try:
+            values = {axis.key: _read_value(axis, trial.point[axis.key]) for axis in self._axes}
             self._study.add_trial(
                 import_optuna().trial.create_trial(params=values, distributions=self._distributions, value=value)
             )

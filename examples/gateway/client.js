@@ -22,20 +22,21 @@ export function cartpole([x, speed, angle, spin], action) {
 /** Play episodes; `report` gets a line for each, and `onStep` the state of the cart after each step. */
 export async function play(address, name, episodes, report, onStep = async () => {}) {
   const socket = new WebSocket(address);
-  let settle; // of the answer that is awaited
-  socket.onmessage = ({ data }) => settle.resolve(JSON.parse(data));
-  socket.onclose = socket.onerror = () => settle.reject(new Error("the connection to the gateway ended"));
-  const answered = () => new Promise((resolve, reject) => (settle = { resolve, reject }));
-  const ask = async (message) => {
-    const answer = answered();
-    socket.send(JSON.stringify(message));
-    const found = await answer;
-    if (!["welcome", "action"].includes(found.type)) throw new Error(found.reason);
-    return found;
+  let [settle, end] = [null, null]; // the answer that is awaited, and why none comes any more
+  const fail = (error) => settle.reject((end ??= error));
+  socket.onmessage = ({ data }) => {
+    const message = JSON.parse(data);
+    if (["welcome", "action"].includes(message.type)) settle.resolve(message);
+    else fail(new Error(message.reason));
   };
-  const opened = answered();
-  socket.onopen = () => settle.resolve();
-  await opened;
+  socket.onclose = socket.onerror = () => fail(new Error("the connection to the gateway ended"));
+  const answer = (begin) =>
+    new Promise((resolve, reject) => {
+      settle = { resolve, reject };
+      end ? reject(end) : begin();
+    });
+  const ask = (message) => answer(() => socket.send(JSON.stringify(message)));
+  await answer(() => (socket.onopen = () => settle.resolve()));
   report(`joined ${(await ask({ type: "hello", version: 1, name, ...SPACES })).run}`);
   for (let episode = 0; episode < episodes; episode++) {
     let state = Array.from({ length: 4 }, () => Math.random() * 0.1 - 0.05);

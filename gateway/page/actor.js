@@ -11,11 +11,12 @@ export class RefusedError extends Error {}
 export class Actor {
   #socket;
   #waiting = null; // {resolve, reject} of the answer that is awaited
+  #end = null; // why no further answer comes: it may be known while nothing is awaited
 
   constructor(address) {
     this.#socket = new WebSocket(address);
     this.#socket.onmessage = ({ data }) => this.#take(JSON.parse(data));
-    this.#socket.onclose = () => this.#waiting?.reject(new Error("the connection to the gateway ended"));
+    this.#socket.onclose = () => this.#fail(new Error("the connection to the gateway ended"));
   }
 
   /** Join the run, and return the gateway's welcome. */
@@ -45,16 +46,24 @@ export class Actor {
   #answer(begin) {
     return new Promise((resolve, reject) => {
       this.#waiting = { resolve, reject };
-      begin();
+      if (this.#end) reject(this.#end);
+      else begin();
     });
   }
 
   #take(message) {
     const final = message.type === "run_ended" || message.code === "refused" || message.code === "misfit";
-    if (message.type === "error" || message.type === "run_ended") {
-      this.#waiting?.reject(final ? new RefusedError(message.reason) : new Error(message.reason));
+    if (final) {
+      this.#fail(new RefusedError(message.reason));
+    } else if (message.type === "error") {
+      this.#waiting?.reject(new Error(message.reason));
     } else {
       this.#waiting?.resolve(message);
     }
+  }
+
+  #fail(error) {
+    this.#end ??= error;
+    this.#waiting?.reject(this.#end);
   }
 }

@@ -7,7 +7,7 @@ pulled, by their names, after a check of their sizes. SealedDirectory checks the
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,7 +89,8 @@ def pull(repository: str, revision: str | None = None) -> Path:
         # Of the checked commit: a branch may have moved since, to files of any size.
         folder = _folder(repository, [Path(api.hf_hub_download(repository, name, revision=commit)) for name in LIMITS])
         if revision != commit:
-            _note_commit(folder, revision or "main", commit)
+            with suppress(OSError):  # a cache in an image that is read only
+                _note_commit(folder, revision or "main", commit)
     return folder
 
 

@@ -118,6 +118,20 @@ def test_renew_replaces_certificates_that_expire_soon(tmp_path: Path, capsys: py
     assert load(made / "actor-box", "actor").days_left() < 7
 
 
+def test_renew_replaces_tokens_that_expire_soon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make(tmp_path / "certs")
+    for name, days in (("phone", "20"), ("robot", "90")):
+        assert certs(["issue", "client", name, "--days", days, "--directory", str(made)]) == 0
+    before = {name: (made / f"client-{name}" / "token").read_text() for name in ("phone", "robot")}
+    capsys.readouterr()
+    assert certs(["renew", "--directory", str(made)]) == 0
+    assert "client-phone/token    give this token to the client" in capsys.readouterr().out
+    assert (made / "client-phone" / "token").read_text() != before["phone"]
+    assert (made / "client-robot" / "token").read_text() == before["robot"]
+    assert certs(["renew", "--directory", str(made)]) == 0
+    assert capsys.readouterr().out == "no certificate or token expires within 30 days\n"
+
+
 ROLES = {"actor-arm": "actor", "actor-box": "actor", "router": "router", "learner": "learner"}
 
 
@@ -142,6 +156,9 @@ def test_more_certificates_than_a_handshake_has_room_for_are_refused(
         (["issue", "actor", "a.b", "--directory", "{certs}"], "'a.b' has a '.': name it 'a'"),
         (["issue", "actor", "a/b", "--directory", "{certs}"], "actor name 'a/b' must be"),
         (["issue", "actor", "a", "--directory", "{certs}/nowhere"], "holds no CA"),
+        (["init", "{certs}/new", "--host", "gpü-box"], "--host 'gpü-box' is not a name for a certificate"),
+        (["issue", "router", "--host", "gpü-box", "--directory", "{certs}"], "--host 'gpü-box' is not a name"),
+        (["issue", "gateway", "--host", "", "--directory", "{certs}"], "--host '' is not a name"),
         (["revoke", "actor", "a", "--directory", "{certs}"], "no actor is named a: see `daedalus certs list`"),
         (["renew", "actor", "a", "--directory", "{certs}"], "no certificate was issued for actor-a"),
         (["list", "--directory", "{certs}/nowhere"], "holds no CA"),

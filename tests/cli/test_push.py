@@ -1,5 +1,6 @@
 """`daedalus push` and pulling the policy again, with the real huggingface_hub and a stand-in of the Hub on loopback."""
 
+import errno
 import json
 import logging
 import sys
@@ -175,6 +176,20 @@ def test_a_private_repository_needs_the_token(hub: HubServer, monkeypatch: pytes
         pull("ada/secret")
 
 
+def test_a_private_push_never_ends_in_a_public_repository(hub: HubServer, capsys: pytest.CaptureFixture[str]) -> None:
+    run_of(Path("run"), 4)
+    assert push(["run", "ada/cart"]) == 0
+    before = hub.files("ada/cart")
+    capsys.readouterr()
+    assert push(["run", "ada/cart", "--private"]) == 1
+    assert line(capsys) == (
+        "daedalus push: ada/cart is public: make it private in its settings on the Hub, or choose another name"
+    )
+    assert hub.files("ada/cart") == before
+    hub.repositories["ada/cart"].private = True
+    assert push(["run", "ada/cart", "--private"]) == 0
+
+
 # ------------------------------------------------------------------------------------------------- bad input
 
 
@@ -317,6 +332,18 @@ def test_a_pulled_policy_is_used_again_without_the_hub(hub: HubServer, monkeypat
     offline(hub, monkeypatch)
     assert pull("ada/cart") == first
     assert hub.requests == []
+
+
+def test_a_policy_is_used_from_a_cache_that_cannot_be_written(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_of(Path("run"), 4)
+    assert push(["run", "ada/cart"]) == 0
+    folder = pull("ada/cart")
+
+    def read_only(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(hub_module, "replace_text", read_only)
+    assert pull("ada/cart") == folder
 
 
 def test_only_the_files_of_a_policy_are_pulled(hub: HubServer) -> None:

@@ -104,6 +104,16 @@ def test_the_tracker_is_not_opened_before_the_first_row(tmp_path: Path) -> None:
         until(lambda: 3000 in TAPE)
 
 
+def test_a_run_that_ends_before_its_first_row_is_not_logged(tmp_path: Path) -> None:
+    directory = record(tmp_path / "run", finished=False, evaluation=None)
+    (directory / "metrics.csv").unlink()
+    files = set(directory.iterdir())
+    with logged(directory):
+        pass
+    assert TAPE == []
+    assert set(directory.iterdir()) == files
+
+
 def test_a_resumed_run_continues_under_its_id_and_makes_no_step_twice(tmp_path: Path) -> None:
     directory = record(tmp_path / "run", finished=False, evaluation=None)
     with logged(directory):

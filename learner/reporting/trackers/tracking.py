@@ -75,8 +75,10 @@ class Tracking:
 
     def _log(self, *, last: bool) -> None:
         """Log what is new in the run directory."""
-        if not (last or self._rows.exist):
-            return  # the import of the tracker's package would compete with the start of the run
+        if not (self._rows.exist or (last and self._state.id)):
+            # A run that fails at its start is not logged. Before the first row, the import of the tracker's package
+            # would compete with the start of the run.
+            return
         if self._tracker is None:
             self._tracker = self._opened()
         try:

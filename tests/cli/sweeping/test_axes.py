@@ -64,6 +64,7 @@ def test_a_value_of_a_range_is_short_and_inside() -> None:
         ("collection.rollout_length=5,20,5", "the value 5 is there twice"),
         ("training.learning_rate=1e-3,0.001", r"the value 0\.001 is there twice"),
         ("training.learning_rate=1e-2..1e-4", "the range is empty: write the lower end first"),
+        ("training.learning_rate=1..1e999", "an end of the range is too large"),
         ("training.seed=1,2", "use --seeds N"),
         ("environment.id=A-v0,B-v0", "a sweep has one environment"),
     ],
@@ -72,3 +73,10 @@ def test_bad_input_is_one_line(text: str, message: str) -> None:
     with pytest.raises(SettingsError, match=message) as error:
         read_axis(text)
     assert "\n" not in str(error.value)
+
+
+def test_underscores_are_for_numbers_between_digits_only() -> None:
+    assert read_axis("training.batch_rollouts=1_0..2_0") == Range(
+        key="training.batch_rollouts", low=10.0, high=20.0, whole=True
+    )
+    assert read_axis("training.batch_rollouts=1_..2") == Choices(key="training.batch_rollouts", values=("1_..2",))

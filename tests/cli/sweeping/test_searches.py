@@ -121,6 +121,14 @@ class TestSampler:
         assert len({run.spec.training.learning_rate for run in after}) == 9
         assert len([trial for trial in search._study.trials if trial.value is not None]) == 9
 
+    def test_points_of_another_kind_of_range_are_not_reported(self, tmp_path: Path) -> None:
+        """The same setting with whole numbers, after a command whose range had fractions."""
+        (tmp_path / TRIALS).write_text(json.dumps({"trials": [{"training.discount_factor": "0.5"}]}))
+        whole = Range(key="training.discount_factor", low=0.0, high=1.0, whole=True)
+        search = SampledSearch(planner(tmp_path), [whole], [1], trials=2, folder=tmp_path)
+        make_runs(search, lambda run: 1.0, most=1)
+        assert search._study.trials == []
+
     def test_points_of_another_sweep_are_refused(self, tmp_path: Path) -> None:
         for content in ({"trials": [{"training.learning_rate": "0.1"}]}, {"trials": 3}, {}):
             (tmp_path / TRIALS).write_text(json.dumps(content))

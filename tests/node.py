@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "examples" / "node"
+FOLDER = Path(__file__).parents[1] / "examples" / "node"
 _OLDEST = (22, 18)  # the first version that runs TypeScript files
 
 
