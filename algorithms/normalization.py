@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.normalization import ObservationNormalizer
-from daedalus.protocol.uploads import Rollout, RolloutIdentity
+from daedalus.protocol.uploads import Rollout
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
 _LARGEST_MEAN = 5.0  # of the scaled returns: that of episodes of a thousand equal rewards, at a discount factor of 0.99
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
-_MAX_STREAMS = 4096  # actors whose running returns are kept
 
 
 class Moments(NamedTuple):
@@ -110,14 +110,14 @@ class RewardNormalizer:
 
     The return of row t is G_t = r_t + discount_factor * G_{t-1}, which begins at 0 with each episode: a sum over the
     past, whose deviation is that of the values to within the mean (Engstrom et al. 2020, section 3). It runs on from
-    rollout to rollout of an actor. The mean counts where it is large beside the deviation, such as with episodes of one
-    step whose rewards are 100 and 101: divided by their deviation, all would be clipped to the same value.
+    rollout to rollout (algorithms/running_returns.py). The mean counts where it is large beside the deviation, such as
+    with episodes of one step whose rewards are 100 and 101: divided by their deviation, all would be clipped to the
+    same value.
     """
 
     def __init__(self, discount_factor: float) -> None:
-        self._discount_factor = discount_factor
         self.moments = RunningMoments(())
-        self._running: dict[str, tuple[RolloutIdentity, np.ndarray]] = {}  # by actor: last rollout, G of it [E]
+        self._returns = RunningReturns(discount_factor)
 
     def add(self, rollouts: Sequence[Rollout]) -> None:
         """Add the returns of rollouts to the statistics."""
@@ -125,7 +125,7 @@ class RewardNormalizer:
 
     def moments_of(self, rollouts: Sequence[Rollout]) -> Moments:
         """Return the moments of the returns of the rows to learn from. Call it once for each rollout, in order."""
-        seen = [self._returns(rollout)[rollout.learned] for rollout in rollouts]
+        seen = [self._returns.add(rollout)[rollout.learned] for rollout in rollouts]
         return moments_of(torch.from_numpy(np.concatenate(seen)))
 
     def scale(self, batch: Batch) -> None:
@@ -133,26 +133,3 @@ class RewardNormalizer:
         deviation, mean = float(self.moments.variance.sqrt()), float(self.moments.mean)
         divisor = max(deviation, abs(mean) / _LARGEST_MEAN, 1e-8)
         batch.rewards.div_(divisor).clamp_(-_LARGEST_REWARD, _LARGEST_REWARD)
-
-    def _returns(self, rollout: Rollout) -> np.ndarray:
-        """Return G [T, E] of a rollout, and remember its last row."""
-        identity = rollout.identity
-        running = np.zeros(rollout.environments)
-        last, carried = self._running.pop(identity.actor, (None, running))
-        if last is not None and _follows(identity, last) and len(carried) == len(running):
-            running = carried
-        returns = np.empty((rollout.rows, rollout.environments))
-        goes_on = ~(rollout.terminated | rollout.truncated)
-        for row in range(rollout.rows):
-            running = rollout.rewards[row] + self._discount_factor * running
-            returns[row] = running
-            running = np.where(goes_on[row], running, 0.0)
-        # An actor does not check its rewards: one that is not finite must not reach its later rollouts.
-        self._running[identity.actor] = identity, np.where(np.isfinite(running), running, 0.0)
-        while len(self._running) > _MAX_STREAMS:
-            del self._running[next(iter(self._running))]
-        return returns
-
-
-def _follows(identity: RolloutIdentity, last: RolloutIdentity) -> bool:
-    return identity.incarnation == last.incarnation and identity.sequence == last.sequence + 1

@@ -1,4 +1,4 @@
-"""algorithms/normalization.py: the statistics equal those of all values together, however they arrive."""
+"""algorithms/normalization.py, running_returns.py: statistics equal those of all values, however they arrive."""
 
 from dataclasses import replace
 
@@ -8,8 +8,9 @@ import torch
 from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
-from daedalus.algorithms import normalization
+from daedalus.algorithms import running_returns
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
+from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
 from daedalus.policy.normalized import normalized_components
@@ -93,7 +94,7 @@ def test_a_reward_that_is_not_finite_does_not_reach_the_next_episode_or_rollout(
     first.rewards[2] = bad
     first.terminated[3] = ends
     normalizer = RewardNormalizer(DISCOUNT)
-    returns = normalizer._returns(first)
+    returns = normalizer._returns.add(first)
     assert np.isfinite(returns).all(1).tolist() == [True, True, False, False, ends, ends]
     assert normalizer.moments_of([sent(1)]).squares.isfinite()
 
@@ -125,11 +126,54 @@ def test_rewards_that_differ_little_beside_their_mean_stay_different(offset: flo
     assert higher - lower == pytest.approx(5.0 / abs(offset), rel=0.05)
 
 
+def played(sequence: int, begin: int, reward: float, *, rows: int = 16, stack: int = 1) -> Rollout:
+    """Return a rollout of one agent without an end, whose newest frames count on from `begin`."""
+    frames = begin + 1 - stack + np.arange(rows + stack, dtype=np.float32)
+    nowhere = np.zeros((rows, 1), np.bool_)
+    return make_rollout(
+        identity("a", sequence),
+        rows=rows,
+        environments=1,
+        frames=frames[:, None, None].repeat(3, 2),
+        rewards=np.full((rows, 1), reward, np.float32),
+        terminated=nowhere,
+        truncated=nowhere,
+        valid=~nowhere,
+        episode_returns=np.zeros(0, np.float32),
+        episode_lengths=np.zeros(0, np.int32),
+    )
+
+
+@pytest.mark.parametrize("stack", [1, 4])
+def test_returns_of_the_agents_of_a_client_run_on_agent_by_agent(stack: int) -> None:
+    """One agent's rewards are 1, the other's -1: mixed, the returns would be near 0."""
+    normalizer = RewardNormalizer(0.99)
+    rounds = 60
+    for turn in range(rounds):
+        normalizer.add([played(2 * turn, 16 * turn, 1.0, stack=stack)])
+        normalizer.add([played(2 * turn + 1, 10_000 + 16 * turn, -1.0, stack=stack)])
+    returns = (1.0 - 0.99 ** np.arange(1, 16 * rounds + 1)) / 0.01
+    expected = np.concatenate([returns, -returns]).std()
+    assert float(normalizer.moments.variance) ** 0.5 == pytest.approx(expected, rel=0.01)
+
+
+def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
+    """As in runs of a2c, while the client waits for the next policy."""
+    normalizer = RewardNormalizer(0.5)
+    normalizer.add([played(0, 0, 1.0), played(1, 100, 1.0)])
+    expected = (1.0 - 0.5 ** np.arange(1, 33)) / 0.5
+    assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
+
+
 def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(normalization, "_MAX_STREAMS", 2)
-    normalizer = RewardNormalizer(DISCOUNT)
-    normalizer.add([sent(0, actor) for actor in "abc"])
-    assert list(normalizer._running) == ["b", "c"]
+    monkeypatch.setattr(running_returns, "_MAX_STREAMS", 2)
+    returns = RunningReturns(DISCOUNT)
+    for rollout in [sent(0, actor) for actor in "abc"]:
+        returns.add(rollout)
+    assert list(returns._newest) == ["b", "c"]
+    returns.add(sent(1, "b"))
+    assert list(returns._newest) == ["c", "b"]
+    assert [actor for actor, *_ in returns._running] == ["c", "b"]
 
 
 def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:
