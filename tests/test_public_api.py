@@ -238,7 +238,7 @@ def test_invalid_arguments_of_evaluate_are_refused(tmp_path: Path) -> None:
     save(tmp_path / "run", COUNTING, 1)
     with pytest.raises(ValueError, match="name either a run directory"):
         daedalus.evaluate()
-    with pytest.raises(ValueError, match="choose at least 1"):
+    with pytest.raises(ValueError, match="choose a number from 1 to"):
         daedalus.evaluate(tmp_path / "run", episodes=0)
     with pytest.raises(EnvironmentSetupError, match=r"pass allow_modules=\['counting_environment'\]"):
         daedalus.evaluate(tmp_path / "run", episodes=1)

@@ -29,6 +29,7 @@ examples:
 exit status: 0 done, 1 failed or stopped, 2 bad usage"""
 
 _EPISODES = 100  # without --video and --render
+_MOST_EPISODES = 1_000_000  # their results are held in memory
 _WIDTHS = range(16, 4097)
 
 
@@ -113,8 +114,8 @@ def check(arguments: argparse.Namespace) -> None:
         )
     if arguments.revision is not None and arguments.from_hub is None:
         raise ValueError("--revision is that of a policy on the Hub: add --from-hub USER/NAME, or leave it out")
-    if arguments.episodes < 1:
-        raise ValueError(f"--episodes is {arguments.episodes}: choose at least 1")
+    if not 1 <= arguments.episodes <= _MOST_EPISODES:
+        raise ValueError(f"--episodes is {arguments.episodes}: choose a number from 1 to {_MOST_EPISODES:,}")
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:
         raise ValueError(f"--envs is {arguments.envs}: choose a number from 1 to 4096")
     if arguments.seed is not None and arguments.seed < 0:

@@ -186,9 +186,10 @@ def main() -> int:
     try:
         listener = _listen(host, port, arguments.or_any_port)
     except OSError as error:
-        print(
-            f"daedalus gateway: cannot listen on {arguments.listen}: {os.strerror(error.errno or 0)}", file=sys.stderr
-        )
+        # socket.create_server adds the address to the reason, but not to that of a host without an address.
+        reason = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
+        text = f"cannot listen on {arguments.listen}: {reason}: choose another --listen"
+        print(f"daedalus gateway: {text}", file=sys.stderr)
         return 1
     try:
         asyncio.run(_serve(arguments, chosen, listener, stop))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from daedalus.cli.comparing.comparison import Comparison, Estimate, GroupResult
+from daedalus.cli.logs import printable
 from daedalus.protocol.texts import short_number
 
 _FEW = 5  # runs
@@ -20,7 +21,7 @@ def as_text(comparison: Comparison) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in [head, *rows]
     ]
     lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join([*lines, "", *notes(comparison)])
+    return "\n".join(printable(line) for line in [*lines, "", *notes(comparison)])
 
 
 def header(comparison: Comparison) -> list[str]:

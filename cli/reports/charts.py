@@ -1,5 +1,6 @@
 """Charts as SVG: lines with bands over env_steps or minutes, and histograms. Pure functions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -55,7 +56,7 @@ def line_chart(title: str, series: Sequence[Series], *, unit: str, colours: Sequ
 
 def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, float]], unit: str) -> Html:
     """Return a histogram of finite values, with vertical lines at named numbers."""
-    counts, edges = np.histogram(values, np.histogram_bin_edges(values, _bins(values)))
+    counts, edges = np.histogram(values, _edges(values))
     x = axis(float(edges[0]), float(edges[-1]), _LEFT, _RIGHT, count=7, whole_steps=False)
     y = axis(0.0, float(counts.max()), _BOTTOM, _TOP, count=5, whole_steps=True)
     bars = [
@@ -81,10 +82,13 @@ def histogram(title: str, values: np.ndarray, *, marks: Sequence[tuple[str, floa
     return _figure(title, text, [_grid(x, y, unit), bars, lines])
 
 
-def _bins(values: np.ndarray) -> int:
-    if np.ptp(values) == 0.0:
-        return 1
-    return int(np.clip(len(np.histogram_bin_edges(values[:100_000], "sturges")) * 2, 5, _MOST_BINS))
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Return the edges of bins that hold all values: twice as many as Sturges' rule has, or one for equal values."""
+    low, high = _extent([values])
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        margin = max(0.5, 1e-6 * abs(low))
+        return np.array([low - margin, high + margin])
+    return np.linspace(low, high, min(2 * math.ceil(math.log2(len(values)) + 2), _MOST_BINS) + 1)
 
 
 def _figure(title: str, description: str, content: Sequence[Child]) -> Html:

@@ -30,7 +30,7 @@ _TITLES = {
     "updates_skipped": "skipped updates",
 }
 _MOST_OWN = 24  # columns of the environment and of the user
-_LARGEST = 1e100  # larger numbers are left out: their distances overflow
+LARGEST = 1e100  # larger numbers are left out: their distances overflow
 
 
 def curves(groups: Sequence[Group], by: str) -> list[Html]:
@@ -84,19 +84,19 @@ def _run_series(name: str, run: RecordedRun, column: str, by: str) -> Series:
     std_x, std = points(run, _STD, by)
     spread = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))
     at, values = evaluations(run, by)
-    known = (np.abs(values) < _LARGEST) & np.isfinite(at)
+    known = (np.abs(values) < LARGEST) & np.isfinite(at)
     marks = (at[known], values[known]) if known.any() else None
     return Series(name=name, x=x, y=y, low=y - spread, high=y + spread, marks=marks)
 
 
 def _drawable(series: Series) -> Series | None:
     """Return a series without the numbers that cannot be drawn, or None if nothing is left."""
-    kept = np.isfinite(series.x) & (np.abs(series.y) < _LARGEST)
+    kept = np.isfinite(series.x) & (np.abs(series.y) < LARGEST)
     if not kept.any():
         return None
 
     def part(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else np.where(np.abs(values[kept]) < _LARGEST, values[kept], np.nan)
+        return None if values is None else np.where(np.abs(values[kept]) < LARGEST, values[kept], np.nan)
 
     low, high = part(series.low), part(series.high)
     return Series(name=series.name, x=series.x[kept], y=series.y[kept], low=low, high=high, marks=series.marks)

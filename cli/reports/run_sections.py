@@ -10,6 +10,7 @@ import numpy as np
 from daedalus.cli.comparing.grouping import text
 from daedalus.cli.reports.axes import written
 from daedalus.cli.reports.charts import histogram
+from daedalus.cli.reports.curves import LARGEST
 from daedalus.cli.reports.episodes import EpisodeStatistics, episode_statistics
 from daedalus.cli.reports.failures import failed_events, failure_counts, together
 from daedalus.cli.reports.markup import Child, Html, element, table
@@ -99,9 +100,12 @@ def _returns(record: RunRecord, statistics: EpisodeStatistics) -> Html:
     if statistics.interquartile is None:
         how = "The returns of the episodes are not recorded, so there is no histogram. Evaluate the run again with: "
         return element("p", how, element("code", record_command(record.run.directory)), class_="note")
+    returns = np.array(record.evaluation.returns)
+    if not (np.abs(returns) < LARGEST).all():
+        return element("p", "The returns are too large for a histogram.", class_="note")
     marks = [("mean", statistics.mean.value), ("interquartile mean", statistics.interquartile.value)]
     keys = [element("li", element("span", class_=f"key mark-{index}"), name) for index, (name, _) in enumerate(marks)]
-    chart = histogram("episodes by return", np.array(record.evaluation.returns), marks=marks, unit="return")
+    chart = histogram("episodes by return", returns, marks=marks, unit="return")
     return element("div", chart, element("ul", keys, class_="legend"))
 
 

@@ -55,6 +55,9 @@ def run_locally(
         if stopping.is_set():
             raise RunStoppedError from None
         raise RunFailedError(str(error)) from None
+    except KeyboardInterrupt:  # in a function of the public API
+        stopping.set()
+        raise
     finally:
         stop([gateway.process for gateway in page])  # until now it has shown the result
         trackers.finish(stopping)

@@ -107,6 +107,18 @@ def test_runs_that_cannot_be_used_are_left_out(folder: Path, capsys: pytest.Capt
     )
 
 
+def test_control_characters_of_a_run_do_not_reach_the_terminal(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, colour in enumerate(("[31mred", "[32mgreen")):
+        config = record(folder / f"run-{number}", evaluation=1.0) / "config.toml"
+        config.write_text(config.read_text().replace('"tanh"', f'"\\u001b{colour}"'))
+    assert compare(["run-0", "run-1"]) == 0
+    output = capsys.readouterr()
+    assert "\x1b" not in output.out + output.err
+    assert "activation=\\x1b[31mred" in output.out
+
+
 def test_nothing_to_compare_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(folder / "a")
     record(folder / "b", preset="acrobot")

@@ -70,4 +70,14 @@ def test_address_in_use_is_reported_in_one_line(start: Start) -> None:
         port = taken.getsockname()[1]
         gateway = start("gateway", "--connect", "tcp/127.0.0.1:1", "--listen", f"127.0.0.1:{port}")
         assert gateway.wait() == 1
-    assert gateway.lines == [f"daedalus gateway: cannot listen on 127.0.0.1:{port}: {os.strerror(errno.EADDRINUSE)}"]
+    reason = f"{os.strerror(errno.EADDRINUSE)}: choose another --listen"
+    assert gateway.lines == [f"daedalus gateway: cannot listen on 127.0.0.1:{port}: {reason}"]
+
+
+def test_host_that_cannot_be_found_is_reported_in_one_line(start: Start) -> None:
+    gateway = start("gateway", "--connect", "tcp/127.0.0.1:1", "--listen", "no.such.host.invalid:0", "--insecure")
+    assert gateway.wait() == 1
+    (line,) = gateway.lines
+    assert line.startswith("daedalus gateway: cannot listen on no.such.host.invalid:0: ")
+    assert line.endswith(": choose another --listen")
+    assert "Unknown error" not in line
