@@ -6,7 +6,6 @@ Exit status: 0 stopped by a signal, 1 failed, 2 bad usage.
 import argparse
 import asyncio
 import errno
-import os
 import re
 import socket
 import sys
@@ -186,8 +185,7 @@ def main() -> int:
     try:
         listener = _listen(host, port, arguments.or_any_port)
     except OSError as error:
-        # socket.create_server adds the address to the reason, but not to that of a host without an address.
-        reason = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
+        reason = (error.strerror or str(error)).partition(" (while attempting")[0]  # of socket.create_server
         text = f"cannot listen on {arguments.listen}: {reason}: choose another --listen"
         print(f"daedalus gateway: {text}", file=sys.stderr)
         return 1
