@@ -1,6 +1,6 @@
 """What an actor needs besides the weights to compute a gradient as the learner would: it travels in each snapshot.
 
-The numbers are among the weights of the snapshot, under a name that no parameter has. Compact snapshots have the
+The numbers are among the weights of the snapshot, under names that no parameter has. Compact snapshots have the
 precision of bfloat16: each number is therefore a sum of bfloat16 numbers, which is exact. Pure functions.
 """
 
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 NAME = "gradient_inputs"
 TARGET = "target_network/"  # followed by the name of a parameter: its value in the target network
@@ -26,15 +27,26 @@ class GradientInputs(NamedTuple):
 
 def packed(inputs: GradientInputs) -> np.ndarray:
     """Return the numbers as float32 [4, parts], each of which bfloat16 can represent."""
-    parts, rest = [], torch.tensor(inputs, dtype=torch.float64)
-    for _ in range(_PARTS):
-        parts.append(rest.to(torch.bfloat16).to(torch.float32))
-        rest = rest - parts[-1].to(torch.float64)
-    return torch.stack(parts, 1).numpy()
+    return exact(torch.tensor(inputs, dtype=torch.float64))
 
 
 def unpacked(array: np.ndarray) -> GradientInputs:
     """Return the numbers from the result of `packed`. Raises ValueError if the array is none."""
-    if array.shape != (len(GradientInputs._fields), _PARTS) or array.dtype != np.float32:
-        raise ValueError(f"{NAME} must be float32 [{len(GradientInputs._fields)}, {_PARTS}], not {array.shape}")
-    return GradientInputs(*array.astype(np.float64)[:, ::-1].sum(1).tolist())
+    return GradientInputs(*restored(array, (len(GradientInputs._fields),)).tolist())
+
+
+def exact(values: Tensor) -> np.ndarray:
+    """Return values [*shape] as float32 [*shape, parts], each of which bfloat16 can represent."""
+    parts, rest = [], values.detach().to("cpu", torch.float64)
+    for _ in range(_PARTS):
+        parts.append(rest.to(torch.bfloat16).to(torch.float32))
+        rest = rest - parts[-1].to(torch.float64)
+        rest = rest.where(rest.isfinite(), 0.0)  # the first part has what is not finite
+    return torch.stack(parts, -1).numpy()
+
+
+def restored(array: np.ndarray, shape: tuple[int, ...]) -> Tensor:
+    """Return float64 values [*shape] from the result of `exact`. Raises ValueError if the array is none."""
+    if array.shape != (*shape, _PARTS) or array.dtype != np.float32:
+        raise ValueError(f"expected float32 {[*shape, _PARTS]}, not {array.dtype} {list(array.shape)}")
+    return torch.from_numpy(array.astype(np.float64)).flip(-1).sum(-1)

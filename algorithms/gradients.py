@@ -145,9 +145,14 @@ class GradientComputer:
             values.copy_(before[name])
 
     @property
+    def own_statistics(self) -> dict[str, Tensor]:
+        """Tensors that the algorithm itself changes after an update, by name; not those of the target network."""
+        return {f"algorithm/{name}": values for name, values in self._algorithm.statistics.items()}
+
+    @property
     def statistics(self) -> dict[str, Tensor]:
         """Tensors of the algorithm that a checkpoint saves, by name, and restores in place."""
-        statistics = {f"algorithm/{name}": values for name, values in self._algorithm.statistics.items()}
+        statistics = self.own_statistics
         if self._algorithm.record.target_network:
             statistics["target_network"] = self.forward.target_values
         return statistics

@@ -11,7 +11,7 @@ from daedalus.algorithms.action_counts import ActionCounts
 from daedalus.algorithms.batch import BatchAssembler
 from daedalus.algorithms.diagnostics import BATCH_METRICS, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
-from daedalus.algorithms.gradient_inputs import TARGET, unpacked
+from daedalus.algorithms.gradient_inputs import TARGET, restored, unpacked
 from daedalus.algorithms.gradients import GradientComputer
 from daedalus.algorithms.normalization import Moments, ObservationStatistics, RewardNormalizer
 from daedalus.policy.acting.errors import PolicyError
@@ -62,13 +62,17 @@ class RolloutGradients:
                 raise PolicyError(
                     f"weights {name!r} are {weights[name].shape}, the network requires {tuple(parameter.shape)}"
                 )
+        statistics = self._computer.own_statistics
         try:
             inputs = unpacked(weights[GRADIENT_INPUTS])
+            given = {name: restored(weights[name], tuple(values.shape)) for name, values in statistics.items()}
         except (KeyError, ValueError) as error:
             raise PolicyError(f"the snapshot has no numbers to compute gradients with: {error}") from None
         with torch.no_grad():
             for name, parameter in self._loaded.items():
                 parameter.copy_(torch.from_numpy(weights[name].copy()))
+            for name, values in statistics.items():
+                values.copy_(given[name])
         self._entropy_bonus = inputs.entropy_bonus
         if self._rewards is not None:
             moments = self._rewards.moments

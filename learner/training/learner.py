@@ -10,7 +10,7 @@ from torch import Tensor
 from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.diagnostics import FirstPass, batch_metrics, diagnostics
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
-from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, packed
+from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, exact, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
 from daedalus.learner.ranks.leader import ONE_PROCESS, Distribution
@@ -231,6 +231,7 @@ class Learner:
             count, mean, squares = float(moments.count), float(moments.mean), float(moments.squares)
         target = self._gradients.forward.target_parameters
         inputs = {TARGET + name: values.cpu().numpy() for name, values in target.items()}
+        inputs |= {name: exact(values) for name, values in self._gradients.own_statistics.items()}
         inputs[GRADIENT_INPUTS] = packed(GradientInputs(self.entropy_bonus(progress), count, mean, squares))
         return inputs
 

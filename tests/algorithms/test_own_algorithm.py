@@ -6,15 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from building import POLICY, RECURRENT, SPACES, make_rollouts, run_spec
+from building import POLICY, RECURRENT, SPACES, identity, make_rollout, make_rollouts, run_spec
 
 from daedalus.algorithms.errors import AlgorithmError
+from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.settings_arguments import choose_run, learner_parser
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
+from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
+from daedalus.protocol.compact import bfloat16, float32
 from daedalus.protocol.spec import PolicySpec, RunSpec, TrainingSpec
 
 MODULE = "own_algorithms"
@@ -85,6 +88,27 @@ class Counting(A3c):
     def after_update(self, policy_version, forward):
         self.statistics["updates"] += 1
         assert self.statistics["updates"] == policy_version
+
+class Adaptive(A3c):
+    record = AlgorithmRecord(synchronous=True)
+
+    def __init__(self, spec, distribution):
+        super().__init__(spec, distribution)
+        self.statistics = {
+            "weight": torch.tensor([1.0, torch.inf]),
+            "updates": torch.tensor(1_000_000),
+            "odd": torch.tensor(False),
+        }
+
+    def losses(self, batch, forward):
+        weight = self.statistics["weight"][0] * (self.statistics["updates"] % 3) + self.statistics["odd"]
+        for losses in super().losses(batch, forward):
+            yield losses._replace(policy_loss=losses.policy_loss * weight)
+
+    def after_update(self, policy_version, forward):
+        self.statistics["weight"].mul_(1.0 / 3.0)
+        self.statistics["updates"].add_(1)
+        self.statistics["odd"].logical_not_()
 
 class FaultyAfter(A3c):
     def after_update(self, policy_version, forward):
@@ -183,6 +207,27 @@ def test_what_follows_an_update_is_saved_and_restored(modules: UserModules) -> N
     second.restore(3, {name: values.copy() for name, values in first.weights().items()}, state)
     second.step(make_rollouts(9), 0.0)
     assert float(second.state()["algorithm/updates"]) == 4.0
+
+
+def test_actors_that_compute_gradients_have_the_statistics_of_the_learner(modules: UserModules) -> None:
+    """Also with compact snapshots, which are rounded."""
+    spec = resolved(modules, "Adaptive")
+    collection = spec.collection.model_copy(update={"upload": "gradients"})
+    spec = RunSpec.model_validate({**spec.model_dump(), "collection": collection.model_dump()})
+    by_rollouts, by_gradients = (Learner(spec.training, POLICY, SPACES, modules) for _ in range(2))
+    actor = RolloutGradients(spec, SPACES, modules)
+    for sequence in range(4):
+        inputs = float32(bfloat16(by_gradients.gradient_inputs(0.0)))
+        actor.load({name: values.copy() for name, values in by_gradients.weights().items()} | inputs)
+        rollout = make_rollout(identity(sequence=sequence), seed=sequence)
+        by_gradients.apply([actor.compute(rollout)], 0.0)
+        by_rollouts.step([rollout], 0.0)
+        for name, values in by_rollouts.weights().items():
+            assert np.array_equal(by_gradients.weights()[name], values), name
+    missing = {**by_gradients.weights(), **by_gradients.gradient_inputs(0.0)}
+    del missing["algorithm/weight"]
+    with pytest.raises(PolicyError, match="no numbers to compute gradients with: 'algorithm/weight'"):
+        actor.load(missing)
 
 
 def test_the_run_directory_holds_the_settings_and_not_the_record(modules: UserModules, tmp_path: Path) -> None:
