@@ -2,8 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
 
+from daedalus.cli.command_table import COMMANDS
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, interrupts_held
 
 USAGE = """\
@@ -57,126 +57,21 @@ def _run() -> int:
         print(f"daedalus {__version__}")
         return 0
     command, rest = arguments[0], arguments[1:]
-    if command in _MODULES:
-        line = [sys.executable, "-P", "-m", _MODULES[command], *rest]
-        if sys.platform == "win32" or not hasattr(os, "execv"):  # Windows would return to the shell at once
-            import subprocess
-
-            return subprocess.run(line, check=False).returncode
-        # The command replaces this process, so signals reach it and its exit status is returned.
-        with interrupts_held():
-            os.execv(sys.executable, line)
-    if command not in _COMMANDS:
+    if command not in COMMANDS:
         import difflib
 
-        near = difflib.get_close_matches(command, [*_MODULES, *_COMMANDS], 1, 0.5)
+        near = difflib.get_close_matches(command, COMMANDS, 1, 0.5)
         hint = f"did you mean {near[0]}?" if near else "`daedalus --help` lists the commands"
         print(f"daedalus: unknown command {command!r}: {hint}", file=sys.stderr)
         return 2
-    exit_on_thread_exceptions()
-    return _COMMANDS[command](rest)
+    if COMMANDS[command].function:
+        exit_on_thread_exceptions()
+        return COMMANDS[command].run(rest)
+    line = [sys.executable, "-P", "-m", f"daedalus.cli.commands.{command}", *rest]
+    if sys.platform == "win32" or not hasattr(os, "execv"):  # Windows would return to the shell at once
+        import subprocess
 
-
-_MODULES = {name: f"daedalus.cli.commands.{name}" for name in ("learner", "actor", "evaluate", "gateway")}
-
-
-def _train(arguments: list[str]) -> int:
-    from daedalus.cli.commands.train import train
-
-    return train(arguments)
-
-
-def _resume(arguments: list[str]) -> int:
-    from daedalus.cli.commands.train import resume
-
-    return resume(arguments)
-
-
-def _sweep(arguments: list[str]) -> int:
-    from daedalus.cli.commands.sweep import sweep
-
-    return sweep(arguments)
-
-
-def _check(arguments: list[str]) -> int:
-    from daedalus.cli.commands.check import check
-
-    return check(arguments)
-
-
-def _status(arguments: list[str]) -> int:
-    from daedalus.cli.commands.status import status
-
-    return status(arguments)
-
-
-def _drain(arguments: list[str]) -> int:
-    from daedalus.cli.commands.drain import drain
-
-    return drain(arguments)
-
-
-def _router(arguments: list[str]) -> int:
-    from daedalus.cli.commands.router import router
-
-    return router(arguments)
-
-
-def _exporter(arguments: list[str]) -> int:
-    from daedalus.cli.commands.exporter import exporter
-
-    return exporter(arguments)
-
-
-def _plot(arguments: list[str]) -> int:
-    from daedalus.cli.commands.plot import plot
-
-    return plot(arguments)
-
-
-def _compare(arguments: list[str]) -> int:
-    from daedalus.cli.commands.compare import compare
-
-    return compare(arguments)
-
-
-def _report(arguments: list[str]) -> int:
-    from daedalus.cli.commands.report import report
-
-    return report(arguments)
-
-
-def _push(arguments: list[str]) -> int:
-    from daedalus.cli.commands.push import push
-
-    return push(arguments)
-
-
-def _certs(arguments: list[str]) -> int:
-    from daedalus.cli.commands.certs import certs
-
-    return certs(arguments)
-
-
-def _completion(arguments: list[str]) -> int:
-    from daedalus.cli.commands.completion import completion
-
-    return completion(arguments)
-
-
-_COMMANDS: dict[str, Callable[[list[str]], int]] = {
-    "train": _train,
-    "resume": _resume,
-    "sweep": _sweep,
-    "check": _check,
-    "router": _router,
-    "status": _status,
-    "drain": _drain,
-    "exporter": _exporter,
-    "plot": _plot,
-    "compare": _compare,
-    "report": _report,
-    "push": _push,
-    "certs": _certs,
-    "completion": _completion,
-}
+        return subprocess.run(line, check=False).returncode
+    # The command replaces this process, so signals reach it and its exit status is returned.
+    with interrupts_held():
+        os.execv(sys.executable, line)

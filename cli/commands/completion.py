@@ -1,12 +1,12 @@
 """`daedalus completion`: print a script that completes the command line of `daedalus` in a shell."""
 
 import argparse
-import importlib
 from pathlib import Path
 
 import shtab
 
 from daedalus.cli.arguments import command_parser
+from daedalus.cli.command_table import COMMANDS
 from daedalus.learner.run.settings import preset_names
 from daedalus.protocol.algorithms import ALGORITHMS
 
@@ -17,28 +17,6 @@ examples:
   daedalus completion bash > ~/.local/share/bash-completion/completions/daedalus
   daedalus completion zsh > ~/.zfunc/_daedalus      (with fpath+=~/.zfunc before compinit in ~/.zshrc)
   daedalus completion tcsh > ~/.daedalus.completion.csh      (source it in ~/.tcshrc)"""
-
-# Module in cli and function of the parser of each command. Only this command imports all of them.
-_PARSERS = {
-    "train": ("commands.train", "train_parser"),
-    "resume": ("commands.train", "resume_parser"),
-    "sweep": ("commands.sweep", "parser"),
-    "check": ("commands.check", "parser"),
-    "learner": ("settings_arguments", "learner_parser"),
-    "actor": ("commands.actor_arguments", "parser"),
-    "router": ("commands.router", "parser"),
-    "status": ("commands.status", "parser"),
-    "drain": ("commands.drain", "parser"),
-    "gateway": ("commands.gateway", "parser"),
-    "exporter": ("commands.exporter", "parser"),
-    "certs": ("commands.certs", "parser"),
-    "evaluate": ("commands.evaluate_arguments", "parser"),
-    "plot": ("commands.plot", "parser"),
-    "compare": ("commands.compare", "parser"),
-    "report": ("commands.report", "parser"),
-    "push": ("commands.push", "parser"),
-    "completion": ("commands.completion", "parser"),
-}
 
 
 def parser() -> argparse.ArgumentParser:
@@ -59,8 +37,8 @@ def command_tree() -> argparse.ArgumentParser:
     """Return one parser of all commands, for completion only: its choices are not those of the commands."""
     root = argparse.ArgumentParser(prog="daedalus")
     commands = root.add_subparsers(metavar="COMMAND")
-    for name, (module, function) in _PARSERS.items():
-        command = getattr(importlib.import_module(f"daedalus.cli.{module}"), function)()
+    for name, entry in COMMANDS.items():
+        command = entry.make_parser()
         summary = " ".join((command.description or "").split()).partition(". ")[0].removesuffix(".")
         tree = commands.add_parser(name, parents=[command], add_help=False, help=summary)
         for action in tree._actions:

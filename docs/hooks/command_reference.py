@@ -8,51 +8,9 @@ import os
 from typing import Any
 from unittest.mock import patch
 
-from daedalus.cli.commands import (
-    certs,
-    check,
-    compare,
-    completion,
-    drain,
-    exporter,
-    gateway,
-    plot,
-    push,
-    report,
-    router,
-    status,
-    sweep,
-    train,
-)
-from daedalus.cli.commands.actor_arguments import parser as actor_parser
-from daedalus.cli.commands.evaluate_arguments import parser as evaluate_parser
-from daedalus.cli.settings_arguments import learner_parser
+from daedalus.cli.command_table import COMMANDS
 
 MARKER = "<!-- commands -->"
-
-
-def parsers() -> dict[str, argparse.ArgumentParser]:
-    """Return the parser of every command, in the order of `daedalus --help`."""
-    return {
-        "train": train.train_parser(),
-        "resume": train.resume_parser(),
-        "sweep": sweep.parser(),
-        "check": check.parser(),
-        "learner": learner_parser(),
-        "actor": actor_parser(),
-        "router": router.parser(),
-        "status": status.parser(),
-        "drain": drain.parser(),
-        "gateway": gateway.parser(),
-        "exporter": exporter.parser(),
-        "certs": certs.parser(),
-        "evaluate": evaluate_parser(),
-        "plot": plot.parser(),
-        "compare": compare.parser(),
-        "report": report.parser(),
-        "push": push.parser(),
-        "completion": completion.parser(),
-    }
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -63,7 +21,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def command_sections() -> str:
     """Return the reference as Markdown: a heading and the help text for each command and its verbs."""
     with patch.dict(os.environ, COLUMNS="100", NO_COLOR="1"):
-        return "\n\n".join(_section(parser, 2) for parser in parsers().values())
+        return "\n\n".join(_section(command.make_parser(), 2) for command in COMMANDS.values())
 
 
 def _section(parser: argparse.ArgumentParser, level: int) -> str:

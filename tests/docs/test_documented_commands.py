@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from pages import PAGES, ROOT, code_blocks, hook, inline_code, name_of
+from pages import PAGES, ROOT, code_blocks, inline_code, name_of
 
+from daedalus.cli.command_table import COMMANDS
 from daedalus.cli.commands import actor_arguments, evaluate_arguments
 from daedalus.cli.settings_arguments import resolve
 from daedalus.learner.run.settings import SettingsError
@@ -43,13 +44,13 @@ def alternatives(command: str) -> list[str]:
 def parse(words: Sequence[str], *, whole: bool) -> argparse.Namespace:
     """Return the parsed command line. Unless it is `whole`, it may lack required arguments."""
     command, *arguments = words
-    parsers: dict[str, argparse.ArgumentParser] = hook("command_reference").parsers()
-    assert command in parsers, f"`daedalus {command}`: there is no such command"
-    for action in parsers[command]._actions:
+    assert command in COMMANDS, f"`daedalus {command}`: there is no such command"
+    parser = COMMANDS[command].make_parser()
+    for action in parser._actions:
         action.required = action.required and whole
-    for group in parsers[command]._mutually_exclusive_groups:
+    for group in parser._mutually_exclusive_groups:
         group.required = group.required and whole
-    return parsers[command].parse_args(arguments)
+    return parser.parse_args(arguments)
 
 
 def check(words: Sequence[str], *, whole: bool = True) -> None:
@@ -83,7 +84,7 @@ def test_commands_are_ones_that_we_take(page: Path) -> None:
 
 def test_the_pages_show_every_command() -> None:
     shown = {words[0] for page in PAGES for words in commands_in_blocks(page.read_text("utf-8"))}
-    assert shown == set(hook("command_reference").parsers())
+    assert shown == COMMANDS.keys()
 
 
 def test_a_wrong_command_is_noticed() -> None:
