@@ -65,7 +65,8 @@ def check_program(model: bytes, is_input: Callable[[str], bool]) -> None:
                 raise PolicyError(f"the program computes {node.operator} from constants alone, which is not allowed")
             nodes += 1
     if nodes > MAX_NODES:
-        raise PolicyError(f"the program has {nodes} nodes, the limit is {MAX_NODES}")
+        remedy = "declare one MultiDiscrete or Box in place of many components, or take a network of fewer layers"
+        raise PolicyError(f"the program has {nodes} nodes, the limit is {MAX_NODES}: {remedy}")
 
 
 class _Node(NamedTuple):

@@ -5,11 +5,12 @@ several components takes a map of them.
 """
 
 import math
-from itertools import accumulate, chain
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.choices import variables_and_values
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
 from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
 from daedalus.policy.network.errors import NetworkError
@@ -35,6 +36,12 @@ class FlatEncoder(nn.Module):
         self.layers = Perceptron(sum(_width(space) for space in spaces.values()), spec.hidden, spec.activation)
         self.features = self.layers.features
         self._first_columns = _first_columns(spaces)
+        # No buffers: they would become inputs of the exported program.
+        self._choices = {
+            name: variables_and_values(space.counts)
+            for name, space in spaces.items()
+            if isinstance(space, DiscreteSpace)
+        }
 
     def forward(self, observations: Observations) -> Tensor:
         """Encode observations."""
@@ -42,8 +49,19 @@ class FlatEncoder(nn.Module):
             choices = torch.cat([observations[name] for name in self._spaces], -1)
             if self.layers.learns_fast(choices):
                 return self.layers.of_choices(choices + self._first_columns)
-        parts = [_flat(observations[name], space) for name, space in self._spaces.items()]
+        parts = [self._inputs(name, observations[name]) for name in self._spaces]
         return self.layers(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
+
+    def _inputs(self, name: str, observations: Tensor) -> Tensor:
+        """Return the inputs of the layers [N, width] float32 for one component."""
+        space = self._spaces[name]
+        if isinstance(space, ArraySpace):
+            return _numbers(observations)
+        variables, values = (each.to(observations.device) for each in self._choices[name])
+        # Of one variable nothing is selected, which would take longer than the comparison.
+        chosen = observations if space.size == 1 else observations.index_select(-1, variables)
+        # Comparisons, because torch's one_hot reads the values, which a recording (algorithms/recording.py) cannot.
+        return (chosen == values).to(torch.float32)
 
 
 class ArrayEncoder(nn.Module):
@@ -145,15 +163,11 @@ def _first_columns(spaces: ObservationSpaces) -> Tensor | None:
     counts = [space.counts for space in spaces.values() if isinstance(space, DiscreteSpace)]
     if len(counts) < len(spaces):
         return None
-    return torch.tensor([0, *accumulate(chain.from_iterable(counts))][:-1])
+    _, values = variables_and_values(tuple(chain.from_iterable(counts)))
+    return torch.nonzero(values == 0).squeeze(-1)
 
 
-def _flat(observations: Tensor, space: ArraySpace | DiscreteSpace) -> Tensor:
-    """Return the inputs of a perceptron [N, width] float32."""
-    if isinstance(space, ArraySpace):
-        flat = observations.flatten(1)
-        return flat if flat.dtype == torch.float32 else flat.to(torch.float32) * (1.0 / 255.0)
-    # Comparisons, because torch's one_hot reads the values, which a recording (algorithms/recording.py) cannot.
-    choices = (torch.arange(count, device=observations.device) for count in space.counts)
-    hot = [observations[:, index : index + 1] == each for index, each in enumerate(choices)]
-    return torch.cat(hot, -1).to(torch.float32)
+def _numbers(observations: Tensor) -> Tensor:
+    """Return the inputs of a perceptron [N, width] float32 for arrays."""
+    flat = observations.flatten(1)
+    return flat if flat.dtype == torch.float32 else flat.to(torch.float32) * (1.0 / 255.0)

@@ -129,7 +129,7 @@ def constant_observations() -> onnx.ModelProto:
         (heavy_constant(), "Einsum from constants alone"),
         (heavy_constant_of_a_shape(), "Einsum from constants alone"),
         (constant_observations(), "constants in place of its inputs"),
-        (model([COPY] * 4997), "5000 nodes, the limit is 4096"),
+        (model([COPY] * 4997), "5000 nodes, the limit is 4096: declare one MultiDiscrete or Box in place of many"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

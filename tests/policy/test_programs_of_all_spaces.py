@@ -163,3 +163,21 @@ def test_bounded_distributions_stay_within_their_bounds_in_the_program(distribut
         choice = runtime.act(seen, np.zeros((ROWS, 0), np.float32), noise, {})
         assert np.abs(choice.actions["b"]).max() <= 1.0
         assert np.isfinite(choice.log_probs).all()
+
+
+@pytest.mark.parametrize("counts", [(2,) * 4096, (3, 2) * 350, (65_536,), (64,) * 1024])
+def test_program_of_the_largest_discrete_observations_acts_as_torch_does(counts: tuple[int, ...]) -> None:
+    spaces = Spaces(
+        observations={"a": DiscreteSpace(counts=counts), "b": ArraySpace(shape=(3,), dtype="float32")},
+        actions={"c": DiscreteSpace(counts=(4,))},
+    )
+    spec = PolicySpec(hidden=(8,))
+    network, weights = built(spec, spaces)
+    random = np.random.default_rng(1)
+    seen, choices = observe(spaces, random), []
+    runtimes = OnnxRuntime(export_program(network, spaces)), TorchRuntime(spec, spaces)
+    noise = draw_noise(runtimes[0].noise_size, ROWS, random)
+    for runtime in runtimes:
+        runtime.load(weights)
+        choices.append(runtime.act(seen, np.zeros((ROWS, 0), np.float32), noise, {}))
+    assert_same(spaces, *choices)

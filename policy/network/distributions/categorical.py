@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from daedalus.policy.network.choices import variables_and_values
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.protocol.spaces import DiscreteSpace
 
@@ -68,11 +69,9 @@ def _entropy(log_probs: Tensor) -> Tensor:
 
 def _padded(counts: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """Return, for each variable and choice, its index among all choices [D * A], and where there is none [D, A]."""
-    most, first = max(counts), 0
-    columns = torch.zeros((len(counts), most), dtype=torch.int64)
-    missing = torch.ones((len(counts), most), dtype=torch.bool)
-    for variable, count in enumerate(counts):
-        columns[variable, :count] = torch.arange(first, first + count)
-        missing[variable, :count] = False
-        first += count
+    variables, values = variables_and_values(counts)
+    columns = torch.zeros((len(counts), max(counts)), dtype=torch.int64)
+    missing = torch.ones_like(columns, dtype=torch.bool)
+    columns[variables, values] = torch.arange(len(variables))
+    missing[variables, values] = False
     return columns.flatten(), missing
