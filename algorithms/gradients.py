@@ -85,12 +85,21 @@ class GradientComputer:
                 shares = losses.shares
             self.parameters.gradients.copy_(gradient)
             terms = Terms(*each)
-            yield terms if batch.share is None else self._over_ranks(batch.share, terms, shares)
+            if batch.share is not None:
+                terms, _ = self._over_ranks(batch.share, terms, shares)
+            yield terms
         if batch.share is not None:
-            for _ in range(updates, batch.share.updates):  # an algorithm of the user makes fewer here than elsewhere
-                self.parameters.gradients.zero_()
-                none = batch.valid.new_zeros(1)
-                yield self._over_ranks(batch.share, Terms(none[0], none[0], none[0], none[0]), none)
+            yield from self._of_other_ranks(batch.share, batch.share.updates - updates)
+
+    def _of_other_ranks(self, share: Share, most: int) -> Iterator[Terms]:
+        """Take part in the updates that an algorithm of the user makes on other ranks only, until it makes none."""
+        none = share.valid.new_zeros(1)
+        for _ in range(most):
+            self.parameters.gradients.zero_()
+            terms, makers = self._over_ranks(share, Terms(*none.expand(len(Terms._fields))), none, makes_update=False)
+            if not makers:
+                return
+            yield terms
 
     def _of_minibatch(self, losses: MinibatchLosses, bonus: Tensor, *, record: bool) -> tuple[Tensor, ...]:
         """Return the gradient [P] and the terms of the losses of a minibatch, by a recording if it is worth one."""
@@ -114,17 +123,22 @@ class GradientComputer:
         terms = Terms(losses.policy_loss.detach(), value_term.detach(), entropy.detach(), clipped)
         return self.parameters.differentiated(loss), *terms
 
-    def _over_ranks(self, share: Share, terms: Terms, shares: Tensor) -> Terms:
-        """Replace the gradient of this rank by the mean over all ranks, and return the means of the terms.
+    def _over_ranks(
+        self, share: Share, terms: Terms, shares: Tensor, *, makes_update: bool = True
+    ) -> tuple[Terms, Tensor]:
+        """Replace the gradient of this rank by the mean over all ranks.
 
         A rank counts by its rows to learn from, so that the result is that of the whole batch.
+
+        Returns: the means of the terms, and the number of ranks that make the update.
         """
         number = (shares > 0.0).sum().to(torch.float32)
-        *sums, total = share.ranks.sum(torch.stack([*terms, torch.ones_like(number)]) * number)
+        counts = [number, torch.full_like(number, makes_update)]
+        *sums, total, makers = share.ranks.sum(torch.stack([*(each * number for each in terms), *counts]))
         total = total.clamp(min=1.0)
         self.parameters.gradients.mul_(number / total)
         self.parameters.gradients.copy_(share.ranks.sum(self.parameters.gradients))
-        return Terms(*(each / total for each in sums))
+        return Terms(*(each / total for each in sums)), makers
 
     def take_first_pass(self) -> FirstPass | None:
         """Return the first pass of the newest batch, once; None without a batch since the last call.

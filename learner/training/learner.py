@@ -96,6 +96,7 @@ class Learner:
 
         If the gradient of an update is not finite, the update is repeated without the rollouts at fault. If no rollout
         is at fault, or all are, the remaining updates of the batch are skipped: new versions with unchanged parameters.
+        An algorithm that makes fewer updates than expected skips none; the version is the same in all cases.
 
         Args:
           rollouts: the rollouts of the batch, in order.
@@ -140,6 +141,7 @@ class Learner:
                 return False
             if self.policy_version == end:
                 break
+        self.policy_version = end  # an algorithm of the user may stop early
         self.first_pass = self._gradients.take_first_pass()
         return True
 

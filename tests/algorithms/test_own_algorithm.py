@@ -89,6 +89,15 @@ class Counting(A3c):
         self.statistics["updates"] += 1
         assert self.statistics["updates"] == policy_version
 
+class Stopping(Appo):
+    record = AlgorithmRecord(passes_over_batch=True)
+
+    def losses(self, batch, forward):
+        for index, losses in enumerate(super().losses(batch, forward)):
+            if index == 2 and batch.rewards.any():  # not in the trial before the run
+                return
+            yield losses
+
 class Adaptive(A3c):
     record = AlgorithmRecord(synchronous=True)
 
@@ -195,6 +204,17 @@ def test_a_fault_is_reported_in_one_line_before_the_run(modules: UserModules, na
         Learner(TrainingSpec(algorithm=name), POLICY, SPACES, modules)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_an_algorithm_may_stop_its_passes_early(modules: UserModules) -> None:
+    """Such as at a KL bound. The actors expect the versions of the whole batch; no gradient was at fault."""
+    learner = Learner(resolved(modules, "Stopping", passes=2, minibatches=3).training, POLICY, SPACES, modules)
+    for version in (6, 12):
+        before = {name: values.copy() for name, values in learner.weights().items()}
+        assert learner.step(make_rollouts(version), 0.0) == []
+        assert (learner.policy_version, learner.updates_skipped) == (version, 0)
+        assert any(not np.array_equal(values, before[name]) for name, values in learner.weights().items())
+        assert learner.take_diagnostics()
 
 
 def test_what_follows_an_update_is_saved_and_restored(modules: UserModules) -> None:

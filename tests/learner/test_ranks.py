@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from ranked import assert_equal_state, ranked_learner, spec_of
 from torch import Tensor
 from torch.testing import assert_close
 
-from daedalus.algorithms.algorithm import Algorithm, Forward, Losses
+from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchLosses
+from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
 from daedalus.learner.ranks import leader
@@ -181,6 +183,35 @@ def test_an_algorithm_that_makes_fewer_updates_on_some_ranks_does_not_hang() -> 
         learner.step(make_rollouts(2, state_size=5), 0.0)
     assert learner.policy_version == 2 * 2 * ENVIRONMENTS
     assert_equal_state(learner, ranks)
+
+
+class TwoUpdates(Appo):
+    """Stops its passes early."""
+
+    record = AlgorithmRecord(passes_over_batch=True)
+
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[MinibatchLosses]:
+        return islice(super().losses(batch, forward), 2 if batch.rewards.any() else None)  # all in the trial
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_no_rank_makes_updates_after_an_algorithm_has_stopped_early(number: int) -> None:
+    """Those with a gradient of 0 would still move the parameters, by the momentum of the optimiser."""
+    name, modules = f"{__name__}:TwoUpdates", UserModules(frozenset({__name__}))
+    settings = steadily(minibatches=2)
+    one_pass = spec_of(POLICY, **settings, algorithm="appo", passes=1)
+    alone = Learner(one_pass.training, POLICY, SPACES)
+    for step in range(STEPS):
+        alone.step(make_rollouts(step), 0.0)
+    record = TwoUpdates.record.model_dump()
+    spec = spec_of(POLICY, **settings, algorithm=name, algorithm_record=record, passes=3)
+    with ranked_learner(number, spec, SPACES, modules) as (learner, ranks):
+        for step in range(STEPS):
+            learner.step(make_rollouts(step), 0.0)
+    assert (learner.policy_version, learner.updates_skipped) == (STEPS * 6, 0)
+    assert_equal_state(learner, ranks)
+    for name, values in learner.weights().items():
+        assert_close(torch.from_numpy(values), torch.from_numpy(alone.weights()[name]), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 16])
