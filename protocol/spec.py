@@ -230,7 +230,8 @@ class TrainingSpec(Specification):
     """Divide rewards by the running standard deviation of the discounted return, or by a fifth of its mean if that is
     larger, so that values are near one."""
     normalize_advantages: bool = False
-    """Scale the advantages of each batch to mean 0 and standard deviation 1."""
+    """Scale the advantages of each batch to mean 0 and standard deviation 1. With `collection.upload=gradients`, each
+    actor scales those of each rollout."""
 
     optimizer: Literal["adam", "rmsprop"] = "adam"
     """Optimiser of the network's parameters."""
