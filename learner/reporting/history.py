@@ -6,11 +6,10 @@ from itertools import islice
 
 import numpy as np
 
-from daedalus.learner.reporting.metrics import COLUMNS, GROUPS
+from daedalus.learner.reporting.metrics import COLUMNS, GROUPS, MAX_COLUMNS
 from daedalus.protocol.metrics import MAX_PAGE_VALUES, MetricsPage, MetricsReport
 
 MAX_ROWS = 2000  # that are kept
-_MAX_COLUMNS = 1024  # in one page; a program of the user's may name a new metric in every row
 
 _ORDER = {name: place for place, name in enumerate(COLUMNS)}
 _EVALUATION = GROUPS["evaluation"]
@@ -50,7 +49,7 @@ class MetricsHistory:
         """Return the rows from number `first` on, as many as a page may have."""
         with self._lock:
             found = {number: row for number, row in self._rows.items() if number >= first}
-        columns = sorted({name for row in found.values() for name in row}, key=_place)[:_MAX_COLUMNS]
+        columns = sorted({name for row in found.values() for name in row}, key=_place)[:MAX_COLUMNS]
         numbers = list(islice(found, MAX_PAGE_VALUES // max(len(columns), 1)))
         values = np.array([[found[number].get(name, np.nan) for name in columns] for number in numbers], np.float64)
         return MetricsReport(

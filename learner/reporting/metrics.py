@@ -54,6 +54,7 @@ COLUMNS = tuple(name for names in GROUPS.values() for name in names)
 # Prefixes of columns that a run adds to COLUMNS.
 ENV = "env/"  # scalars of the environment's info
 USER = "user/"  # metrics of the program that started the run
+MAX_COLUMNS = 1024  # that are read; a program of the user's may name a new metric in every row
 
 
 def tag(column: str) -> str:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-_MAX_COLUMNS = 256
+from daedalus.learner.reporting.metrics import MAX_COLUMNS
 
 
 def read_rows(path: Path) -> Iterator[dict[str, float]]:
@@ -17,8 +17,12 @@ def read_rows(path: Path) -> Iterator[dict[str, float]]:
         lines = csv.reader(file)
         try:
             columns = next(lines, [])
-            if "env_steps" not in columns or len(columns) > _MAX_COLUMNS:
+            if "env_steps" not in columns:
                 raise ValueError(f"{path} has no column env_steps: it is not the metrics of a run")
+            if len(columns) > MAX_COLUMNS:
+                raise ValueError(
+                    f"{path} has {len(columns):,} columns, and at most {MAX_COLUMNS:,} are read: log fewer metrics"
+                )
             for cells in lines:
                 row = numbers(columns, cells)
                 if "env_steps" in row:

@@ -116,3 +116,17 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     path.write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="not the metrics of a run"):
         list(read_rows(path))
+
+
+def test_as_many_columns_are_read_as_are_shown(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    for number in (1024, 1025):
+        row = {"env_steps": 1.0, **{f"user/{index}": 1.0 for index in range(number - 1)}}
+        path.write_text(f"{','.join(row)}\n{','.join(map(str, row.values()))}\n")
+        if number == 1024:
+            assert list(read_rows(path)) == [row]
+            history = MetricsHistory()
+            history.add(row)
+            assert history.page("r", 1, 0).values.shape == (1, 1024)
+    with pytest.raises(ValueError, match=r"metrics\.csv has 1,025 columns, and at most 1,024 are read: log fewer"):
+        list(read_rows(path))
