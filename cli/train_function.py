@@ -15,16 +15,15 @@ from typing import Any, TextIO
 
 from daedalus.cli.callbacks import Callback, observed
 from daedalus.cli.child_output import ChildOutput
-from daedalus.cli.own_algorithm import with_record
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
+from daedalus.cli.quick_check import EnvironmentProblemError
 from daedalus.cli.running.local_run import LocalRun, RunEnd, RunFailedError, UnsavedError
+from daedalus.cli.running.new_run import prepare
 from daedalus.cli.running.run_locally import run_locally
-from daedalus.cli.settings_arguments import Choice, check_processes, named_directory
+from daedalus.cli.settings_arguments import Choice, named_directory
 from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.initial import check_initial
 from daedalus.learner.run.settings import SettingsError, assign
-from daedalus.policy.user_modules import UserModules, modules_of
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -106,22 +105,14 @@ def train(
     choice = Choice(
         preset=preset, env=env, algorithm=algorithm, seed=seed, env_steps=env_steps, actors=actors, wrap=wrap
     )
-    spec = choice.spec(partial(_assign, changes=settings or {}))
-    check_processes(processes, spec)
-    directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    run_directory.check_free(directory)  # before the environment is made
+    resolved = partial(choice.spec, partial(_assign, changes=settings or {}))
     weights = None if init_from is None else Path(init_from)
     check_initial(weights)
+    if run_dir is not None:
+        run_directory.check_free(Path(run_dir))  # before the environment is made
     with _checking(quiet):
-        if env is None:
-            spaces = checked_spaces(spec)
-        else:
-            spaces, defaults = checked_defaults(spec)
-            chosen = choice.spec(partial(_assign, changes=settings or {}), defaults)
-            spaces, spec = transformed_spaces(chosen, spec, spaces), chosen
-    if env is not None:
-        directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
-    spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
+        spec, spaces = prepare(resolved, env=env, processes=int(processes))
+    directory = named_directory(preset, spec) if run_dir is None else Path(run_dir)
     with (
         run_directory.create_locked(directory, spec, numbered=run_dir is None, init_from=weights) as lock,
         observed(callback, lock.directory) as (observer, control),

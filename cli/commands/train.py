@@ -3,6 +3,7 @@
 import argparse
 import signal
 import sys
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
 from daedalus.cli.logs import add_logging, configure_logging
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
-from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces, transformed_spaces
+from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
 from daedalus.cli.run_report import report, show
 from daedalus.cli.running.local_run import (
     LocalRun,
@@ -29,9 +30,17 @@ from daedalus.cli.running.local_run import (
     UnsavedError,
     resume_command,
 )
+from daedalus.cli.running.new_run import prepare
 from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.running.run_observer import RunObserver
-from daedalus.cli.settings_arguments import add_log, add_new_run, add_settings, check_processes, resolve
+from daedalus.cli.settings_arguments import (
+    add_log,
+    add_new_run,
+    add_settings,
+    check_processes,
+    named_directory,
+    resolve_spec,
+)
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.training_display import TrainingDisplay
 from daedalus.learner.reporting.trackers.tracking_state import chosen_trackers
@@ -46,7 +55,6 @@ from daedalus.policy.user_modules import (
     ModuleNotAllowedError,
     UserModuleError,
     UserModules,
-    modules_of,
 )
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -100,19 +108,13 @@ def train(arguments: list[str]) -> int:
     try:
         _check_listening(parsed)
         _check_watching(parsed)
-        spec, directory = resolve(parsed)
         if parsed.run_dir is not None:
-            run_directory.check_free(directory)  # before the environment is made
+            run_directory.check_free(parsed.run_dir)  # before the environment is made
         check_initial(parsed.init_from)
-        if parsed.env is None:
-            spaces = checked_spaces(spec, fork=True)
-        else:
-            spaces, defaults = checked_defaults(spec, fork=True)
-            chosen, directory = resolve(parsed, defaults)
-            spaces = transformed_spaces(chosen, spec, spaces, fork=True)
-            spec = chosen
-        check_processes(parsed.processes or 1, spec)
-        spec = with_record(spec, UserModules(frozenset(modules_of(spec.user_modules))))
+        spec, spaces = prepare(
+            partial(resolve_spec, parsed), env=parsed.env, processes=parsed.processes or 1, fork=True
+        )
+        directory = parsed.run_dir or named_directory(parsed.preset, spec)
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
     except (RunInUseError, EnvironmentProblemError) as error:
         print(f"daedalus train: {error}", file=sys.stderr)

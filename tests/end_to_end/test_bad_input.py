@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from processes import Running, until
 
-from daedalus.cli import main
+from daedalus.cli.command_table import COMMANDS
 
 Start = Callable[..., Running]
 
@@ -115,7 +115,7 @@ def test_an_address_in_use_is_reported(start: Start, address: str, tmp_path: Pat
     assert not (tmp_path / "two").exists()
 
 
-@pytest.mark.parametrize("command", [*main._MODULES, *main._COMMANDS])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_examples(start: Start, command: str) -> None:
     running = start(command, "--help")
     assert running.wait() == 0
