@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector.utils import create_empty_array
 
 from daedalus.actor.environments.environment_errors import (
     OTHER_BACKEND,
@@ -23,7 +24,11 @@ _ATARI_OPTIONS = {"stack_num", "frame_skip", "gray_scale", "img_height", "img_wi
 _ATARI_SIZE = (210, 160)
 _ATARI_FRAMES = 108_000  # half an hour, as in ALE; envpool's own limit counts steps, however many frames they repeat
 
+_ALL = slice(None)
+
 Arrange = Callable[[np.ndarray], np.ndarray]
+Frames = Any  # an array [E, *frame_shape], or a map of these by component, nested as the observation space is
+Rows = np.ndarray | slice
 
 
 class EnvpoolEnvironments:
@@ -52,7 +57,7 @@ class EnvpoolEnvironments:
           options: of the pool.
           repeat: how often each action is repeated here.
           no_reward_limit: end an episode after so many steps in a row without a positive reward.
-          arrange: turns the pool's observations into frames [E, *frame_shape].
+          arrange: turns the arrays of the pool's observations into frames [E, *frame_shape].
         """
         self.count: int = options["num_envs"]
         self._make_pool = partial(envpool.make_gymnasium, name, **options)
@@ -61,14 +66,13 @@ class EnvpoolEnvironments:
             spec = envpool.make_spec(name, **options)
             self.observation_space: gymnasium.Space = _arranged(spec.gymnasium_observation_space, arrange)
             self.action_space: gymnasium.Space = spec.gymnasium_action_space
-        self._shape = (self.count, *(self.observation_space.shape or ()))
         self._arrange = arrange
         self._repeat = repeat
         self._no_reward_limit = no_reward_limit
         self._ended = np.zeros(self.count, np.bool_)
         self._unrewarded = np.zeros(self.count, np.int64)  # steps in a row
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, seed: int) -> Frames:
         """See BackendEnvironments."""
         self.close()
         with _no_warnings():
@@ -76,16 +80,18 @@ class EnvpoolEnvironments:
             observations, _ = self._pool.reset()
         self._ended[:] = False
         self._unrewarded[:] = 0
-        return self._arrange(observations)
+        frames = self._empty_frames()
+        self._write(frames, _ALL, observations, _ALL)
+        return frames
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: np.ndarray) -> tuple[Frames, np.ndarray, np.ndarray, np.ndarray]:
         """See BackendEnvironments."""
-        frames = np.empty(self._shape, self.observation_space.dtype)
+        frames = self._empty_frames()
         rewards = np.zeros(self.count)
         terminated, truncated = np.zeros((2, self.count), np.bool_)
         ended, live = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
         if len(ended):
-            frames[ended] = self._arrange(self._pool.reset(ended)[0])
+            self._write(frames, ended, self._pool.reset(ended)[0], _ALL)
         for repeats_left in reversed(range(self._repeat)):
             if not len(live):
                 break
@@ -93,7 +99,7 @@ class EnvpoolEnvironments:
             rewards[live] += earned
             terminated[live], truncated[live] = over, cut
             last = (over | cut) if repeats_left else np.ones(len(live), np.bool_)
-            frames[live[last]] = self._arrange(shown[last])
+            self._write(frames, live[last], shown, last)
             live = live[~last]
         if self._no_reward_limit is not None:
             self._unrewarded = np.where((rewards > 0.0) | self._ended, 0, self._unrewarded + 1)
@@ -102,6 +108,17 @@ class EnvpoolEnvironments:
             terminated |= ended
         self._ended = terminated | truncated
         return frames, rewards, terminated, truncated
+
+    def _empty_frames(self) -> Frames:
+        return create_empty_array(self.observation_space, self.count, np.empty)
+
+    def _write(self, frames: Frames, environments: Rows, observations: Frames, rows: Rows) -> None:
+        """Write rows of the pool's observations to the frames of these environments."""
+        if isinstance(observations, dict):
+            for name, part in observations.items():
+                self._write(frames[name], environments, part, rows)
+        else:
+            frames[environments] = self._arrange(observations[rows])
 
     def take_episode_info(self) -> dict[str, np.ndarray]:
         """See BackendEnvironments. The `info` of this backend has only numbers of its own, such as frame counts."""

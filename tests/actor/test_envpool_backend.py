@@ -3,6 +3,7 @@
 import sys
 import warnings
 from types import SimpleNamespace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments
+from daedalus.actor.environments.envpool_backend import EnvpoolEnvironments, make_envpool
 from daedalus.actor.environments.make import make_environments
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -36,18 +37,23 @@ class _OneByOne:
         self._repeat = repeat
         self._ended = [False] * count
 
-    def step(self, environment: int, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+    def step(self, environment: int, action: np.ndarray) -> tuple[Any, float, bool, bool]:
         total, frame, terminated, truncated = 0.0, None, False, False
         for _ in range(1 if self._ended[environment] else self._repeat):
             frames, rewards, over, cut, info = self._pool.step(action[None], np.array([environment], np.int32))
             assert (info["elapsed_step"][0] == 0) == self._ended[environment]
-            frame, terminated, truncated = frames[0], bool(over[0]), bool(cut[0])
+            frame, terminated, truncated = _row(frames, 0), bool(over[0]), bool(cut[0])
             total += float(rewards[0])
             if terminated or truncated:
                 break
         self._ended[environment] = terminated or truncated
         assert frame is not None
         return frame, total, terminated, truncated
+
+
+def _row(frames: Any, row: int) -> Any:
+    """Return one row of an observation, which may be a nested map of components."""
+    return {name: _row(part, row) for name, part in frames.items()} if isinstance(frames, dict) else frames[row]
 
 
 @pytest.mark.parametrize(
@@ -75,6 +81,39 @@ def test_repeated_actions_equal_single_steps(
         ends += step[2].sum(), step[3].sum()
     assert ends[1] > 0
     assert ends[0] > 0 or name == "CarRacing-v3"
+    environments.close()
+
+
+@pytest.mark.parametrize("name", ["CheetahRun-v1", "MiniGrid-Empty-5x5-v0", "Maze-v0"])
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_composite_observations_equal_single_steps(name: str, repeat: int) -> None:
+    count, limit = 3, 5
+    spec = _spec(name, action_repeat=repeat, max_episode_steps=limit)
+    bare, _ = make_envpool(spec, count)
+    oracle = _OneByOne(name, count, seed=5, repeat=repeat, limit=limit)
+    np.testing.assert_equal(bare.reset(5), oracle.first)
+    bare.action_space.seed(1)
+    ends = 0
+    for _ in range(12):
+        actions = np.stack([bare.action_space.sample() for _ in range(count)])
+        frames, _, terminated, truncated = bare.step(actions)
+        for environment, action in enumerate(actions):
+            frame, _, over, cut = oracle.step(environment, action)
+            np.testing.assert_equal(_row(frames, environment), frame)
+            assert (terminated[environment], truncated[environment]) == (over, cut)
+        ends += (terminated | truncated).sum()
+    assert ends or name == "Maze-v0"
+    bare.close()
+
+
+def test_components_of_composite_observations_are_those_of_the_pool() -> None:
+    environments = make_environments(_spec("MiniGrid-Empty-5x5-v0"), 2)
+    frames = environments.reset(1).frames
+    assert {name: values.shape for name, values in frames.items()} == {
+        "direction": (2, 1),
+        "image": (2, 7, 7, 3),
+        "mission": (2, 96),
+    }
     environments.close()
 
 
