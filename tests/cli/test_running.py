@@ -10,10 +10,12 @@ import pytest
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands import train as train_command
-from daedalus.cli.running import final_evaluation, training
+from daedalus.cli.running import final_evaluation, new_run, training
+from daedalus.cli.running import run_locally as run_locally_module
 from daedalus.cli.running.local_run import LocalRun, RunFailedError
 from daedalus.cli.running.run_locally import run_locally
 from daedalus.cli.supervisor import Supervised
+from daedalus.cli.tracking.tracker_processes import TrackerProcesses
 from daedalus.protocol.spec import RunSpec
 
 
@@ -45,6 +47,20 @@ def test_actor_that_cannot_be_started_ends_the_learner_and_the_actors_before_it(
             process.wait()
 
 
+def test_trackers_have_little_time_after_an_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stopping, seen = threading.Event(), []
+
+    def interrupted(*_: Any) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_locally_module, "train", interrupted)
+    monkeypatch.setattr(TrackerProcesses, "finish", lambda _, stop: seen.append(stop.is_set()))
+    run = LocalRun(directory=tmp_path, spec=RunSpec.model_validate({"environment": {"id": "X-v0"}}), started=0.0)
+    with pytest.raises(KeyboardInterrupt):
+        run_locally(run, stopping, ChildOutput(tmp_path / "output.log", print, print))
+    assert seen == [True]
+
+
 @pytest.mark.parametrize("reason", ["all actors failed: joint 3 is stuck", ""], ids=["a reason", "printed by a child"])
 def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], reason: str
@@ -56,7 +72,7 @@ def test_a_run_that_failed_after_a_checkpoint_says_how_to_continue_it(
         raise RunFailedError(reason)
 
     monkeypatch.setattr(train_command, "run_locally", fail)
-    monkeypatch.setattr(train_command, "checked_spaces", lambda *_, **_others: None)
+    monkeypatch.setattr(new_run, "checked_spaces", lambda *_, **_others: None)
     monkeypatch.setattr(train_command, "configure_logging", lambda *_, **_others: None)
     monkeypatch.setattr(train_command, "stop_on_signals", threading.Event)
     monkeypatch.setattr(train_command.signal, "signal", lambda *_: None)
