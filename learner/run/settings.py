@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
+from daedalus.learner.run.setting_errors import known_names, one_line, unknown_setting
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec, TrainingSpec
-from daedalus.protocol.specification import meanings
-
-_FORMS = {"environment.wrap": "module:function"}  # of settings whose description does not begin with their form
 
 
 class SettingsError(Exception):
@@ -131,8 +129,8 @@ def _check_for_algorithm(tables: Any) -> None:
             raise SettingsError(f"for_algorithm.{name} {error}") from None
         for section, values in table.items():
             for path in [[section], *([section, key] for key in values)]:
-                if path[-1] not in _known_names(path[:-1]):
-                    raise SettingsError(_unknown_setting(["for_algorithm", name, *path], path[:-1]))
+                if path[-1] not in known_names(path[:-1]):
+                    raise SettingsError(unknown_setting(["for_algorithm", name, *path], path[:-1]))
 
 
 def _assign(section: dict[str, Any], key: str, value: Any) -> None:
@@ -147,84 +145,4 @@ def run_spec(settings: dict[str, Any]) -> RunSpec:
     try:
         return RunSpec.model_validate(settings)
     except ValidationError as error:
-        raise SettingsError(_one_line(error)) from None
-
-
-def _one_line(error: ValidationError) -> str:
-    first = error.errors()[0]
-    path = [str(part) for part in first["loc"]]
-    name = ".".join(path)
-    if first["type"] == "extra_forbidden":
-        return _unknown_setting(path, path[:-1])
-    if first["type"] == "missing":
-        return f"setting {name} is missing: add it"
-    value, message = first["input"], first["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    if not name:
-        return message
-    if first["type"] == "string_too_short" and value == "":  # a NumPy array has no truth value
-        return f"setting {name} is empty"
-    if first["type"] == "tuple_type":
-        return f"setting {name} is {value!r}{_as_list(name, value)}"
-    if first["type"] == "string_pattern_mismatch":
-        hint = f": write {_FORMS[name]}" if name in _FORMS else f". {_description(path)}"
-        return f"setting {name} is {value!r}, which is not valid{hint}"
-    bounds = _bounds(path)
-    return f"setting {name} {message}, not {value!r}{f' (it must be {bounds})' if bounds else ''}"
-
-
-def _unknown_setting(path: list[str], section: list[str]) -> str:
-    known = _known_names(section)
-    near = difflib.get_close_matches(path[-1], known, 3, 0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
-    return f"unknown setting {'.'.join(path)}: {hint}"
-
-
-def _as_list(name: str, value: Any) -> str:
-    """Return why a value is not a list, and how to write one. A shell removes the quotes of texts in a list."""
-    if not isinstance(value, str):
-        return f", which is not a list: write {name}=[{value}]"
-    if value.startswith("[") and not value.endswith("]"):
-        return ": the closing bracket is missing"
-    parts = [part.strip() for part in value.strip("[]").split(",")]
-    return f', which is not a list: write --set "{name}={parts}"'
-
-
-def _description(path: list[str]) -> str:
-    """Return the description of a setting, or of the list that it is part of, in one line, or an empty string."""
-    path = [part for part in path if not part.isdigit()]
-    model = _model(path[:-1])
-    return meanings(model).get(path[-1], "") if model else ""
-
-
-def _known_names(path: list[str]) -> list[str]:
-    model = _model(path)
-    return sorted(model.model_fields) if model else []
-
-
-def _model(path: list[str]) -> type[BaseModel] | None:
-    model: Any = RunSpec
-    for part in path:
-        field = model.model_fields.get(part)
-        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
-            return None
-        model = field.annotation
-    return model
-
-
-def _bounds(path: list[str]) -> str:
-    """Return the allowed range of a setting in words, or an empty string if it has no bounds."""
-    model = _model(path[:-1])
-    field = model.model_fields.get(path[-1]) if model else None
-    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    found = []
-    for constraint in field.metadata if field else ():
-        found += [
-            f"{text} {_plain(getattr(constraint, key))}"
-            for key, text in words.items()
-            if getattr(constraint, key, None) is not None
-        ]
-    return " and ".join(found)
-
-
-def _plain(bound: float) -> str:
-    return str(bound) if isinstance(bound, int) else f"{bound:g}"
+        raise SettingsError(one_line(error)) from None

@@ -236,6 +236,45 @@ def test_value_of_wrong_type_is_refused() -> None:
     assert error_message(training=3).startswith("setting training should be")
 
 
+def test_error_of_a_setting_of_several_types_is_that_of_the_type_that_was_meant() -> None:
+    assert error_message("environment.frame_stack=0") == (
+        "setting environment.frame_stack should be greater than or equal to 1, not 0"
+    )
+    assert error_message("environment.frame_stack.camera=0") == (
+        "setting environment.frame_stack.camera should be greater than or equal to 1, not 0"
+    )
+    assert error_message("environment.frame_stack=x").startswith(
+        "setting environment.frame_stack should be a valid integer"
+    )
+
+
+@pytest.mark.parametrize("value", ["84", "[84]", "[84, 84, 3]", "84x84", "{height = 84}"])
+def test_error_of_a_list_of_fixed_length_says_the_length(value: str) -> None:
+    message = error_message(f"environment.resize={value}")
+    assert message.startswith("setting environment.resize is ")
+    assert message.endswith(
+        ": it must be a list of 2 numbers. Resize frames to (height, width); each pixel is the mean "
+        "of the area that it covers."
+    )
+
+
+@pytest.mark.parametrize(
+    ("assignment", "end"),
+    [
+        ("policy.hidden=64,32", ": write policy.hidden=[64,32]"),
+        ("training.exploration=0.1", ": write training.exploration=[0.1]"),
+        ("environment.action_table=3", "is 3, which is not a list"),
+        ("environment.action_table=[[1.0], 3]", "environment.action_table.1 is 3, which is not a list"),
+    ],
+)
+def test_example_of_a_list_is_one_that_is_accepted(assignment: str, end: str) -> None:
+    message = error_message(assignment)
+    assert message.endswith(end)
+    _, found, example = message.partition(": write ")
+    if found:
+        run_spec(settings(example))
+
+
 def test_settings_without_an_environment_are_refused() -> None:
     with pytest.raises(SettingsError, match="setting environment is missing"):
         run_spec({})
