@@ -1,6 +1,7 @@
 """Environment with a text in its observation, in a space of its own class, as MiniGrid has missions.
 
-Importing this module registers `Mission-v0`. The text is another in each episode if `missions` has several.
+Importing this module registers `Mission-v0`. The text is another in each episode if `missions` has several. With
+`text_space` the space of the text is gymnasium's Text, which has no blanks; `disconnects` makes the second step fail.
 """
 
 from typing import Any
@@ -32,8 +33,12 @@ class Mission(gymnasium.Env):
     observation_space = gym.Dict({"mission": MissionSpace(), "step": gym.Box(0.0, 4.0, (1,), np.float32)})
     action_space = gym.Discrete(2)
 
-    def __init__(self, missions: tuple[str, ...] = ("open the door",)) -> None:
-        self._missions = missions
+    def __init__(
+        self, missions: tuple[str, ...] = ("open the door",), text_space: bool = False, disconnects: bool = False
+    ) -> None:
+        self._missions, self._disconnects = missions, disconnects
+        if text_space:
+            self.observation_space = gym.Dict({**self.observation_space.spaces, "mission": gym.Text(30)})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)
@@ -42,6 +47,8 @@ class Mission(gymnasium.Env):
 
     def step(self, action: np.int64) -> tuple[dict, float, bool, bool, dict]:
         self._step += 1
+        if self._disconnects and self._step == 2:
+            raise ValueError("motor 3 is disconnected")
         return self._observe(), float(action), self._step == 4, False, {}
 
     def _observe(self) -> dict:

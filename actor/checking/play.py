@@ -16,6 +16,7 @@ from daedalus.actor.checking.texts import Texts
 from daedalus.actor.checking.vectorized import vectorized_problem
 from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
+from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line, place_of
@@ -61,8 +62,9 @@ def _check_one(
         texts = Texts(environment.observation_space, rest.leave_out)
         texts.watch(environment, seed)
         rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
+        space = without(environment.observation_space, rest.leave_out)
         transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
-        play = _Play(spec.id, environment, transforms, RandomActions(transforms.spaces.actions, seed), texts)
+        play = _Play(spec.id, environment, space, transforms, RandomActions(transforms.spaces.actions, seed), texts)
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
         return play.report()
@@ -90,11 +92,13 @@ class _Play:
         self,
         name: str,
         environment: gymnasium.Env,
+        observation_space: gymnasium.Space,
         transforms: Transforms,
         random_actions: RandomActions,
         texts: Texts,
     ) -> None:
         self._name, self._environment, self._texts = name, environment, texts
+        self._observation_space = observation_space  # without what is left out
         self._transforms, self._random_actions = transforms, random_actions
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
@@ -143,7 +147,7 @@ class _Play:
         result = self._call("reset", seed=seed)
         self._reset_seconds += time.monotonic() - began
         self._resets += 1
-        self._add(reset_violations(self._environment.observation_space, result))
+        self._add(reset_violations(self._observation_space, result))
         self._observe(result[0], result[1], over=False)
 
     def _step(self) -> tuple[float, bool]:
@@ -154,7 +158,7 @@ class _Play:
         self._busy_seconds += time.process_time() - busy
         self._step_seconds += time.monotonic() - began
         self._env_steps += 1
-        self._add(step_violations(self._environment.observation_space, result))
+        self._add(step_violations(self._observation_space, result))
         observation, reward, terminated, truncated, info = result
         over = bool(terminated or truncated)
         self._observe(observation, info, over=over)

@@ -10,18 +10,21 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from daedalus.actor.environments.leaves import LeftOut
 from daedalus.protocol.spaces import LARGEST_OBSERVATION
 
 Violation = tuple[str, str]  # "problem" or "warning", and the text
 
 
 def observation_violations(space: gymnasium.Space, value: Any, call: str) -> Iterator[Violation]:
-    """Yield what makes an observation, returned by `call`, differ from its space."""
+    """Yield what makes an observation, returned by `call`, differ from its space. Parts that are LeftOut may differ."""
     yield from _violations(space, value, f"{call} returns an observation", "observation_space")
 
 
 def _violations(space: gymnasium.Space, value: Any, what: str, where: str) -> Iterator[Violation]:
     match space:
+        case LeftOut():
+            return
         case gymnasium.spaces.Dict():
             yield from _parts(dict(space.spaces), value, what, where)
         case gymnasium.spaces.Tuple():

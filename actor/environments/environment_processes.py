@@ -87,12 +87,14 @@ class EnvironmentProcesses(AsyncVectorEnv):
 
     _idle = False  # no call is in progress, so the processes can be asked to end
 
-    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
+    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]], *, shared_memory: bool = True) -> None:
         """Start the processes.
 
         Args:
           name: id of the environments, for errors.
           makers: picklable functions, each of which creates one environment.
+          shared_memory: whether observations come in shared memory, which must be able to hold all their components: it
+            cannot hold a text with other letters than its space.
 
         Raises EnvironmentSetupError if a process dies, and whatever the first environment raises.
         """
@@ -100,18 +102,18 @@ class EnvironmentProcesses(AsyncVectorEnv):
         wrapped = [_Maker(name, maker, os.getpid()) for maker in makers]
         with _interrupts_blocked():
             try:
-                self._start(wrapped)
+                self._start(wrapped, shared_memory)
             except (EOFError, ConnectionError):
                 error = self._death()
                 self.close(terminate=True)
                 raise error from None
         self._idle = True
 
-    def _start(self, makers: Sequence[_Maker]) -> None:
+    def _start(self, makers: Sequence[_Maker], shared_memory: bool) -> None:
         # Zenoh does not work after a fork.
         options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
         try:
-            super().__init__(makers, **options)
+            super().__init__(makers, **options, shared_memory=shared_memory)
         except (TypeError, ValueError) as error:
             if not isinstance(error.__cause__, CustomSpaceError) and "dynamic shape" not in str(error):
                 raise

@@ -120,7 +120,7 @@ def make_gymnasium(
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     try:
-        environments = GymnasiumEnvironments(environment, spec.id)
+        environments = GymnasiumEnvironments(environment, spec.id, spec.leave_out)
     except EnvironmentSetupError:
         environment.close()
         raise
@@ -210,7 +210,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
-        return EnvironmentProcesses(spec.id, [factory] * count)
+        return EnvironmentProcesses(spec.id, [factory] * count, shared_memory=not spec.leave_out)
     return EnvironmentsInTurn([factory] * count)
 
 

@@ -1,6 +1,7 @@
 """Environments of a gymnasium vector environment, as the actor steps them."""
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,7 @@ from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
+from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.policy.user_code import first_line, place_of
 
@@ -20,7 +22,7 @@ _logger = logging.getLogger(__name__)
 class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
-    def __init__(self, environment: Any, name: str) -> None:
+    def __init__(self, environment: Any, name: str, leave_out: Sequence[str] = ()) -> None:
         """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them.
 
         Of environments that are stepped in turn only the first is reset: a reset may be slow.
@@ -28,13 +30,16 @@ class GymnasiumEnvironments:
         Args:
           environment: the vector environment.
           name: its id, for errors.
+          leave_out: components of the observation that nobody reads: what is wrong with them is no error.
 
-        Raises EnvironmentSetupError if an environment raises an exception, as `reset` and `step` do.
+        Raises EnvironmentSetupError if an environment raises an exception, as `reset` and `step` do, or has no such
+        component to leave out.
         """
         self._environment, self._name = environment, name
         self.count: int = environment.num_envs
         self.observation_space: gymnasium.Space = environment.single_observation_space
         self.action_space: gymnasium.Space = environment.single_action_space
+        self._read_space = without(self.observation_space, leave_out)
         self._episode_info = EpisodeInfo()
         self.action_mask: Any = None
         if isinstance(self.action_space, gymnasium.spaces.Box):
@@ -88,7 +93,7 @@ class GymnasiumEnvironments:
             for observation in getattr(self._environment, "_env_obs", ()):  # of SyncVectorEnv
                 if observation is None:
                     continue
-                for kind, text in observation_violations(self.observation_space, observation, "a step or a reset"):
+                for kind, text in observation_violations(self._read_space, observation, "a step or a reset"):
                     if kind == "problem":
                         return EnvironmentSetupError(f"environment {self._name}: {text}")
         return playing_error(self._name, call, error)

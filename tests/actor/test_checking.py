@@ -161,6 +161,13 @@ def test_text_that_changes_is_a_problem() -> None:
     assert mission("open the door", "close the door", leave_out=("mission",)).problems == ()
 
 
+@pytest.mark.parametrize("leave_out", [(), ("mission",)])
+def test_text_that_is_left_out_need_not_be_of_its_space(leave_out: tuple[str, ...]) -> None:
+    spec = EnvironmentSpec(id="mission_environment:Mission-v0", kwargs={"text_space": True}, leave_out=leave_out)
+    report = check_environment(spec, TEST_MODULES, seconds=60.0, env_steps=25)
+    assert (report.problems, report.env_steps) == ((), 25)
+
+
 def test_gymnasiums_own_checker_adds_notes() -> None:
     notes = gymnasium_notes(EnvironmentSpec(id=FAULTY, kwargs={"fault": "bounds"}), MODULES)
     assert notes

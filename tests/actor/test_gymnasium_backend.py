@@ -396,6 +396,17 @@ def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.Monke
         environments.step({"action": np.zeros((2, 1), np.int64)})
 
 
+def test_component_that_is_left_out_does_not_hide_an_error() -> None:
+    kwargs = {"text_space": True, "disconnects": True}
+    environments = created(
+        EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), kwargs=kwargs), 2
+    )
+    environments.reset(1)
+    environments.step({"action": np.zeros((2, 1), np.int64)})
+    with pytest.raises(EnvironmentSetupError, match="step raises ValueError: motor 3 is disconnected"):
+        environments.step({"action": np.zeros((2, 1), np.int64)})
+
+
 # ------------------------------------------------------------------------------------------------ failures in play
 
 
@@ -491,8 +502,9 @@ def test_minigrid_is_registered_by_its_names() -> None:
     environments.close()
 
 
-def test_text_of_a_class_of_its_own_can_be_left_out_in_processes() -> None:
-    spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True)
+@pytest.mark.parametrize("kwargs", [{}, {"text_space": True}], ids=["space of its own", "text with blanks"])
+def test_text_can_be_left_out_in_processes(kwargs: dict[str, bool]) -> None:
+    spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True, kwargs=kwargs)
     environments = created(spec, 2)
     try:
         assert environments.reset(1).frames["step"].tolist() == [[0.0], [0.0]]
