@@ -41,10 +41,12 @@ def _parts(spaces: Mapping[Any, gymnasium.Space], value: Any, what: str, where: 
     if not isinstance(value, Mapping):
         yield "problem", f"{what} of type {type(value).__name__}, but {where} has the parts {sorted(spaces, key=str)}"
         return
-    if set(value) != set(spaces):
-        parts = sorted(value, key=str)
-        yield "problem", f"{what} with the parts {parts}, but {where} has the parts {sorted(spaces, key=str)}"
-        return
+    if value.keys() != spaces.keys():
+        is_missing = not spaces.keys() <= value.keys()
+        parts = f"the parts {sorted(value, key=str)}, but {where} has the parts {sorted(spaces, key=str)}"
+        yield "problem" if is_missing else "warning", f"{what} with {parts}"
+        if is_missing:
+            return
     for name, space in spaces.items():
         yield from _violations(space, value[name], f"{what} whose part {name!r} is", f"{where}[{name!r}]")
 
@@ -116,8 +118,6 @@ def _reward_violations(reward: Any) -> Iterator[Violation]:
     except (TypeError, ValueError):
         yield "problem", f"step returns the reward {_shown(reward)}: it must be a number"
         return
-    if np.ndim(reward):
-        yield "warning", f"step returns a reward of shape {np.shape(reward)}: it must be a number"
     if not math.isfinite(number):
         yield "problem", f"step returns the reward {number}: it must be finite"
 

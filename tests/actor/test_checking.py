@@ -13,7 +13,7 @@ from plain import plain_spaces
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
 from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps, uninformative_bounds
-from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.checking.violations import observation_violations, step_violations
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
@@ -130,6 +130,23 @@ def test_observations_of_several_parts_are_checked_part_by_part() -> None:
         ((kind, text),) = observation_violations(space, value, "step")
         assert kind == "problem"
         assert message in text
+
+
+def test_surplus_parts_of_an_observation_are_a_warning_as_nobody_reads_them() -> None:
+    space = Dict({"joints": Tuple([Discrete(3)])})
+    ((kind, text),) = observation_violations(space, {"joints": (1,), "extra": None}, "step")
+    assert kind == "warning"
+    assert "with the parts ['extra', 'joints'], but observation_space has the parts ['joints']" in text
+    found = list(observation_violations(space, {"joints": (3,), "extra": None}, "step"))
+    assert [kind for kind, _ in found] == ["warning", "problem"]
+
+
+@pytest.mark.parametrize("reward", [[1.0], "1.0a", None, np.array([1.0, 2.0])], ids=str)
+def test_reward_that_is_no_number_is_a_problem(reward: object) -> None:
+    result = np.zeros(2, np.float32), reward, False, False, {}
+    ((kind, text),) = step_violations(Box(-1, 1, (2,)), result)
+    assert kind == "problem"
+    assert text.endswith("it must be a number")
 
 
 def mission(*missions: str, leave_out: tuple[str, ...] = (), seconds: float = 60.0) -> EnvironmentReport:
