@@ -32,19 +32,20 @@ class EnvironmentCollector:
         """
         self._count, self._modules = count, modules
         self._environments: VectorEnvironment | None = None
-        self._spec: EnvironmentSpec | None = None  # of the environments
+        self._requested: tuple[EnvironmentSpec, int] | None = None  # a backend may make fewer than this number
         self._runtime: PolicyRuntime | None = None
         self._writer: RolloutWriter | None = None
         self._policy_version = -1
 
     def prepare(self, spec: RunSpec) -> tuple[Spaces, int]:
-        """See Collector. Reuse the environments of an earlier run with the same specification."""
-        if self._spec != spec.environment:
+        """See Collector. Reuse the environments of an earlier run with the same specification and number of them."""
+        count = self._count or spec.collection.envs_per_actor
+        requested = (spec.environment, count)
+        if self._requested != requested:
             self.close()
         if self._environments is None:
-            count = self._count or spec.collection.envs_per_actor
             self._environments = make_environments(spec.environment, count, modules=self._modules)
-            self._spec = spec.environment
+            self._requested = requested
         return self._environments.spaces, self._environments.count
 
     def begin(self, runtime: PolicyRuntime, spec: RunSpec, seed: int, epsilon: float = 0.0) -> None:
@@ -91,4 +92,4 @@ class EnvironmentCollector:
         """See Collector. Close the environments."""
         if self._environments is not None:
             self._environments.close()
-        self._environments = self._spec = self._runtime = self._writer = None
+        self._environments = self._requested = self._runtime = self._writer = None

@@ -8,6 +8,7 @@ from unittest import mock
 import gymnasium
 import numpy as np
 import pytest
+from allowed_modules import TEST_MODULES
 from collectors import collect, started_collector
 from plain import PlainPolicy, plain, vector_spaces
 
@@ -351,6 +352,26 @@ def test_environments_are_made_anew_for_another_specification_only() -> None:
         assert [each.closed for each in made] == [True, False]
     collector.close()
     assert [each.closed for each in made] == [True, True]
+
+
+@pytest.mark.parametrize("own_count", [None, 3])
+def test_environments_are_made_anew_for_another_number_of_them(own_count: int | None) -> None:
+    """A run may be resumed with another collection.envs_per_actor; a number of the actor's own stays."""
+    collector = EnvironmentCollector(own_count, TEST_MODULES)
+    counts = []
+    for count in (2, 4, 4):
+        run = RunSpec(environment=COUNTING, collection=CollectionSpec(envs_per_actor=count))
+        counts.append(collector.prepare(run)[1])
+    collector.close()
+    assert counts == ([2, 4, 4] if own_count is None else [3] * 3)
+
+
+def test_environments_are_kept_if_the_backend_makes_fewer_than_requested() -> None:
+    run = RunSpec(environment=COUNTING, collection=CollectionSpec(envs_per_actor=8))
+    collector = EnvironmentCollector()
+    with mock.patch.object(environment_collector, "make_environments", side_effect=lambda *_, **__: Seeds()) as make:
+        assert [collector.prepare(run)[1] for _ in range(2)] == [1, 1]
+    assert make.call_count == 1
 
 
 def test_a_rollout_can_be_collected_at_any_time() -> None:
