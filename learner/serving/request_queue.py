@@ -7,7 +7,9 @@ from collections import deque
 
 from daedalus.transport.interface import Request
 
-_OLDEST_SECONDS = 10.0  # senders take a request for lost that waits much longer, and send it again
+# Senders take a request for lost that waits 30 s, and send it again.
+_OLDEST_SECONDS = 10.0  # while a request has waited longer, others are refused
+_LATE_SECONDS = 20.0
 
 
 class RequestQueue:
@@ -51,6 +53,16 @@ class RequestQueue:
             _, request = self._requests.popleft()
             self._bytes -= request.size
             return request
+
+    def take_late(self) -> list[Request]:
+        """Take the requests that have waited so long that they need an answer now."""
+        late, now = [], time.monotonic()
+        with self._changed:
+            while self._requests and now - self._requests[0][0] > _LATE_SECONDS:
+                _, request = self._requests.popleft()
+                self._bytes -= request.size
+                late.append(request)
+        return late
 
     def wake(self) -> None:
         """Let `take` raise queue.Empty once."""

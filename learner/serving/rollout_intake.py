@@ -24,7 +24,7 @@ from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
-from daedalus.learner.serving.held_answers import HeldAnswers
+from daedalus.learner.serving.held_answers import MOST_SECONDS, HeldAnswers
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.learner.serving.request_queue import RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
@@ -127,11 +127,14 @@ class RolloutIntake:
         elif self._refuses_size(request):
             pass
         elif not self._requests.offer(request):
-            request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
-            with self._lock:
-                actor = self._fleet.actors.get(keys.last_chunk(request.key))
-                if actor is not None:
-                    actor.busy += 1
+            self._answer_busy(request)
+
+    def _answer_busy(self, request: Request) -> None:
+        request.reply(encode(Acknowledgement(verdict="busy", policy_version=self._published_version())))
+        with self._lock:
+            actor = self._fleet.actors.get(keys.last_chunk(request.key))
+            if actor is not None:
+                actor.busy += 1
 
     def _refuses_size(self, request: Request) -> bool:
         """Refuse a request that cannot be a rollout of its sender, without a copy of its payload."""
@@ -237,12 +240,15 @@ class RolloutIntake:
             sender, payload = keys.last_chunk(request.key), request.payload
             content = self._intake.read(sender, payload)
             with self._lock:
-                answer = self._judge(sender, content, len(payload))
-                is_held = answer.verdict == "accepted" and self._held.holds and self._ending is None
-                if is_held:
-                    self._held.add(request)
-            if not is_held:
-                request.reply(encode(self._ending or answer))
+                verdict = self._judge(sender, content, len(payload))
+                is_stored = not isinstance(verdict, Rejected) and self._store(verdict, len(payload))
+                is_held = is_stored and self._hold(request)
+            if isinstance(verdict, Rejected):
+                self._reply(request, acknowledgement(verdict, self._published_version()))
+            elif not is_stored:
+                self._wait_for_room(request, verdict, len(payload))
+            elif not is_held:
+                self._reply(request, _ACCEPTED)
         with self._lock:
             self._held.release()
         self._answer_held()
@@ -250,14 +256,11 @@ class RolloutIntake:
     def _answer_held(self) -> None:
         """Answer the accepted rollouts whose answers need not wait any more."""
         with self._lock:
-            answers = [
-                (request, self._ending or self._final_answer(keys.last_chunk(request.key), _ACCEPTED))
-                for request in self._held.take(time.monotonic())
-            ]
-        for request, answer in answers:
-            request.reply(encode(replace(answer, policy_version=self._published_version())))
+            requests = self._held.take(time.monotonic())
+        for request in requests:
+            self._reply(request, _ACCEPTED)
 
-    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
+    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Upload | Rejected:
         if self._is_surplus(content):
             content = Rejected(
                 verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
@@ -268,15 +271,60 @@ class RolloutIntake:
         self._fleet.received(sender, size)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
-        else:
-            self._store(verdict, size)
-        return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
+        return verdict
 
-    def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
+    def _store(self, rollout: Upload, size: int) -> bool:
+        """Put an accepted rollout into the buffer; return False if there is no room. The caller holds the lock."""
+        if self._ending is None and not self._buffer.has_room_for(rollout):
+            return False
+        self._buffer.add(rollout)
+        self._counters.accepted(rollout, size)
+        self._lock.notify_all()
+        return True
+
+    def _hold(self, request: Request) -> bool:
+        """Let the answer to a stored rollout wait if the learner computes, and return whether it does. As `_store`."""
+        if not self._held.holds or self._ending is not None or self._is_drained(request):
+            return False
+        self._held.add(request)
+        return True
+
+    def _wait_for_room(self, request: Request, rollout: Upload, size: int) -> None:
+        """Wait until an accepted rollout is in the buffer; no others are judged meanwhile, which slows all actors down.
+
+        No answer is late, also if the learner computes for long: a sender would take its rollout for lost.
+        """
+        answer_by = time.monotonic() + MOST_SECONDS
+        is_stored = is_answered = False
+        while not is_stored:
+            self._answer_held()
+            for late in self._requests.take_late():
+                self._answer_busy(late)
+            if not is_answered and time.monotonic() > answer_by:
+                self._reply(request, _ACCEPTED)
+                is_answered = True
+            with self._lock:
+                is_stored = self._store(rollout, size)
+                if not is_stored:
+                    self._lock.wait(HEARTBEAT_SECONDS)
+                elif not is_answered:
+                    is_answered = self._hold(request)
+        if not is_answered:
+            self._reply(request, _ACCEPTED)
+
+    def _reply(self, request: Request, answer: Acknowledgement) -> None:
+        with self._lock:
+            answer = self._ending or self._final_answer(request, answer)
+        request.reply(encode(replace(answer, policy_version=self._published_version())))
+
+    def _final_answer(self, request: Request, answer: Acknowledgement) -> Acknowledgement:
         """Return the answer to a rollout, `drained` if its actor is asked to leave."""
-        actor = self._fleet.actors.get(sender)
         is_final = answer.verdict in ("accepted", "rejected")
-        return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer
+        return replace(answer, verdict="drained") if is_final and self._is_drained(request) else answer
+
+    def _is_drained(self, request: Request) -> bool:
+        actor = self._fleet.actors.get(keys.last_chunk(request.key))
+        return actor is not None and actor.drained
 
     def _count_rejection(self, sender: str, rejected: Rejected) -> None:
         self._counters.rollouts_rejected[rejected.cause] += 1
@@ -293,14 +341,6 @@ class RolloutIntake:
         """
         synchronous = self._spec.algorithm.synchronous
         return synchronous and not isinstance(content, Rejected) and not self._buffer.has_room_for(content)
-
-    def _store(self, rollout: Upload, size: int) -> None:
-        """Put a rollout into the buffer, and wait for room first. The late answer slows the sender down."""
-        while not self._buffer.has_room_for(rollout) and self._ending is None:
-            self._lock.wait(HEARTBEAT_SECONDS)
-        self._buffer.add(rollout)
-        self._counters.accepted(rollout, size)
-        self._lock.notify_all()
 
 
 def largest_request(spec: RunSpec) -> int:
