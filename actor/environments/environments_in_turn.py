@@ -35,6 +35,18 @@ class EnvironmentsInTurn(SyncVectorEnv):
             raise
         self._collecting = False
 
+    def close_extras(self, **_options: Any) -> None:
+        """Close all environments, then raise the first exception that one of them raised."""
+        self.closed = True  # also after an exception: the environments would be closed again
+        errors: list[BaseException] = []
+        for environment in self.envs:
+            try:
+                environment.close()
+            except (Exception, SystemExit) as error:  # of the user's code
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
     def _add_info(self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int) -> dict[str, Any]:
         if self._collecting:  # the base class calls this method again for a map in `info`
             return super()._add_info(vector_infos, env_info, env_num)

@@ -111,22 +111,33 @@ def test_seeds_of_training_fit_an_int_of_c(seed: int) -> None:
     collect(started_collector(spec(), First(), count=2, rollout_length=4, seed=seed, modules=MODULES))
 
 
+class Simulator(gymnasium.Env[Any, Any]):
+    """An environment whose `close` raises an exception, and which cannot be made for the lack of a licence."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
+
+    def __init__(self, number: int, closed: list[int], licensed: bool = True) -> None:
+        self._number, self._closed = number, closed
+        if not licensed:
+            raise ConnectionError("all licences are in use")
+
+    def close(self) -> None:
+        self._closed.append(self._number)
+        raise RuntimeError(f"{self._number} has no connection")
+
+
 def test_environments_are_closed_if_another_cannot_be_made() -> None:
     """Simulators that were started would go on, and occupy the ports of those that the next process starts."""
     closed: list[int] = []
-
-    class Simulator(gymnasium.Env[Any, Any]):
-        observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
-
-        def __init__(self, number: int) -> None:
-            self._number = number
-            if number == 3:
-                raise ConnectionError("all licences are in use")
-
-        def close(self) -> None:
-            closed.append(self._number)
-            raise RuntimeError("has no connection")
-
     with pytest.raises(ConnectionError, match="licences"):
-        EnvironmentsInTurn([partial(Simulator, number) for number in range(1, 5)])
+        EnvironmentsInTurn([partial(Simulator, number, closed, licensed=number != 3) for number in range(1, 5)])
     assert closed == [1, 2]
+
+
+def test_all_environments_are_closed_once_though_one_raises() -> None:
+    closed: list[int] = []
+    environments = EnvironmentsInTurn([partial(Simulator, number, closed) for number in range(1, 4)])
+    with pytest.raises(RuntimeError, match="1 has no connection"):
+        environments.close()
+    environments.close()
+    assert closed == [1, 2, 3]
