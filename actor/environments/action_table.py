@@ -79,6 +79,7 @@ def _checked_table(
 ) -> np.ndarray:
     """Return the rows of the table [count, len(columns)], in the order and the dtype of the action's numbers."""
     low, high = space.low.ravel()[columns], space.high.ravel()[columns]
+    of_integers = space.dtype is not None and space.dtype.kind != "f"
     for number, row in enumerate(table):
         if len(row) != columns.size:
             few = columns.size < space.low.size
@@ -86,9 +87,14 @@ def _checked_table(
             raise EnvironmentSetupError(
                 f"environment.action_table row {number} has {len(row)} numbers, but {expected} {columns.size}"
             )
-        action = np.asarray(row, space.dtype)
+        # In the space's own precision, in which a bound such as 0.7 is another number; integers would be truncated.
+        action = np.asarray(row, np.float64 if of_integers else space.dtype)
         if not ((action >= low) & (action <= high)).all():
             raise EnvironmentSetupError(
                 f"environment.action_table row {number} is {row}, outside action space {described(space)}"
+            )
+        if of_integers and (action != np.rint(action)).any():
+            raise EnvironmentSetupError(
+                f"environment.action_table row {number} is {row}, but action space {described(space)} has integers"
             )
     return np.asarray(table, space.dtype)

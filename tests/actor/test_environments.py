@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -11,7 +12,8 @@ from allowed_modules import TEST_MODULES
 from plain import PlainEnvironments, choices
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
-from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.interface import BackendEnvironments
+from daedalus.actor.environments.make import make_bare, make_environments
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace
@@ -178,6 +180,33 @@ def test_the_columns_of_a_table_have_their_own_order_and_the_space_its_shape() -
     assert actions.dtype == space.dtype
 
 
+def test_a_table_over_integers_keeps_them() -> None:
+    spec = EnvironmentSpec(id="x", action_table=((0.0, 3.0), (255.0, 7.0)))
+    transforms = Transforms(spec, gymnasium.spaces.Box(-1, 1, (2,)), gymnasium.spaces.Box(0, 255, (2,), np.uint8))
+    actions = transforms.env_actions({"action": np.array([[1], [0]])})
+    assert (actions.tolist(), actions.dtype) == ([[255, 7], [0, 3]], np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"),
+    [
+        ((0.7, 3.0), r"row 1 is \(0.7, 3.0\), but action space Box\(0, 255, \(2,\), uint8\) has integers"),
+        ((300.0, 3.0), r"row 1 is \(300.0, 3.0\), outside action space Box"),
+        ((-0.5, 3.0), "outside action space Box"),
+    ],
+)
+def test_a_table_that_no_integers_fit_is_refused(row: tuple[float, float], reason: str) -> None:
+    spec = EnvironmentSpec(id="x", action_table=((0.0, 0.0), row))
+    with pytest.raises(EnvironmentSetupError, match=f"environment.action_table .*{reason}"):
+        Transforms(spec, gymnasium.spaces.Box(-1, 1, (2,)), gymnasium.spaces.Box(0, 255, (2,), np.uint8))
+
+
+def test_a_row_may_be_the_bound_of_an_action() -> None:
+    spec = EnvironmentSpec(id="x", action_table=((-0.7,), (0.7,)))  # as float32 they are nearer to 0
+    transforms = Transforms(spec, gymnasium.spaces.Box(-1, 1, (2,)), gymnasium.spaces.Box(-0.7, 0.7, (1,)))
+    assert transforms.env_actions({"action": np.array([[1]])}) == pytest.approx(0.7)
+
+
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
@@ -243,3 +272,10 @@ def test_action_indices_start_at_zero_for_a_discrete_space_that_does_not() -> No
     environments.reset(1)
     assert choices(environments.spaces) == 2
     np.testing.assert_array_equal(environments.step(np.array([0, 1]))[1], [5.0, 6.0])
+
+
+def test_the_guide_names_every_member_of_a_backend() -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "guides" / "backend.md").read_text()
+    members = {name for name in vars(BackendEnvironments) if not name.startswith("_")}
+    assert members == set(re.findall(r"`(\w+)", "".join(re.findall(r"^\| (`.*?) \|", guide, re.MULTILINE))))
+    assert f"`{make_bare.__name__}`" in guide
