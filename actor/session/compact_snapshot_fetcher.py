@@ -34,7 +34,7 @@ class CompactSnapshotFetcher:
           on_news: called on the transport's threads when `take` may have something new.
           rests: after a fetch let the link rest for as long as it took, because a slow link carries rollouts too.
         """
-        self.rests = rests
+        self._rests = rests
         self._transport, self._on_news = transport, on_news
         self._key, self._actor = keys.snapshots(run), actor
         self._held: tuple[int, Bits] | None = None  # the version and weights that differences are added to
@@ -136,7 +136,7 @@ class CompactSnapshotFetcher:
         if len(self._parts) == self._count:
             whole = b"".join(self._parts[part] for part in range(self._count))
             self._seconds = time.monotonic() - self._began
-            self._end(whole, rest=self._seconds if self.rests else 0.0)
+            self._end(whole, rest=self._seconds if self._rests else 0.0)
             return none
         first, self._requested = self._requested, min(self._count, len(self._parts) + _PARALLEL_PARTS)
         return range(first, self._requested)

@@ -33,9 +33,8 @@ class SnapshotFeed:
         self._transport, self._queries, self._end, self._actor = transport, queries, end, actor
         self._on_news = on_news
         self._inboxes: dict[str, Inbox] = {}  # by run
-        self._whole: SnapshotFetcher | None = None  # at most one of these two is set
-        self._compact: CompactSnapshotFetcher | None = None
-        self._confirming: SnapshotFetcher | None = None  # while snapshots are pushed
+        self._fetcher: SnapshotFetcher | CompactSnapshotFetcher | None = None
+        self._fetches_on_request = False  # else snapshots are pushed, or fetched as often as a slow link allows
         self._run, self._learner_epoch = "", -1
         self.newest: Snapshot | None = None  # of this learner epoch
         self.confirmed_at = -math.inf  # the monotonic time at which `newest` was last known to be the learner's newest
@@ -44,7 +43,7 @@ class SnapshotFeed:
         """Begin with a learner: no snapshot of it is known, and nothing about its link."""
         self._run, self._learner_epoch, self.newest = welcome.run, welcome.learner_epoch, None
         self.confirmed_at = -math.inf
-        self._whole = self._compact = self._confirming = None
+        self._fetcher, self._fetches_on_request = None, False
 
     def subscribe(self) -> None:
         """Receive every published snapshot from now on, unless compact snapshots are fetched. Idempotent."""
@@ -54,7 +53,8 @@ class SnapshotFeed:
     def use_compact_snapshots(self) -> None:
         """End the subscription; from now on compact snapshots are fetched, as often as a slow link allows."""
         self._unsubscribe()
-        self._compact = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
+        self._fetches_on_request = False
+        self._fetcher = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news)
 
     def use_differences(self) -> None:
         """Fetch compact snapshots, as differences, in place of whole ones from now on. Idempotent.
@@ -62,11 +62,10 @@ class SnapshotFeed:
         Only of a small network: the learner computes the differences, which for a large one takes longer than to send
         the whole.
         """
-        if self._whole is None or self.newest is None:
+        if not self._fetches_on_request or self._compact is not None or self.newest is None:
             return
         if sum(array.nbytes for array in self.newest.weights.values()) <= _SMALL_BYTES:
-            self._whole = None
-            self._compact = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news, rests=False)
+            self._fetcher = CompactSnapshotFetcher(self._transport, self._run, self._actor, self._on_news, rests=False)
 
     def use_fetches(self) -> None:
         """End the subscription; from now on whole snapshots are fetched on request, unless compact ones are.
@@ -76,9 +75,9 @@ class SnapshotFeed:
         if self._compact is None:
             self._unsubscribe()
             assert self.newest is not None
-            self._whole = self._fetcher(self.newest)
+            self._fetcher, self._fetches_on_request = self._whole_fetcher(self.newest), True
 
-    def _fetcher(self, held: Snapshot) -> SnapshotFetcher:
+    def _whole_fetcher(self, held: Snapshot) -> SnapshotFetcher:
         return SnapshotFetcher(
             self._transport, self._queries, self._run, self._actor, held.policy_version, self._on_news
         )
@@ -89,18 +88,18 @@ class SnapshotFeed:
         self._inboxes.clear()
 
     @property
-    def _slow_link(self) -> CompactSnapshotFetcher | None:
-        return self._compact if self._compact is not None and self._compact.rests else None
+    def _compact(self) -> CompactSnapshotFetcher | None:
+        return self._fetcher if isinstance(self._fetcher, CompactSnapshotFetcher) else None
 
     @property
     def _scheduled(self) -> SnapshotFetcher | CompactSnapshotFetcher | None:
         """What fetches on request; None while snapshots are pushed, and on a slow link."""
-        return self._whole if self._compact is None else None if self._compact.rests else self._compact
+        return self._fetcher if self._fetches_on_request else None
 
     @property
     def is_slow(self) -> bool:
         """Whether snapshots are fetched as often as a slow link allows."""
-        return self._slow_link is not None
+        return self._compact is not None and not self._fetches_on_request
 
     @property
     def fetch_seconds(self) -> float:
@@ -122,10 +121,10 @@ class SnapshotFeed:
 
     def _received(self) -> Iterator[tuple[Message, float]]:
         """Yield each message that has come, with the monotonic time of its request; a push has the present time."""
-        for fetcher in (self._compact, self._whole, self._confirming):
-            message = None if fetcher is None else fetcher.take()
-            if fetcher is not None and message is not None:
-                yield message, fetcher.answered_request_at
+        fetcher = self._fetcher
+        message = None if fetcher is None else fetcher.take()
+        if fetcher is not None and message is not None:
+            yield message, fetcher.answered_request_at
         inbox = self._inboxes.get(self._run)
         data = None if inbox is None else inbox.take()
         message = None if data is None else self._queries.decode(data)
@@ -145,11 +144,10 @@ class SnapshotFeed:
 
     def request_confirmation(self) -> None:
         """Ask whether `newest` is still the learner's newest, unless an answer is awaited. Does not wait."""
-        if self._compact is None and self._whole is None and self._confirming is None and self.newest is not None:
-            self._confirming = self._fetcher(self.newest)
-        fetcher = self._compact or self._whole or self._confirming
-        if fetcher is not None:
-            fetcher.request_newest()
+        if self._fetcher is None and self.newest is not None:
+            self._fetcher = self._whole_fetcher(self.newest)
+        if self._fetcher is not None:
+            self._fetcher.request_newest()
 
     def request_newest(self) -> None:
         """Request the newest snapshot in case a push was lost. Raises as `read` does."""
@@ -162,8 +160,9 @@ class SnapshotFeed:
 
     def request_compact_if_behind(self, newest_version: int) -> None:
         """Request the snapshot of a version that acknowledgements mention, on a slow link."""
-        if self._slow_link is not None and (self.newest is None or newest_version > self.newest.policy_version):
-            self._slow_link.request_newest()
+        is_behind = self.newest is None or newest_version > self.newest.policy_version
+        if self._fetcher is not None and self.is_slow and is_behind:
+            self._fetcher.request_newest()
 
     def _apply(self, message: Message, at: float) -> None:
         """Apply a message; `at` is the monotonic time of the request that it answers, or at which it was pushed."""
