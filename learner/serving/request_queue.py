@@ -9,7 +9,7 @@ from daedalus.transport.interface import Request
 
 # Senders take a request for lost that waits 30 s, and send it again.
 _OLDEST_SECONDS = 10.0  # while a request has waited longer, others are refused
-_LATE_SECONDS = 20.0
+_LATE_SECONDS = 15.0
 
 
 class RequestQueue:

@@ -239,28 +239,54 @@ class RolloutIntake:
                 break
             sender, payload = keys.last_chunk(request.key), request.payload
             content = self._intake.read(sender, payload)
+            if not self._wait_for_room(content):
+                self._answer_busy(request)
+                continue
             with self._lock:
-                verdict = self._judge(sender, content, len(payload))
-                is_stored = not isinstance(verdict, Rejected) and self._store(verdict, len(payload))
-                is_held = is_stored and self._hold(request)
-            if isinstance(verdict, Rejected):
-                self._reply(request, acknowledgement(verdict, self._published_version()))
-            elif not is_stored:
-                self._wait_for_room(request, verdict, len(payload))
-            elif not is_held:
-                self._reply(request, _ACCEPTED)
+                answer = self._judge(sender, content, len(payload))
+                is_held = answer.verdict == "accepted" and self._held.holds and self._ending is None
+                if is_held:
+                    self._held.add(request)
+            if not is_held:
+                request.reply(encode(self._ending or answer))
         with self._lock:
             self._held.release()
         self._answer_held()
 
+    def _wait_for_room(self, content: Upload | Rejected) -> bool:
+        """Wait until the buffer has room; return False if that takes so long that the sender needs an answer.
+
+        No other rollouts are judged meanwhile, which slows their senders down. But no answer is late: its sender would
+        take the rollout for lost, and send it again.
+        """
+        answer_by = time.monotonic() + MOST_SECONDS
+        while True:
+            with self._lock:
+                if self._has_room_for(content):
+                    return True
+                self._lock.wait(HEARTBEAT_SECONDS)
+            self._answer_held()
+            for late in self._requests.take_late():
+                self._answer_busy(late)
+            if time.monotonic() > answer_by:
+                return False
+
+    def _has_room_for(self, content: Upload | Rejected) -> bool:
+        """Return whether content can be judged now. The barrier rejects a rollout that it has no room for."""
+        waits = isinstance(content, Upload) and self._ending is None and not self._spec.algorithm.synchronous
+        return not waits or self._buffer.has_room_for(content)
+
     def _answer_held(self) -> None:
         """Answer the accepted rollouts whose answers need not wait any more."""
         with self._lock:
-            requests = self._held.take(time.monotonic())
-        for request in requests:
-            self._reply(request, _ACCEPTED)
+            answers = [
+                (request, self._ending or self._final_answer(keys.last_chunk(request.key), _ACCEPTED))
+                for request in self._held.take(time.monotonic())
+            ]
+        for request, answer in answers:
+            request.reply(encode(replace(answer, policy_version=self._published_version())))
 
-    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Upload | Rejected:
+    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
             content = Rejected(
                 verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
@@ -271,60 +297,17 @@ class RolloutIntake:
         self._fleet.received(sender, size)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)
-        return verdict
+        else:
+            self._buffer.add(verdict)
+            self._counters.accepted(verdict, size)
+            self._lock.notify_all()
+        return self._final_answer(sender, acknowledgement(verdict, self._published_version()))
 
-    def _store(self, rollout: Upload, size: int) -> bool:
-        """Put an accepted rollout into the buffer; return False if there is no room. The caller holds the lock."""
-        if self._ending is None and not self._buffer.has_room_for(rollout):
-            return False
-        self._buffer.add(rollout)
-        self._counters.accepted(rollout, size)
-        self._lock.notify_all()
-        return True
-
-    def _hold(self, request: Request) -> bool:
-        """Let the answer to a stored rollout wait if the learner computes, and return whether it does. As `_store`."""
-        if not self._held.holds or self._ending is not None or self._is_drained(request):
-            return False
-        self._held.add(request)
-        return True
-
-    def _wait_for_room(self, request: Request, rollout: Upload, size: int) -> None:
-        """Wait until an accepted rollout is in the buffer; no others are judged meanwhile, which slows all actors down.
-
-        No answer is late, also if the learner computes for long: a sender would take its rollout for lost.
-        """
-        answer_by = time.monotonic() + MOST_SECONDS
-        is_stored = is_answered = False
-        while not is_stored:
-            self._answer_held()
-            for late in self._requests.take_late():
-                self._answer_busy(late)
-            if not is_answered and time.monotonic() > answer_by:
-                self._reply(request, _ACCEPTED)
-                is_answered = True
-            with self._lock:
-                is_stored = self._store(rollout, size)
-                if not is_stored:
-                    self._lock.wait(HEARTBEAT_SECONDS)
-                elif not is_answered:
-                    is_answered = self._hold(request)
-        if not is_answered:
-            self._reply(request, _ACCEPTED)
-
-    def _reply(self, request: Request, answer: Acknowledgement) -> None:
-        with self._lock:
-            answer = self._ending or self._final_answer(request, answer)
-        request.reply(encode(replace(answer, policy_version=self._published_version())))
-
-    def _final_answer(self, request: Request, answer: Acknowledgement) -> Acknowledgement:
+    def _final_answer(self, sender: str, answer: Acknowledgement) -> Acknowledgement:
         """Return the answer to a rollout, `drained` if its actor is asked to leave."""
+        actor = self._fleet.actors.get(sender)
         is_final = answer.verdict in ("accepted", "rejected")
-        return replace(answer, verdict="drained") if is_final and self._is_drained(request) else answer
-
-    def _is_drained(self, request: Request) -> bool:
-        actor = self._fleet.actors.get(keys.last_chunk(request.key))
-        return actor is not None and actor.drained
+        return replace(answer, verdict="drained") if actor is not None and actor.drained and is_final else answer
 
     def _count_rejection(self, sender: str, rejected: Rejected) -> None:
         self._counters.rollouts_rejected[rejected.cause] += 1

@@ -88,16 +88,16 @@ def test_no_answer_is_late_while_the_learner_computes_a_long_batch(
 ) -> None:
     monkeypatch.setattr(held_answers, "MOST_SECONDS", 0.3)
     monkeypatch.setattr(rollout_intake, "MOST_SECONDS", 0.3)
-    monkeypatch.setattr(request_queue, "_LATE_SECONDS", 2.0)
     intake.offer(0, 1)
     assert intake.answers(2) == [(0, "accepted"), (1, "accepted")]
     assert intake.batch() == [0, 1]
     intake.offer(2, 3, 4, 5)  # two fill the buffer, one waits for room, one is not judged
-    assert sorted(intake.answers(4)) == [(2, "accepted"), (3, "accepted"), (4, "accepted"), (5, "busy")]
+    assert sorted(intake.answers(4)) == [(2, "accepted"), (3, "accepted"), (4, "busy"), (5, "busy")]
     assert intake.counters.rollouts_accepted == 4
-    intake.offer(5)
+    monkeypatch.undo()
+    intake.offer(4, 5)
     assert [intake.batch(), intake.batch()] == [[2, 3], [4, 5]]
-    assert intake.answers(1) == [(5, "accepted")]
+    assert intake.answers(2) == [(4, "accepted"), (5, "accepted")]
     assert not intake.counters.rollouts_rejected
 
 
@@ -110,3 +110,13 @@ def test_rollouts_that_wait_for_room_keep_their_order_and_their_senders_wait(int
     assert intake.rollouts.take_batch(0) == []
     assert intake.answers(1) == [(4, "accepted")]
     assert intake.counters.rollouts_accepted == 5
+
+
+def test_requests_that_are_not_judged_in_time_are_answered_busy(
+    intake: Intake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(request_queue, "_LATE_SECONDS", 0.3)
+    intake.offer(0, 1, 2, 3, 4)
+    assert intake.answers(4) == [(0, "accepted"), (1, "accepted"), (3, "busy"), (4, "busy")]
+    assert intake.batch() == [0, 1]
+    until(lambda: intake.counters.rollouts_accepted == 3)

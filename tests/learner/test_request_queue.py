@@ -59,6 +59,15 @@ def test_requests_are_refused_while_the_oldest_has_waited_long(monkeypatch: pyte
     assert queue.offer(UnansweredRequest(1))
 
 
+def test_requests_that_have_waited_too_long_are_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue, requests = RequestQueue(100, 100), [UnansweredRequest(size) for size in (3, 4)]
+    assert all(queue.offer(request) for request in requests)
+    assert queue.take_late() == []
+    monkeypatch.setattr(request_queue, "_LATE_SECONDS", -1.0)
+    assert queue.take_late() == requests
+    assert (queue.bytes, queue.take_late()) == (0, [])
+
+
 def test_empty_queue_accepts_a_request_of_any_size() -> None:
     queue = RequestQueue(10, 100)
     assert queue.offer(UnansweredRequest(1000))
