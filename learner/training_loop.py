@@ -54,7 +54,8 @@ class TrainingLoop:
         """Offer the policy to the actors, before the first update."""
         learner = self._learner
         self._server.offer_policy(program, learner.state_size, learner.gradient_shapes)
-        self._add_gradient_inputs()
+        if self._state.spec.uploads_gradients:
+            self._server.publisher.extras = lambda: learner.gradient_inputs(self._state.progress)
         self._server.publisher.publish(learner.policy_version, learner.weights())
 
     def run(self, records: RunRecords) -> float:
@@ -100,8 +101,7 @@ class TrainingLoop:
         skipped = learner.updates_skipped
         left_out = self._learn_from(batch, progress)
         learner.anneal_exploration(self._state.spec.training.exploration_annealing(progress, env_steps))
-        self._add_gradient_inputs()
-        self._server.publisher.publish_if_due(learner.policy_version, learner.weights(), len(batch))
+        self._server.publisher.publish_if_due(learner.policy_version, learner.weights, len(batch))
         rollouts.count_trained(batch, left_out)
         self._health.updated = self._health.actor_seen = time.monotonic()
         skipped = learner.updates_skipped - skipped
@@ -120,8 +120,3 @@ class TrainingLoop:
             self._learner.apply(gradients, progress)
             return []
         return [*self._learner.step([upload for upload in uploads if isinstance(upload, Rollout)], progress)]
-
-    def _add_gradient_inputs(self) -> None:
-        """Let the next snapshots carry what actors need to compute gradients, if they do."""
-        if self._state.spec.uploads_gradients:
-            self._server.publisher.extras = self._learner.gradient_inputs(self._state.progress)

@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -57,7 +58,7 @@ class SnapshotPublisher:
         self._unpublished_rollouts = 0  # trained on since the last snapshot
         self._program_hash = ""
         self.version = start_version  # the newest published version
-        self.extras: dict[str, np.ndarray] = {}  # what the next snapshots carry besides the weights
+        self.extras: Callable[[], dict[str, np.ndarray]] = dict  # what snapshots carry besides the weights
 
     def open(self) -> None:
         """Start to answer requests for compact snapshots."""
@@ -91,7 +92,7 @@ class SnapshotPublisher:
         self._program_hash = program_hash(model)
         self._responses.offer_program(Program(hash=self._program_hash, model=np.frombuffer(model, np.uint8)))
 
-    def publish_if_due(self, policy_version: int, weights: dict[str, np.ndarray], rollouts: int) -> None:
+    def publish_if_due(self, policy_version: int, weights: Callable[[], dict[str, np.ndarray]], rollouts: int) -> None:
         """Publish a policy version if enough rollouts were trained on since the last snapshot.
 
         With a small fleet, publish every update. With a large fleet, publish after a quarter of the actors have
@@ -100,7 +101,7 @@ class SnapshotPublisher:
 
         Args:
           policy_version: the version of the weights.
-          weights: numpy arrays by parameter name.
+          weights: returns the numpy arrays by parameter name: with a large fleet, few versions are published.
           rollouts: number of rollouts in the batch that made the version.
         """
         self._unpublished_rollouts += rollouts
@@ -108,7 +109,7 @@ class SnapshotPublisher:
             live = len(self._fleet.live)
         version_due = 4 * (policy_version - self.version) >= self._spec.policy_lag_bound_with(live)
         if self._spec.algorithm.synchronous or version_due or 4 * self._unpublished_rollouts >= live:
-            self.publish(policy_version, weights)
+            self.publish(policy_version, weights())
 
     def publish(self, policy_version: int, weights: dict[str, np.ndarray]) -> None:
         """Publish a snapshot. It is encoded once, for subscribers and for queries."""
@@ -117,7 +118,7 @@ class SnapshotPublisher:
                 learner_epoch=self._epoch,
                 policy_version=policy_version,
                 program=self._program_hash,
-                weights={**weights, **self.extras},
+                weights={**weights, **self.extras()},
             )
         )
         self._responses.offer_snapshot(snapshot, policy_version)

@@ -413,7 +413,7 @@ def test_publication_interval_grows_with_the_fleet(
     news: list[int] = []
     inbox = actors.subscribe(keys.snapshots("r"), lambda: news.append(version_of(inbox.take())))
     for version in range(1, 7):
-        server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+        server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
     assert news == published
     assert server.publisher.version == (published or [0])[-1]
 
@@ -424,7 +424,7 @@ def test_publication_interval_is_at_most_a_quarter_of_the_policy_lag_bound(netwo
         with_fleet(network, server, 400)
         published = set()
         for version in range(1, 41):
-            server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
             published.add(server.publisher.version)
         assert published == {0, 8, 16, 24, 32, 40}
     finally:
@@ -469,7 +469,7 @@ def test_synchronous_algorithm_publishes_every_version(network: MemoryNetwork) -
     try:
         with_fleet(network, server, 40)
         for version in (1, 2):
-            server.publisher.publish_if_due(version, {"w": np.zeros(2, np.float32)}, rollouts=1)
+            server.publisher.publish_if_due(version, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
             assert server.publisher.version == version
     finally:
         server.close("the test is over")
@@ -479,7 +479,7 @@ def test_acknowledgement_contains_the_newest_published_version(network: MemoryNe
     """An actor cannot fetch a version that is not published."""
     offer_policy(server)
     actors = with_fleet(network, server, 40)
-    server.publisher.publish_if_due(4, {"w": np.zeros(2, np.float32)}, rollouts=1)
+    server.publisher.publish_if_due(4, lambda: {"w": np.zeros(2, np.float32)}, rollouts=1)
     rollout = make_rollout(identity("a0", 0), version=0)
     (answer,) = actors.query(keys.rollouts("r", "a0"), encode(rollout), timeout=LIMIT)
     acknowledgement = decode(answer, Limits())
