@@ -39,8 +39,10 @@ ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 FROM build AS build-learner
 # torch first, with its exact version: on some indexes a range would select the CUDA build.
 RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt torch==2.13.0
+# Extras for the environments that the learner makes once, to choose settings by their spaces.
+ARG EXTRAS=box2d
 COPY . .
-RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,plot,certs,monitoring,gateway]" \
+RUN python3 -m pip --python /opt/daedalus/bin/python install --no-cache-dir -c constraints.txt ".[learner,plot,certs,monitoring,gateway,${EXTRAS}]" \
     && find /opt/daedalus -type d '(' -name tests -o -name test ')' -prune -exec rm -r {} +
 
 FROM run AS learner

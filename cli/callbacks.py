@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from daedalus.cli.running.run_observer import RunObserver
+from daedalus.learner.reporting.user_metrics import MOST_METRICS
 from daedalus.protocol.keys import is_name
 
 _READ_BYTES = 1 << 16
@@ -19,7 +20,8 @@ class TrainingRun:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        """The run directory. `daedalus.load_policy(run.directory)` loads the best policy so far."""
+        """The run directory. `daedalus.load_policy(run.directory)` loads the best policy that was evaluated, or else
+        the newest; it raises NoPolicyError before the first checkpoint."""
         self.stop_reason: str | None = None
         """The reason given to `stop`, or None."""
         self._metrics: dict[str, float] = {}
@@ -34,8 +36,10 @@ class TrainingRun:
         Args:
           metrics: finite numbers, by names of 1 to 64 letters, digits, '.', '_' or '-'.
 
-        Raises ValueError for another name or number.
+        Raises ValueError for another name or number, or for more than 64 names before the next row.
         """
+        if len(self._metrics.keys() | metrics.keys()) > MOST_METRICS:
+            raise ValueError(f"a row has at most {MOST_METRICS} metrics of yours: log fewer names")
         for name, value in metrics.items():
             if not (isinstance(name, str) and is_name(name)) or not _is_finite(value):
                 raise ValueError(f"metric {name!r} is {value!r}: use a finite number, and letters, digits, . _ or -")

@@ -3,9 +3,11 @@
 - `info["action_mask"]` (gymnasium): an array over all choices, a list or tuple of arrays whose choices together are
   these (as `sample(mask)` of gymnasium's spaces takes it), or a map of them by action component;
 - `action_masks()` of the environment (stable-baselines3's contributors), which the gymnasium backend puts into `info`;
-- an observation component named `action_mask` (PettingZoo), which the policy then does not observe.
+- a key `action_mask` of the observation (PettingZoo): an array over all choices, or a map of arrays by action
+  component. The policy then does not observe it.
 """
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -81,16 +83,48 @@ class Masks:
         return mask
 
 
-def mask_component(
-    components: tuple[ObservationComponent, ...], actions: dict[str, ActionSpace]
-) -> ObservationComponent | None:
-    """Return the observation component that is the mask of the only discrete action, or None."""
-    discrete = [space for space in actions.values() if isinstance(space, DiscreteSpace)]
-    for component in components:
-        is_mask = component.leaf.path == (MASK_KEY,) and component.first is None
-        if is_mask and len(discrete) == 1 and component.shape == (discrete[0].choices,):
-            return component
-    return None
+class ObservedMasks:
+    """The masks that are components of the observation; none if the actions have no choices."""
+
+    def __init__(self, components: Iterable[ObservationComponent], actions: dict[str, ActionSpace]) -> None:
+        """Find the masks. Raises EnvironmentSetupError for one that does not fit the actions."""
+        discrete = {name: space for name, space in actions.items() if isinstance(space, DiscreteSpace)}
+        self._components = [each for each in components if discrete and each.leaf.path[:1] == (MASK_KEY,)]
+        for component in self._components:
+            name = _action_of(component)
+            choices = sum(space.choices for key, space in discrete.items() if name in ("", key))
+            if component.first is not None or component.shape != (choices,) or not choices:
+                raise EnvironmentSetupError(
+                    f"observation component {component.leaf.name!r} has shape {component.shape}, and is no mask of the "
+                    f"action's discrete components, {', '.join(map(repr, discrete))}: give an array over all their "
+                    "choices or a map of arrays, or leave the component out: "
+                    f"--set \"environment.leave_out=['{component.leaf.name}']\""
+                )
+
+    def __bool__(self) -> bool:
+        return bool(self._components)
+
+    def contains(self, component: ObservationComponent) -> bool:
+        """Return whether a component of the observation is a mask."""
+        return any(component is mask for mask in self._components)
+
+    @property
+    def example(self) -> Any:
+        """Masks of a batch of one, in which every choice is legal; see `of`."""
+        return self._masks(lambda component: np.ones((1, *component.shape), np.bool_))
+
+    def of(self, observations: Any) -> Any:
+        """Return the masks of batched observations: one array over all choices, or a map by action component."""
+        return self._masks(lambda component: component.values(observations))
+
+    def _masks(self, mask: Callable[[ObservationComponent], np.ndarray]) -> Any:
+        masks = {_action_of(component): mask(component) for component in self._components}
+        return masks.get("", masks)
+
+
+def _action_of(component: ObservationComponent) -> str:
+    """Return the action component that an observed mask is for; empty for all."""
+    return component.leaf.name.removeprefix(MASK_KEY).removeprefix(".")
 
 
 def _flags(name: str, mask: np.ndarray, space: DiscreteSpace | None) -> np.ndarray:

@@ -17,7 +17,7 @@ from daedalus.actor.environments.components import (
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, described, reason_of
 from daedalus.actor.environments.interface import BackendEnvironments, Observed, Step
 from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.masks import MASK_KEY, Masks, mask_component, mask_of_one
+from daedalus.actor.environments.masks import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
@@ -51,13 +51,13 @@ class Transforms:
         self._observation_space, self._action_space = observation_space, action_space
         self._actions = _actions(spec, action_space)
         components = observation_components(observation_space)
-        self._mask_source = mask_component(components, self._actions.spaces)
-        self._observations = [component for component in components if component is not self._mask_source]
+        self._observed_masks = ObservedMasks(components, self._actions.spaces)
+        self._observations = [each for each in components if not self._observed_masks.contains(each)]
         if not self._observations:
             raise EnvironmentSetupError(
                 f"observation space {described(observation_space)} has nothing but the {MASK_KEY}"
             )
-        example = action_mask if self._mask_source is None else np.ones((1, *self._mask_source.shape), np.bool_)
+        example = self._observed_masks.example if self._observed_masks else action_mask
         self._masks = Masks(self._actions.spaces, example)
         self._pixels = _pixels(spec, self._observations)
         try:
@@ -74,7 +74,7 @@ class Transforms:
     @property
     def needs_mask(self) -> bool:
         """Whether `observe` needs an action mask: the actions have masks, and the observation does not contain them."""
-        return bool(self.spaces.masks) and self._mask_source is None
+        return bool(self.spaces.masks) and not self._observed_masks
 
     def observe(self, observations: Any, action_mask: Any, needed: np.ndarray) -> Observed:
         """Return batched observations of the environment as the run has them.
@@ -90,8 +90,8 @@ class Transforms:
         for component in self._observations:
             values, pixels = component.values(observations), self._pixels.get(component.leaf.name)
             frames[component.leaf.name] = values if pixels is None else pixels(values)
-        if self._mask_source is not None:
-            action_mask = self._mask_source.values(observations)
+        if self._observed_masks:
+            action_mask = self._observed_masks.of(observations)
         return Observed(frames, self._masks(action_mask, needed))
 
     def observe_one(self, observation: Any, action_mask: Any, needed: bool = True) -> Observed:

@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "--evaluator",
         action="store_true",
-        help="play greedily on the schedule of the run and report the returns, instead of sending rollouts",
+        help="play the evaluations of the run on its schedule and report the returns, instead of sending rollouts",
     )
     options.add_argument(
         "--stay",

@@ -196,7 +196,7 @@ def resume_parser() -> argparse.ArgumentParser:
         default=[],
         metavar="SECTION.KEY=VALUE",
         help="change a setting of the run from now on, such as training.learning_rate=0.0001. The environment, the "
-        "network, the algorithm and the seed cannot change",
+        "network, the algorithm, the optimiser, the normalisation of rewards and the seed cannot change",
     )
     add_allow_module(options, "config.toml of the run")
     add_log(options)

@@ -99,7 +99,7 @@ def read_header(data: bytes) -> Header:
 def is_own_key(key: str, name: str) -> bool:
     """Return whether a client may use a key if it may act only as `name` and as NAME.ANYTHING."""
     kind, *rest = key.split("/")[2:] or [""]
-    if kind in ("join", "rollouts", "evaluations", "actors"):
+    if kind in ("join", "rollouts", "reports", "evaluations", "actors"):
         return bool(rest) and (rest[0] == name or rest[0].startswith(f"{name}."))
     return kind in ("program", "snapshots", "end", "learner")
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from daedalus.learner.reporting.metrics import USER, Details
 from daedalus.protocol.keys import is_name
 
-_MOST = 64  # metrics between two rows
+MOST_METRICS = 64  # between two rows
 
 
 class UserMetrics:
@@ -28,7 +28,7 @@ class UserMetrics:
             return
         with self._lock:
             for name, value in metrics.items() if isinstance(metrics, dict) else ():
-                known = name in self._metrics or len(self._metrics) < _MOST
+                known = name in self._metrics or len(self._metrics) < MOST_METRICS
                 if known and is_name(name) and isinstance(value, int | float) and math.isfinite(value):
                     self._metrics[name] = float(value)
 

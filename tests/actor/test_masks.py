@@ -200,6 +200,60 @@ def test_masks_of_several_components_are_a_map() -> None:
     assert observed.masks["b"].tolist() == [[False, True, True, False, False]]
 
 
+MASKED = {"a": gym.Discrete(2), "arm": gym.Dict(grip=gym.MultiDiscrete([2, 3])), "c": gym.Box(-1, 1)}
+
+
+@pytest.mark.parametrize(
+    ("space", "mask", "expected"),
+    [
+        (gym.MultiBinary(7), [1, 0, 0, 1, 1, 0, 1], {"a": [True, False], "arm.grip": [False, True, True, False, True]}),
+        (
+            gym.Dict(a=gym.MultiBinary(2), arm=gym.Dict(grip=gym.Box(0, 1, (5,), np.int8))),
+            {"a": [0, 1], "arm": {"grip": [1, 0, 0, 0, 1]}},
+            {"a": [False, True], "arm.grip": [True, False, False, False, True]},
+        ),
+        (gym.Dict(a=gym.MultiBinary(2)), {"a": [0, 1]}, {"a": [False, True]}),
+    ],
+    ids=["one array", "a map", "a map of some"],
+)
+def test_masks_in_the_observation_cover_several_components(
+    space: gymnasium.Space, mask: Any, expected: dict[str, list[bool]]
+) -> None:
+    observations = gym.Dict(seen=gym.Box(0, 1), action_mask=space)
+    transforms = Transforms(SPEC, observations, gym.Dict(MASKED))
+    assert list(transforms.spaces.observations) == ["seen"]
+    assert transforms.spaces.masks == {name: len(flags) for name, flags in expected.items()}
+    assert not transforms.needs_mask
+
+    def arrays(part: Any) -> Any:
+        return (
+            {key: arrays(value) for key, value in part.items()} if isinstance(part, dict) else np.array(part, np.int8)
+        )
+
+    observed = transforms.observe_one({"seen": np.zeros(1), "action_mask": arrays(mask)}, None)
+    assert {name: flags[0].tolist() for name, flags in observed.masks.items()} == expected
+
+
+@pytest.mark.parametrize(
+    ("space", "name"),
+    [
+        (gym.MultiBinary(6), "action_mask"),
+        (gym.MultiDiscrete([2] * 7), "action_mask"),
+        (gym.Dict(a=gym.MultiBinary(3)), "action_mask.a"),
+        (gym.Dict(b=gym.MultiBinary(2)), "action_mask.b"),
+        (gym.Dict(c=gym.MultiBinary(1)), "action_mask.c"),
+    ],
+)
+def test_mask_in_the_observation_that_fits_no_action_is_refused(space: gymnasium.Space, name: str) -> None:
+    """It would be observed like anything else, and illegal actions be played."""
+    observations = gym.Dict(seen=gym.Box(0, 1), action_mask=space)
+    with pytest.raises(EnvironmentSetupError, match=rf"observation component '{name}' has shape .* 'a', 'arm.grip': "):
+        Transforms(SPEC, observations, gym.Dict(MASKED))
+    kept = SPEC.model_copy(update={"leave_out": (name,)})
+    assert list(Transforms(kept, observations, gym.Dict(MASKED)).spaces.observations) == ["seen"]
+    assert len(Transforms(SPEC, observations, gym.Box(-1, 1)).spaces.observations) == 2, "no action has choices"
+
+
 def observe(mask: Any, needed: bool = True, example: Any = None, action: gymnasium.Space | None = None) -> np.ndarray:
     """Return the mask of one observation of an environment with masks."""
     space = action or gym.MultiDiscrete([2, 3])

@@ -12,7 +12,7 @@ import pytest
 
 from daedalus.cli.callbacks import Callback, CallbackObserver, TrainingRun, observed
 from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.user_metrics import RowsWriter, UserMetrics
+from daedalus.learner.reporting.user_metrics import MOST_METRICS, RowsWriter, UserMetrics
 
 
 class Recording(Callback):
@@ -81,6 +81,16 @@ def test_a_row_that_was_cut_off_is_left_out(tmp_path: Path, learner: subprocess.
 def test_a_metric_that_cannot_be_written_is_refused(tmp_path: Path, metrics: dict[Any, Any]) -> None:
     with pytest.raises(ValueError, match="use a finite number"):
         TrainingRun(tmp_path).log(metrics)
+
+
+def test_more_metrics_than_a_row_takes_are_refused(tmp_path: Path) -> None:
+    run = TrainingRun(tmp_path)
+    run.log({f"m{number}": 1.0 for number in range(MOST_METRICS)})
+    run.log({"m0": 2.0})
+    with pytest.raises(ValueError, match="a row has at most 64 metrics of yours: log fewer names"):
+        run.log({"m1": 5.0, "another": 1.0})
+    assert run.take_metrics() == {f"m{number}": 1.0 + (number == 0) for number in range(MOST_METRICS)}
+    run.log({"another": 1.0})
 
 
 def test_the_learner_ignores_what_is_no_metric() -> None:

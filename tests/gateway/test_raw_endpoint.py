@@ -143,6 +143,8 @@ def test_client_with_a_token_acts_under_its_own_name_only(
         ("daedalus/r/actors/wing/7", True),
         ("daedalus/r/actors/*/*", False),
         ("daedalus/r/evaluations/other", False),
+        ("daedalus/r/reports/wing", True),
+        ("daedalus/r/reports/other", False),
         ("daedalus/r/program/*", True),
         ("daedalus/r/snapshots", True),
         ("daedalus/r/end", True),
