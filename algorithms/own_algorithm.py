@@ -74,7 +74,7 @@ def check_updates(
             after_update()
     except Exception as error:  # the user's code may raise anything
         raise _fault(spec.algorithm, error) from error
-    if made != expected:
+    if made > expected:  # fewer where it stops its passes early: the zeros are far from the policy
         raise AlgorithmError(
             f"{_SETTING}={spec.algorithm}: its losses make {made} updates of a batch, and its record says {expected}"
         )

@@ -94,7 +94,7 @@ class Stopping(Appo):
 
     def losses(self, batch, forward):
         for index, losses in enumerate(super().losses(batch, forward)):
-            if index == 2 and batch.rewards.any():  # not in the trial before the run
+            if index == (2 if batch.rewards.any() else 0):  # at once in the trial before the run
                 return
             yield losses
 
