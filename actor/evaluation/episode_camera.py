@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium
-from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.make import make_environments
-from daedalus.policy.acting.noise import Noise, draw_noise, neutral_noise
+from daedalus.actor.evaluation.running_episodes import RunningEpisodes
+from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spaces import DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 
@@ -75,17 +74,15 @@ class EpisodeCamera:
     def play(self, runtime: OnnxRuntime) -> Iterator[Moment]:
         """Play one episode with the most probable actions, and yield each step. Raises EnvironmentSetupError."""
         environments, spaces = self._environments, self._environments.spaces
-        stacks = ObservationStacks(spaces, 1)
-        observed = environments.reset(int(self._random.integers(_SEEDS)))
-        stacks.push(observed.frames, np.ones(1, np.bool_))
-        state, total = np.zeros((1, runtime.state_size), np.float32), 0.0
+        running = RunningEpisodes(spaces, runtime, 1)
+        running.observe(environments.reset(int(self._random.integers(_SEEDS))))
+        total = 0.0
         for step in range(1, self._longest + 1):
-            choice = self._choose(runtime, stacks.observations, state, observed)
-            value = self._estimate(stacks.observations, state)
-            state = choice.state[:1]
+            value = self._estimate(running.observations, running.state)
+            choice = running.act(self._noise(runtime.noise_size, running.observations))
             taken = {name: values[:1] for name, values in choice.actions.items()}
             observed, rewards, terminated, truncated = environments.step(taken)
-            stacks.push(observed.frames, np.zeros(1, np.bool_))
+            running.observe(observed)
             total += float(rewards[0])
             facts = action_facts(spaces, choice)
             yield Moment(
@@ -94,21 +91,10 @@ class EpisodeCamera:
             if terminated[0] or truncated[0]:
                 return
 
-    def _choose(
-        self, runtime: OnnxRuntime, observations: dict[str, np.ndarray], state: np.ndarray, observed: Observed
-    ) -> Choice:
-        """Return the most probable action in row 0, and samples in the other rows."""
+    def _noise(self, size: NoiseSize, observations: dict[str, np.ndarray]) -> Noise:
+        """Return noise that gives the most probable action in row 0, and samples in the other rows."""
         samples = _FEW_SAMPLES if sum(values.size for values in observations.values()) > _LARGE else _SAMPLES
-        neutral, drawn = neutral_noise(runtime.noise_size, 1), draw_noise(runtime.noise_size, samples, self._random)
-        noise = Noise(
-            uniform=np.concatenate([neutral.uniform, drawn.uniform]),
-            normal=np.concatenate([neutral.normal, drawn.normal]),
-        )
-
-        def repeated(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-            return {name: values.repeat(samples + 1, axis=0) for name, values in arrays.items()}
-
-        return runtime.act(repeated(observations), state.repeat(samples + 1, axis=0), noise, repeated(observed.masks))
+        return joined_noise([neutral_noise(size, 1), draw_noise(size, samples, self._random)])
 
 
 def action_facts(spaces: Spaces, choice: Choice) -> list[dict[str, Any]]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.interface import Observed, VectorEnvironment
-from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, neutral_noise
+from daedalus.actor.evaluation.running_episodes import RunningEpisodes
+from daedalus.policy.acting.noise import Noise, NoiseSize, draw_noise, joined_noise, neutral_noise
 from daedalus.policy.acting.runtime import PolicyRuntime
-from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import CollectionSpec, EnvironmentSpec, EvaluationSpec
 
 _MAX_ENVIRONMENTS = 100
@@ -108,11 +108,7 @@ class _EpisodeNoise:
         """Return the noise of one step."""
         if self._neutral is not None:
             return self._neutral
-        drawn = [draw_noise(self._size, 1, generator) for generator in self._generators]
-        return Noise(
-            uniform=np.concatenate([noise.uniform for noise in drawn]),
-            normal=np.concatenate([noise.normal for noise in drawn]),
-        )
+        return joined_noise([draw_noise(self._size, 1, generator) for generator in self._generators])
 
 
 class _Results:
@@ -145,15 +141,15 @@ def _play_round(
     """
     count = environments.count
     numbers = first + np.arange(count)  # of the episodes
-    stacks = ObservationStacks(environments.spaces, count)
-    state = np.zeros((count, runtime.state_size), np.float32)
-    stacks.push(observed.frames, np.ones(count, np.bool_))
+    running = RunningEpisodes(environments.spaces, runtime, count)
+    running.observe(observed)
     playing = numbers < len(results.returns)
     for _ in range(longest):
-        actions, state = _act(runtime, stacks.observations, state, random.draw(), observed.masks)
+        choice = running.act(random.draw())
+        actions = {name: values[:count] for name, values in choice.actions.items()}
         observed, rewards, terminated, truncated = environments.step(actions)
         _check_finite(rewards[playing], numbers[playing])
-        stacks.push(observed.frames, np.zeros(count, np.bool_))
+        running.observe(observed)
         results.returns[numbers[playing]] += rewards[playing]
         results.lengths[numbers[playing]] += 1
         ended = playing & (terminated | truncated)
@@ -176,30 +172,10 @@ def _check_finite(rewards: np.ndarray, numbers: np.ndarray) -> None:
         )
 
 
-def _act(
-    runtime: PolicyRuntime,
-    observations: dict[str, np.ndarray],
-    state: np.ndarray,
-    noise: Noise,
-    masks: dict[str, np.ndarray],
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return actions {name: [E, D]} and the next state [E, S].
+def _rows(count: int) -> int:
+    """Return the number of rows of the policy's batches for `count` environments.
 
     A single row is computed twice, as a batch of two: for a batch of one, matrix products use another kernel, which
     rounds differently.
     """
-    count, repeats = len(state), _rows(len(state)) // len(state)
-    if repeats > 1:
-        observations, masks = _repeated(observations, repeats), _repeated(masks, repeats)
-        state = state.repeat(repeats, axis=0)
-    choice = runtime.act(observations, state, noise, masks)
-    return {name: actions[:count] for name, actions in choice.actions.items()}, choice.state[:count]
-
-
-def _repeated(components: dict[str, np.ndarray], repeats: int) -> dict[str, np.ndarray]:
-    return {name: values.repeat(repeats, axis=0) for name, values in components.items()}
-
-
-def _rows(count: int) -> int:
-    """Return the number of rows of the policy's batches for `count` environments."""
     return max(count, 2)

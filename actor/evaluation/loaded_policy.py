@@ -12,13 +12,13 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
 from daedalus.actor.environments.interface import Observed
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.actor.evaluation.running_episodes import RunningEpisodes
 from daedalus.policy.acting.noise import draw_noise, neutral_noise
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.hub import pull
 from daedalus.policy.saving.saved_policy import SavedPolicy, find_policy
 from daedalus.policy.saving.saved_policy import pretrained as pretrained_directory
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules
-from daedalus.protocol.frames import ObservationStacks
 from daedalus.protocol.spec import RunSpec
 
 
@@ -51,8 +51,7 @@ class Policy:
         """Start an episode: forget what was seen. `seed` is for the actions of `act(sampled=True)`."""
         if seed is not None:
             self._random = np.random.default_rng(seed)
-        self._stacks = ObservationStacks(self._transforms.spaces, 1)
-        self._state = np.zeros((1, self._runtime.state_size), np.float32)
+        self._running = RunningEpisodes(self._transforms.spaces, self._runtime, 1)
         self._action: Any = None
         self._repeats_left = 0
 
@@ -90,12 +89,10 @@ class Policy:
             )
 
     def _choose(self, observed: Observed, sampled: bool) -> Any:
-        self._stacks.push(observed.frames, np.array([self._action is None]))
+        self._running.observe(observed)
         size = self._runtime.noise_size
         noise = draw_noise(size, 1, self._random) if sampled else neutral_noise(size, 1)
-        choice = self._runtime.act(self._stacks.observations, self._state, noise, observed.masks)
-        self._state = choice.state
-        return self._transforms.env_action(choice.actions)
+        return self._transforms.env_action(self._running.act(noise).actions)
 
 
 def load_policy(

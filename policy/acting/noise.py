@@ -1,5 +1,6 @@
 """The random numbers that a policy program makes samples from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +27,14 @@ def draw_noise(size: NoiseSize, rows: int, random: np.random.Generator) -> Noise
     return Noise(
         uniform=random.random((rows, size.uniform), np.float32),
         normal=random.standard_normal((rows, size.normal), np.float32),
+    )
+
+
+def joined_noise(parts: Sequence[Noise]) -> Noise:
+    """Return the noise of the rows of several parts, one part after the other."""
+    return Noise(
+        uniform=np.concatenate([part.uniform for part in parts]),
+        normal=np.concatenate([part.normal for part in parts]),
     )
 
 
