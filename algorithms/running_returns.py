@@ -68,7 +68,7 @@ def _stream(rollout: Rollout, row: int) -> _Stream:
     checksum = 0
     if rollout.environments == 1:
         for frames in rollout.frames.values():
-            checksum = zlib.crc32(np.ascontiguousarray(frames[len(frames) - 1 - rollout.rows + row]), checksum)
+            checksum = zlib.crc32(frames[len(frames) - 1 - rollout.rows + row].tobytes(), checksum)
     return rollout.identity.actor, rollout.identity.incarnation, checksum
 
 

@@ -273,8 +273,9 @@ class RolloutIntake:
 
     def _has_room_for(self, content: Upload | Rejected) -> bool:
         """Return whether content can be judged now. The barrier rejects a rollout that it has no room for."""
-        waits = isinstance(content, Upload) and self._ending is None and not self._spec.algorithm.synchronous
-        return not waits or self._buffer.has_room_for(content)
+        if isinstance(content, Rejected) or self._ending is not None or self._spec.algorithm.synchronous:
+            return True
+        return self._buffer.has_room_for(content)
 
     def _answer_held(self) -> None:
         """Answer the accepted rollouts whose answers need not wait any more."""
