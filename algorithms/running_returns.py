@@ -50,12 +50,14 @@ class RunningReturns:
         """Return G [E] before row 0, 0 if the rollout continues no other, and make the rollout its actor's newest."""
         identity, none = rollout.identity, np.zeros(rollout.environments)
         newest = self._newest.get(identity.actor)
+        if newest is not None and newest.identity.incarnation != identity.incarnation:
+            newest = None
         several = newest is not None and newest.several
         continued = _stream(rollout, 0)
         if rollout.environments == 1 and continued in self._running:
             several |= newest is not None and continued != newest.stream
             running = self._running.pop(continued)
-        elif newest is not None and not several and _follows(identity, newest.identity):
+        elif newest is not None and not several and identity.sequence == newest.identity.sequence + 1:
             running = self._running.get(newest.stream, none)  # stays there: it may be another agent's
         else:
             running = none
@@ -70,10 +72,6 @@ def _stream(rollout: Rollout, row: int) -> _Stream:
         for frames in rollout.frames.values():
             checksum = zlib.crc32(frames[len(frames) - 1 - rollout.rows + row].tobytes(), checksum)
     return rollout.identity.actor, rollout.identity.incarnation, checksum
-
-
-def _follows(identity: RolloutIdentity, last: RolloutIdentity) -> bool:
-    return identity.incarnation == last.incarnation and identity.sequence == last.sequence + 1
 
 
 def _set(entries: dict[Any, Any], key: object, value: object) -> None:
