@@ -30,7 +30,8 @@ class MissionSpace(gymnasium.Space[str]):
 class Mission(gymnasium.Env):
     """Environment of four steps; the observation is the step, and the mission of the episode."""
 
-    observation_space = gym.Dict({"mission": MissionSpace(), "step": gym.Box(0.0, 4.0, (1,), np.float32)})
+    _step_space = gym.Box(0.0, 4.0, (1,), np.float32)
+    observation_space = gym.Dict({"mission": MissionSpace(), "step": _step_space})
     action_space = gym.Discrete(2)
 
     def __init__(
@@ -38,7 +39,7 @@ class Mission(gymnasium.Env):
     ) -> None:
         self._missions, self._disconnects = missions, disconnects
         if text_space:
-            self.observation_space = gym.Dict({**self.observation_space.spaces, "mission": gym.Text(30)})
+            self.observation_space = gym.Dict({"mission": gym.Text(30), "step": self._step_space})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)

@@ -397,7 +397,7 @@ def test_error_of_the_environment_itself_is_not_hidden(monkeypatch: pytest.Monke
 
 
 def test_component_that_is_left_out_does_not_hide_an_error() -> None:
-    kwargs = {"text_space": True, "disconnects": True}
+    kwargs: dict[str, Any] = {"text_space": True, "disconnects": True}
     environments = created(
         EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), kwargs=kwargs), 2
     )
@@ -503,7 +503,7 @@ def test_minigrid_is_registered_by_its_names() -> None:
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"text_space": True}], ids=["space of its own", "text with blanks"])
-def test_text_can_be_left_out_in_processes(kwargs: dict[str, bool]) -> None:
+def test_text_can_be_left_out_in_processes(kwargs: dict[str, Any]) -> None:
     spec = EnvironmentSpec(id="mission_environment:Mission-v0", leave_out=("mission",), processes=True, kwargs=kwargs)
     environments = created(spec, 2)
     try:
