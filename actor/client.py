@@ -97,7 +97,7 @@ class Client:
             raise ValueError(f"link is {link!r}: choose from {', '.join(get_args(LinkChoice))}")
         if not isinstance(timeout, Real) or not timeout > 0.0:
             raise ValueError(f"timeout is {timeout!r}: it must be a number of seconds above 0")
-        agents, timeout = int(agents), float(timeout)  # threading takes no number of NumPy
+        agents, timeout = int(agents), min(float(timeout), threading.TIMEOUT_MAX)  # threading takes no others
         guard = PolicyGuard(action_space, safe_action, max_policy_age, untrained=untrained)
         credentials = credentials_to_connect([connect], tls, "actor")
         identity = credentials.name if credentials else ""
@@ -145,8 +145,7 @@ class Client:
 
     def clock(self, rate: float) -> Clock:
         """Return a clock with `rate` ticks a second, for the loop that calls `act`. The loop ends with the run."""
-        # After an error the loop goes on, so that its next `act` raises it.
-        self._clocks.append(Clock(rate, is_over=lambda: self.is_over and self._error is None))
+        self._clocks.append(Clock(rate, is_over=lambda: self.is_over))
         return self._clocks[-1]
 
     def end_episode(self, *, terminated: bool, observation: Any = None) -> None:
@@ -165,8 +164,11 @@ class Client:
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended: `act` still works, but nobody learns from it."""
-        return not self._thread.is_alive()
+        """Whether the run has ended: `act` still works, but nobody learns from it.
+
+        False after an error, so that a loop goes on and its next `act` raises it.
+        """
+        return self._error is None and not self._thread.is_alive()
 
     def close(self) -> None:
         """Leave the run. Idempotent."""

@@ -115,7 +115,9 @@ class Gateway:
         name = self._config.actor_name(hello.name)
         spaces = ClientSpaces(hello.observations, hello.actions)
         if name in self._seats:
-            raise ClientError("refused", f"a client named {hello.name!r} is connected: choose another name")
+            # It may be the same client, whose connection was lost without a word: pings end it soon.
+            reason = f"a client named {hello.name!r} is connected: choose another name, or try again in 20 s"
+            raise ClientError("unavailable", reason)
         if len(self._seats) >= MAX_CLIENTS:
             raise ClientError("unavailable", f"{MAX_CLIENTS} clients are connected already: try again later")
         actor = self._parked.take(name, spaces) or self._new_actor(name, spaces, address)

@@ -23,11 +23,38 @@ from daedalus.transport.credentials import CERTIFICATE, KEY
 
 _PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
 _MAX_CONNECTIONS = 2048
+_MAX_NEWCOMERS = 128  # WebSockets that have sent no message yet
 _STOP_SECONDS = 2  # for connections to end after a stop
 _KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _MAX_FRAGMENTS = 4096  # of one message: the limit on its bytes does not count empty ones
 _REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer
+
+
+class _Newcomers:
+    """The WebSockets that have sent no message yet; the oldest is ended if there are too many.
+
+    Each may hold a part of a first message, which is large. A client that is honest sends it at once.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[OurWebSocket, None] = {}  # oldest first
+
+    def add(self, connection: "OurWebSocket") -> None:
+        if len(self._waiting) >= _MAX_NEWCOMERS:
+            oldest = next(iter(self._waiting))
+            del self._waiting[oldest]
+            oldest.transport.abort()
+        self._waiting[connection] = None
+
+    def remove(self, connection: "OurWebSocket") -> None:
+        self._waiting.pop(connection, None)
+
+
+class _Config(uvicorn.Config):
+    """Settings of one server, and what its connections share."""
+
+    newcomers: _Newcomers
 
 
 class PromptHttp(H11Protocol):
@@ -51,7 +78,10 @@ class PromptHttp(H11Protocol):
         self._end_deadline()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Let the WebSocket have its own deadlines."""
+        """Let the WebSocket have its own deadlines. uvicorn's limit on connections is for other requests only."""
+        if len(self.connections) > _MAX_CONNECTIONS:
+            self._abort()
+            return
         self._end_deadline()
         super().handle_websocket_upgrade(event)
 
@@ -73,6 +103,18 @@ class OurWebSocket(WebSocketsSansIOProtocol):
     _on_message: Callable[[str | bytes], None] | None = None  # after `divert`
     _on_writable: Callable[[], None] | None = None
 
+    config: _Config
+
+    def connection_made(self, transport: BaseTransport) -> None:
+        """Begin to wait for the first message."""
+        super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
+        self.config.newcomers.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Free the memory of the connection."""
+        super().connection_lost(exc)
+        self.config.newcomers.remove(self)
+
     def handle_connect(self, event: HandshakeRequest) -> None:
         """Give the application the channel."""
         super().handle_connect(event)
@@ -89,6 +131,7 @@ class OurWebSocket(WebSocketsSansIOProtocol):
 
     def send_receive_event_to_app(self) -> None:
         """Deliver a message; pause reading only if the application is behind, which costs two system calls."""
+        self.config.newcomers.remove(self)
         if self._on_message is not None and not self.close_sent:
             self._deliver(self._on_message)
             return
@@ -175,7 +218,7 @@ class Server(uvicorn.Server):
     """A web server that serves until it is asked to stop, and leaves signals to its caller."""
 
     def __init__(self, application: Application, tls: ssl.SSLContext | None = None) -> None:
-        config = uvicorn.Config(
+        config = _Config(
             application,
             http=PromptHttp,
             ws=OurWebSocket,
@@ -191,6 +234,7 @@ class Server(uvicorn.Server):
             server_header=False,
             proxy_headers=False,
         )
+        config.newcomers = _Newcomers()
         config.load()
         config.ssl = tls
         logging.getLogger("uvicorn").setLevel(logging.WARNING)

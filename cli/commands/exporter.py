@@ -106,7 +106,9 @@ def exporter(arguments: list[str]) -> int:
     """Run `daedalus exporter` and return its exit status."""
     parsed = parser().parse_args(arguments)
     try:
-        from prometheus_client import CollectorRegistry, start_http_server
+        from prometheus_client import CollectorRegistry
+
+        from daedalus.cli.metrics_server import MetricsServer
     except ModuleNotFoundError:
         print(
             'daedalus exporter: prometheus-client is not installed: pip install "daedalus-rl[monitoring]"',
@@ -124,13 +126,15 @@ def exporter(arguments: list[str]) -> int:
     registry.register(collector)
     host, port = parsed.listen
     try:
-        server, thread = start_http_server(port, host, registry)
+        server = MetricsServer(host, port, registry)
     except OSError as error:
         print(
             f"daedalus exporter: cannot listen on {host}:{port}: {error.strerror}: choose another --listen",
             file=sys.stderr,
         )
         return 1
+    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
     _logger.info("serving http://%s:%d/metrics", host, server.server_port)
     try:
         _follow(collector, parsed.connect, credentials, stop)

@@ -20,7 +20,10 @@ const connection = new Connection({
     takers[message.type]?.(message);
   },
   frame: (buffer) => camera.show(buffer),
-  lost: () => summary.lost(),
+  lost(reason) {
+    summary.lost(reason);
+    orders.lost();
+  },
   refused(reason) {
     byId("ask-token").hidden = false;
     summary.show({ state: "forbidden", reason, status: null });

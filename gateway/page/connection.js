@@ -8,8 +8,9 @@ export class Connection {
   #pause = FIRST_PAUSE;
   #token = "";
   #refused = false;
+  #reason = ""; // why the gateway ends the connection
 
-  /** `on` has the functions message(object), frame(ArrayBuffer), opened(), lost() and refused(reason). */
+  /** `on` has the functions message(object), frame(ArrayBuffer), opened(), lost(reason) and refused(reason). */
   constructor(on) {
     this.on = on;
   }
@@ -26,8 +27,11 @@ export class Connection {
     socket.onclose = () => this.#closed();
   }
 
+  /** Send a message, and return whether there is a connection. */
   send(message) {
-    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
+    const open = this.#socket?.readyState === WebSocket.OPEN;
+    if (open) this.#socket.send(JSON.stringify(message));
+    return open;
   }
 
   #take(data) {
@@ -39,6 +43,8 @@ export class Connection {
     } else if (message.type === "error" && message.code === "refused") {
       this.#refused = true;
       this.on.refused(message.reason);
+    } else if (message.type === "error") {
+      this.#reason = message.reason;
     } else {
       this.on.message(message);
     }
@@ -46,7 +52,8 @@ export class Connection {
 
   #closed() {
     if (this.#refused) return;
-    this.on.lost();
+    this.on.lost(this.#reason);
+    this.#reason = "";
     setTimeout(() => this.open(this.#token), this.#pause);
     this.#pause = Math.min(2 * this.#pause, LONGEST_PAUSE);
   }

@@ -5,6 +5,8 @@ import { byId, setText } from "./dom.js";
 const DONE = { stop: "The learner saves a checkpoint and ends.", checkpoint: "The learner saves a checkpoint." };
 
 export class Orders {
+  #pending = false; // whether the learner's answer to an order is awaited
+
   constructor(connection) {
     this.connection = connection;
     byId("orders").onsubmit = (event) => {
@@ -23,11 +25,16 @@ export class Orders {
   }
 
   done({ order }) {
-    setText(byId("order-result"), DONE[order]);
+    this.#show(DONE[order]);
   }
 
   refused({ reason }) {
-    setText(byId("order-result"), `Not done: ${reason}`);
+    this.#show(`Not done: ${reason}`);
+  }
+
+  /** The connection has ended. */
+  lost() {
+    if (this.#pending) this.#show("The connection was lost before an answer came: see below whether it was done.");
   }
 
   #ask(order) {
@@ -37,7 +44,13 @@ export class Orders {
   }
 
   #give(order) {
-    setText(byId("order-result"), "Asking the learner...");
-    this.connection.send({ type: "order", order, token: byId("operator-token").value });
+    const sent = this.connection.send({ type: "order", order, token: byId("operator-token").value });
+    this.#show(sent ? "Asking the learner..." : "Not done: the gateway does not answer. Try again.");
+    this.#pending = sent;
+  }
+
+  #show(text) {
+    this.#pending = false;
+    setText(byId("order-result"), text);
   }
 }

@@ -44,8 +44,8 @@ export class Summary {
   }
 
   /** Show that the gateway is gone, with the last figures. */
-  lost() {
-    if (this.#seen.state !== "ended") this.show({ ...this.#seen, state: "closed", reason: "" });
+  lost(reason) {
+    if (this.#seen.state !== "ended") this.show({ ...this.#seen, state: "closed", reason });
   }
 
   #notice({ state, reason, status }) {

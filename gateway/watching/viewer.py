@@ -32,8 +32,7 @@ class ViewerConnection:
         self._data, self._guard, self._receive, self._send_event = data, guard, receive, send
         self._channel = channel_of(scope)
         self._rate = RateLimit(_RATE, _BURST)
-        self._sent = Observation()
-        self._has_rows = False
+        self._sent: Observation | None = None
         self._camera: asyncio.Task[None] | None = None
 
     async def serve(self) -> None:
@@ -91,16 +90,17 @@ class ViewerConnection:
                 await news.wait()
 
     def _changes(self, seen: Observation) -> list[dict[str, Any]]:
+        """Return the messages about what differs from what was sent; all at first, in place of what the page had."""
         sent, messages = self._sent, [observation.run_message(seen)]
-        if seen.actors is not sent.actors:
+        if sent is None or seen.actors is not sent.actors:
             messages.append(observation.actors_message(seen.actors))
-        if seen.events is not sent.events:
+        if sent is None or seen.events is not sent.events:
             messages.append(observation.events_message(seen.events))
-        if seen.rows is not sent.rows:
-            begun = self._has_rows and sent.generation == seen.generation
-            first = sent.rows[-1][0] + 1 if begun and sent.rows else 0
-            messages.append(observation.metrics_message(seen, begun, first))
-            self._has_rows = True
+        if sent is None or sent.generation != seen.generation:
+            messages.append(observation.metrics_message(seen, False, 0))
+        elif seen.rows is not sent.rows:
+            first = sent.rows[-1][0] + 1 if sent.rows else 0
+            messages.append(observation.metrics_message(seen, True, first))
         return messages
 
     async def _send_texts(self, messages: list[dict[str, Any]]) -> None:

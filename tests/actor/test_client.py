@@ -1,5 +1,6 @@
 """Client: what its own thread reports to the caller's thread."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -50,11 +51,17 @@ def test_client_rollouts_reach_the_learner(learner: ScriptedLearner) -> None:
         assert not client.is_over
 
 
+def test_client_may_wait_for_ever(learner: ScriptedLearner) -> None:
+    with Client("tcp/127.0.0.1:1", **SPACES, timeout=math.inf) as client:
+        client.act(OBSERVATION)
+
+
 def test_act_raises_the_quarantine_that_ended_the_client(learner: ScriptedLearner) -> None:
     with Client("tcp/127.0.0.1:1", **SPACES) as client:
         fill_rollout(client)
         learner.receive()[1].reply(encode(Acknowledgement(verdict="quarantined", reason="why")))
-        until(lambda: client.is_over)
+        until(lambda: not client._thread.is_alive())
+        assert not client.is_over, "a loop that ends with the run would hide the error"
         with pytest.raises(ActorError, match="quarantined this actor: why"):
             client.act(OBSERVATION)
 
@@ -66,7 +73,7 @@ def test_act_raises_a_bug_of_the_clients_thread(learner: ScriptedLearner, monkey
     with Client("tcp/127.0.0.1:1", **SPACES) as client:
         monkeypatch.setattr(ClientCollector, "collect", fail)
         fill_rollout(client)
-        until(lambda: client.is_over)
+        until(lambda: not client._thread.is_alive())
         with pytest.raises(ZeroDivisionError, match="a bug"):
             client.act(OBSERVATION)
 

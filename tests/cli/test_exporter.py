@@ -1,12 +1,17 @@
 """Test of cli/commands/exporter.py: scrapes over a network, and mistakes on the command line."""
 
+import contextlib
 import socket
 import sys
+import threading
+import urllib.request
 
 import pytest
+from processes import LIMIT, until
 from prometheus_client import CollectorRegistry
 from statuses import run_status
 
+from daedalus.cli import metrics_server
 from daedalus.cli.commands.exporter import StatusCollector, exporter
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -91,3 +96,34 @@ def test_an_address_in_use_is_reported(capsys: pytest.CaptureFixture[str]) -> No
         other.listen()
         assert exporter(["--connect", UNUSED, "--listen", f"127.0.0.1:{other.getsockname()[1]}"]) == 1
     assert "cannot listen on 127.0.0.1:" in capsys.readouterr().err
+
+
+def test_silent_connections_keep_no_threads_and_nobody_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics_server, "_MAX_CONNECTIONS", 3)
+    server = metrics_server.MetricsServer("127.0.0.1", 0, CollectorRegistry())
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    before = threading.active_count()
+    address = ("127.0.0.1", server.server_port)
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(address, LIMIT)) for _ in range(8)]
+        assert silent[0].recv(1) == b"", "the oldest is ended"
+        with urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}/metrics", timeout=LIMIT) as answer:
+            assert answer.status == 200
+        until(lambda: threading.active_count() - before <= 3)
+    until(lambda: threading.active_count() == before)
+    server.shutdown()
+    server.server_close()
+    thread.join(LIMIT)
+
+
+def test_a_connection_that_says_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics_server._Handler, "timeout", 0.1)
+    server = metrics_server.MetricsServer("127.0.0.1", 0, CollectorRegistry())
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    with socket.create_connection(("127.0.0.1", server.server_port), LIMIT) as silent:
+        assert silent.recv(1) == b""
+    server.shutdown()
+    server.server_close()
+    thread.join(LIMIT)

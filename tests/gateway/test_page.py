@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,16 @@ from watched import HOSTILE, actor_status, observed, run_status
 
 from daedalus.cli.commands.certs import certs
 from daedalus.cli.status_query import ask
+from daedalus.gateway.tokens import OperatorToken
+from daedalus.gateway.watching import page_data
+from daedalus.protocol.orders import Order
 from daedalus.protocol.status import Event
 from daedalus.transport.connecting import connect
 from daedalus.transport.memory import MemoryNetwork
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Debian's chromium")
 MILLISECONDS = 1000 * LIMIT
+TOKEN = "an operator's token of some length"
 ENDLESS = ("--set", "training.stop_when_solved=false", "--env-steps", 10**9)
 Open = Callable[..., Visit]
 
@@ -184,6 +189,46 @@ def test_a_page_before_the_learner_and_after_the_end_says_so(gateway: RunningGat
     show(gateway, run_status(), state="ended", reason="the run is over: the learner has finished")
     page.wait_for_selector("#notices:has-text('The run has ended: the run is over')")
     assert "return 12.5 after 100 env_steps" in text_of(page, "#notices")
+
+
+def test_an_order_that_the_gateway_does_not_receive_or_answer_is_reported(
+    network: MemoryNetwork, visit: Open, tmp_path: Path
+) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    gateway = RunningGateway(network, follows=False, operator=OperatorToken(tmp_path / "token"))
+    asked, answer = threading.Event(), threading.Event()
+
+    def give_order(order: Order) -> str:
+        asked.set()
+        answer.wait(LIMIT)
+        return ""
+
+    gateway.data.give_order = give_order
+    try:
+        visited = visit(f"http://127.0.0.1:{gateway.port}/")
+        page, visited.loses_gateway = visited.page, True
+        show(gateway, run_status())
+        page.locator("#operator-token").fill(TOKEN)
+        page.get_by_role("button", name="Save a checkpoint").click()
+        page.wait_for_selector("#order-result:has-text('Asking the learner')")
+        assert asked.wait(LIMIT)
+    finally:
+        closing = threading.Thread(target=gateway.close)
+        closing.start()
+        answer.set()
+        closing.join(LIMIT)
+    wait_for(page, "!document.querySelector('#order-result').textContent.startsWith('Asking')")
+    wait_for(page, "document.querySelector('#state').dataset.state === 'closed'")
+    page.get_by_role("button", name="Save a checkpoint").click()
+    page.wait_for_selector("#order-result:has-text('Not done: the gateway does not answer')")
+
+
+def test_a_page_that_is_not_served_says_why(
+    gateway: RunningGateway, visit: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_data, "MAX_VIEWERS", 0)
+    page = visit(f"http://127.0.0.1:{gateway.port}/").page
+    page.wait_for_selector("#notices:has-text('0 pages are open already: close one')")
 
 
 def test_play_takes_no_part_in_a_run_of_another_environment(network: MemoryNetwork, visit: Open) -> None:

@@ -16,7 +16,7 @@ import pytest
 from gateways import JsonClient, RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway import server
@@ -196,6 +196,30 @@ def test_connection_without_a_request_is_closed(
     with socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as silent:
         silent.sendall(b"GET /actor HTTP/1.1\r\nHost:")
         assert silent.recv(1) == b""
+
+
+def test_websockets_without_a_message_are_limited_and_the_oldest_ends(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_MAX_NEWCOMERS", 2)
+    known = []
+    for number in range(3):
+        known.append(connect())
+        assert known[-1].hello(f"c-{number}")["type"] == "welcome"
+    silent = [connect() for _ in range(3)]
+    with pytest.raises(ConnectionClosed):
+        silent[0].receive()
+    assert silent[2].hello("late")["type"] == "welcome"
+    assert all(client.act([0.0, 0.0, 0.0, 0.0])["type"] == "action" for client in known)
+    assert silent[1].hello("later")["type"] == "welcome"
+
+
+def test_connections_are_limited(learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "_MAX_CONNECTIONS", 2)
+    clients = [connect() for _ in range(2)]
+    with pytest.raises((InvalidMessage, ConnectionError, EOFError)):
+        connect()
+    assert [client.hello(f"c-{number}")["type"] for number, client in enumerate(clients)] == ["welcome"] * 2
 
 
 def test_connection_without_a_further_request_is_closed(

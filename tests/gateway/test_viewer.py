@@ -101,6 +101,10 @@ def test_a_page_that_is_opened_before_there_is_a_learner_says_so(watch: Watch) -
     viewer = watch()
     assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False}
     assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "status": None}
+    # A page that was connected before may still show the actors and curves of another run.
+    assert viewer.receive("actors")["rows"] == []
+    assert viewer.receive("events")["events"] == []
+    assert viewer.receive("metrics") == {"type": "metrics", "reset": True, "columns": [], "rows": []}
 
 
 def test_a_page_that_is_opened_late_receives_the_whole_run(gateway: RunningGateway, watch: Watch) -> None:
