@@ -12,6 +12,8 @@ from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
+_LARGEST_REWARD = float(np.finfo(np.float32).max)  # rollouts have float32
+
 
 class ClientRows:
     """What the loop reports, written row by row, with E = 1.
@@ -140,9 +142,10 @@ class ClientRows:
         """
         if not self._acted:
             raise ValueError("a reward came before any action of this episode: call act() first")
-        if not np.isfinite(value):
-            raise ValueError(f"the reward is {value}: it must be finite")
-        self._reward += float(value)
+        total = self._reward + float(value)
+        if not abs(total) <= _LARGEST_REWARD:  # false for NaN too
+            raise ValueError(f"the reward is {total}: it must be finite, and a number of 32 bits holds it")
+        self._reward = total
 
     def end_episode(self, observation: Any, *, terminated: bool) -> None:
         """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""

@@ -16,6 +16,9 @@ export class Camera {
     this.connection = connection;
     this.button = byId("camera-switch");
     this.button.onclick = () => this.#switch(!this.#on);
+    document.addEventListener("visibilitychange", () => {
+      if (this.#on) this.connection.send({ type: "camera", on: !document.hidden }); // a hidden page needs no pictures
+    });
     const facts = [...this.#facts].flatMap(([name, value]) => [element("dt", {}, name), value]);
     const side = element("div", { class: "side" }, element("dl", {}, ...facts), this.#actions);
     byId("camera-view").append(this.#canvas, side);

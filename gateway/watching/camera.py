@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import struct
 from collections.abc import AsyncGenerator, Callable, Sequence
@@ -35,9 +36,20 @@ def note(text: str) -> bytes:
 
 
 def frame(facts: dict[str, object], picture: bytes) -> bytes:
-    """Return a frame for the page."""
-    described = json.dumps(facts, separators=(",", ":")).encode()
+    """Return a frame for the page, with null for numbers that JSON does not have."""
+    described = json.dumps(_finite(facts), separators=(",", ":"), allow_nan=False).encode()
     return LENGTH.pack(len(described)) + described + picture
+
+
+def _finite(value: object) -> object:
+    match value:
+        case dict():
+            return {key: _finite(part) for key, part in value.items()}
+        case list() | tuple():
+            return [_finite(part) for part in value]
+        case float() if not math.isfinite(value):
+            return None
+    return value
 
 
 class CameraProcess:

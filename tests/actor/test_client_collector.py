@@ -185,6 +185,10 @@ def test_invalid_calls_raise_and_change_nothing() -> None:
     client.agents[0].act(robot.observation)
     with pytest.raises(ValueError, match="must be finite"):
         client.agents[0].reward(float("nan"))
+    client.agents[0].reward(3e38)
+    with pytest.raises(ValueError, match=r"the reward is 6e\+38: it must be finite, and a number of 32 bits holds it"):
+        client.agents[0].reward(3e38)
+    client.agents[0].reward(-3e38)
     with pytest.raises(ValueError, match="needs its last observation"):
         client.agents[0].end_episode(terminated=False)
     with pytest.raises(ValueError, match="the observation has shape"):

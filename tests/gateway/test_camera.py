@@ -19,7 +19,7 @@ from scripted_learner import POLICY, SPEC, Policy
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
-from daedalus.gateway.watching.camera import CameraProcess
+from daedalus.gateway.watching.camera import CameraProcess, frame
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.messages import Snapshot, Welcome
@@ -190,3 +190,11 @@ def test_the_page_is_told_why_there_is_no_picture() -> None:
         return facts["error"]
 
     assert "The camera cannot play: " in asyncio.run(watch())
+
+
+def test_facts_that_json_does_not_have_are_null() -> None:
+    data = frame({"reward": np.nan, "total": -np.inf, "actions": [{"numbers": [(1.0, np.inf)]}]}, b"jpeg")
+    (length,) = struct.unpack("<I", data[:4])
+    facts = json.loads(data[4 : 4 + length])
+    assert facts == {"reward": None, "total": None, "actions": [{"numbers": [[1.0, None]]}]}
+    assert data.endswith(b"jpeg")

@@ -4,6 +4,7 @@ import os
 import re
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -36,9 +37,14 @@ class MlflowTracker:
         settings = {name: str(value)[:_LONGEST] for name, value in flat(run.settings)}
         if known is None:
             self.id = self._client.create_run(self._experiment(), run_name=run.name).info.run_id
-            parameters = iter([Param(name, value) for name, value in settings.items()])
-            while some := list(islice(parameters, _PARAMETERS_A_CALL)):
-                self._client.log_batch(self.id, params=some)
+            try:
+                parameters = iter([Param(name, value) for name, value in settings.items()])
+                while some := list(islice(parameters, _PARAMETERS_A_CALL)):
+                    self._client.log_batch(self.id, params=some)
+            except Exception:
+                with suppress(Exception):  # the tracker is opened again, and would leave this run behind
+                    self._client.delete_run(self.id)
+                raise
         else:
             self.id = run.id
             self._client.update_run(self.id, status="RUNNING")
