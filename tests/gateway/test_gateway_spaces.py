@@ -147,7 +147,7 @@ def test_only_an_observation_or_action_of_that_name_is_no_map() -> None:
     assert swapped.observation_space == gym.Dict(action=gym.Box(-np.inf, np.inf, (1,), np.float32))
     assert swapped.action_space == gym.Dict(observation=gym.Discrete(2))
     assert swapped.action_space != bare.action_space
-    assert swapped.observation({"action": [0.5]}) == {"action": np.float32([0.5])}
+    assert swapped.observation({"action": [0.5]}) == {"action": np.array([0.5], np.float32)}
     assert swapped.action({"observation": np.int64(1)}) == {"observation": 1}
     own = Transforms(run_spec().environment, swapped.observation_space, swapped.action_space, None)
     assert own.spaces == swapped.stated
