@@ -142,7 +142,7 @@ CHOICE = {"kind": "discrete", "counts": [2]}
 def test_only_an_observation_or_action_of_that_name_is_no_map() -> None:
     """A client whose actions were named `observation` had bare actions, which could not be sent to it."""
     bare = ClientSpaces({"observation": PLAIN}, {"action": CHOICE})
-    assert (bare.observation([0.5]), bare.action(np.int64(1))) == (np.float32([0.5]), 1)
+    assert (bare.observation([0.5]), bare.action(np.int64(1))) == (np.array([0.5], np.float32), 1)
     swapped = ClientSpaces({"action": PLAIN}, {"observation": CHOICE})
     assert swapped.observation_space == gym.Dict(action=gym.Box(-np.inf, np.inf, (1,), np.float32))
     assert swapped.action_space == gym.Dict(observation=gym.Discrete(2))
