@@ -88,6 +88,7 @@ class Algorithm:
         """Do what follows an update, such as changing the target network. Only the learner calls this method.
 
         Args:
-          policy_version: number of updates so far, from 1.
+          policy_version: number of updates so far, from 1. It leaves out those that `losses` could have made of a
+            batch and did not.
           forward: the network, with its new parameters.
         """

@@ -115,9 +115,10 @@ class RewardNormalizer:
     same value.
     """
 
-    def __init__(self, discount_factor: float) -> None:
+    def __init__(self, discount_factor: float, *, synchronous: bool = False) -> None:
+        """Construct the normaliser. `synchronous`: whether the run makes its actors wait for each update."""
         self.moments = RunningMoments(())
-        self._returns = RunningReturns(discount_factor)
+        self._returns = RunningReturns(discount_factor, synchronous=synchronous)
 
     def add(self, rollouts: Sequence[Rollout]) -> None:
         """Add the returns of rollouts to the statistics."""

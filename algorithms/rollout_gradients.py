@@ -44,7 +44,9 @@ class RolloutGradients:
         self._computer = GradientComputer(training, self._network, spaces, modules)
         self._assembler = BatchAssembler(spaces, torch.device("cpu"))
         self._observations = ObservationStatistics(self._network.normalizer)
-        self._rewards = RewardNormalizer(training.discount_factor) if training.normalize_rewards else None
+        self._rewards: RewardNormalizer | None = None
+        if training.normalize_rewards:
+            self._rewards = RewardNormalizer(training.discount_factor, synchronous=training.record.synchronous)
         self._actions = ActionCounts(spaces, torch.device("cpu"))
         self._in_float32 = spec.algorithm.synchronous
         self._parameters = dict(self._network.named_parameters())

@@ -36,7 +36,7 @@ class TrainingRun:
         Args:
           metrics: finite numbers, by names of 1 to 64 letters, digits, '.', '_' or '-'.
 
-        Raises ValueError for another name or number, or for more than 64 names before the next row.
+        Raises ValueError for another name or number, or for more than 64 names in one call of a method.
         """
         if len(self._metrics.keys() | metrics.keys()) > MOST_METRICS:
             raise ValueError(f"a row has at most {MOST_METRICS} metrics of yours: log fewer names")

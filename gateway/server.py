@@ -23,7 +23,8 @@ from daedalus.transport.credentials import CERTIFICATE, KEY
 
 _PING_SECONDS = 10.0  # a client that does not answer a ping for as long is disconnected
 _MAX_CONNECTIONS = 2048
-_MAX_NEWCOMERS = 128  # WebSockets that have sent no message yet
+_MAX_NEWCOMERS = 128  # WebSockets that hold a large part of a first message
+_SMALL_HELLO_BYTES = 16 << 10
 _STOP_SECONDS = 2  # for connections to end after a stop
 _KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
@@ -32,10 +33,7 @@ _REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end o
 
 
 class _Newcomers:
-    """The WebSockets that have sent no message yet; the oldest is ended if there are too many.
-
-    Each may hold a part of a first message, which is large. A client that is honest sends it at once.
-    """
+    """The WebSockets whose first message is large and not complete yet; the oldest is ended if there are too many."""
 
     def __init__(self) -> None:
         self._waiting: dict[OurWebSocket, None] = {}  # oldest first
@@ -102,13 +100,18 @@ class OurWebSocket(WebSocketsSansIOProtocol):
 
     _on_message: Callable[[str | bytes], None] | None = None  # after `divert`
     _on_writable: Callable[[], None] | None = None
+    _is_new, _received = True, 0  # before the first message; bytes of it
 
     config: _Config
 
-    def connection_made(self, transport: BaseTransport) -> None:
-        """Begin to wait for the first message."""
-        super().connection_made(transport)  # type: ignore[arg-type] - it is a transport that writes
-        self.config.newcomers.add(self)
+    def data_received(self, data: bytes) -> None:
+        """Note how much of the first message has come."""
+        if self._is_new:
+            self._received += len(data)
+            if self._received > _SMALL_HELLO_BYTES:
+                self._is_new = False
+                self.config.newcomers.add(self)
+        super().data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the memory of the connection."""
@@ -131,6 +134,7 @@ class OurWebSocket(WebSocketsSansIOProtocol):
 
     def send_receive_event_to_app(self) -> None:
         """Deliver a message; pause reading only if the application is behind, which costs two system calls."""
+        self._is_new = False
         self.config.newcomers.remove(self)
         if self._on_message is not None and not self.close_sent:
             self._deliver(self._on_message)

@@ -16,8 +16,10 @@ import gymnasium
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
+from daedalus.actor.environments.components import is_text
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
 from daedalus.actor.environments.episode_info import info_to_keep
+from daedalus.actor.environments.leaves import leaves
 
 _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a video
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
@@ -30,26 +32,38 @@ _Stepped = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 class OfItsOwnProcess(gymnasium.Wrapper):
     """A wrapper with results that can leave a process: errors without objects of the user, and the `info` that is read.
 
-    gymnasium would wait for ever for an exception that cannot be pickled.
+    gymnasium would wait for ever for an exception that cannot be pickled, and its shared memory cannot hold a text with
+    other letters than those of its space. Texts that nobody reads are therefore empty.
     """
 
-    def __init__(self, environment: gymnasium.Env, name: str) -> None:
-        """Construct from the environment and its id."""
+    def __init__(self, environment: gymnasium.Env, name: str, left_out: Sequence[str] = ()) -> None:
+        """Construct from the environment, its id, and the names of components that nobody reads."""
         super().__init__(environment)
         self._name = name
+        self._unread_texts = [
+            leaf.path
+            for leaf in (leaves(environment.observation_space, "observation") if left_out else ())
+            if leaf.name in left_out and is_text(leaf.space)
+        ]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See gymnasium.Env. Raises EnvironmentSetupError for anything that the environment raises."""
         with self._errors("reset"):
             observation, info = self.env.reset(seed=seed, options=options)
-            return observation, info_to_keep(info, ended=False)
+            return self._without_texts(observation), info_to_keep(info, ended=False)
 
     def step(self, action: Any) -> _Stepped:
         """See gymnasium.Env. Raises EnvironmentSetupError for anything that the environment raises."""
         with self._errors("step"):
             observation, reward, terminated, truncated, info = self.env.step(action)
             ended = bool(terminated or truncated)
-            return observation, reward, terminated, truncated, info_to_keep(info, ended=ended)
+            info = info_to_keep(info, ended=ended)
+            return self._without_texts(observation), reward, terminated, truncated, info
+
+    def _without_texts(self, observation: Any) -> Any:
+        for path in self._unread_texts:
+            observation = _emptied(observation, path)
+        return observation
 
     @contextmanager
     def _errors(self, call: str) -> Iterator[None]:
@@ -61,17 +75,29 @@ class OfItsOwnProcess(gymnasium.Wrapper):
             raise EnvironmentSetupError(str(playing_error(self._name, call, error))) from None
 
 
+def _emptied(value: Any, path: tuple[str | int, ...]) -> Any:
+    """Return a nested value with an empty text at a path. Parts that do not change are shared."""
+    if not path:
+        return ""
+    key, *rest = path
+    part = _emptied(value[key], tuple(rest))
+    if isinstance(value, dict):
+        return {**value, key: part}
+    return tuple(part if index == key else other for index, other in enumerate(value))
+
+
 @dataclass(frozen=True, slots=True)
 class _Maker:
     """A picklable function that creates one environment in a process of its own."""
 
     name: str
     make: Callable[[], gymnasium.Env]
+    left_out: tuple[str, ...]
     parent: int
 
     def __call__(self) -> gymnasium.Env:
         threading.Thread(target=self._end_with_parent, name="parent-watch", daemon=True).start()
-        return OfItsOwnProcess(self.make(), self.name)
+        return OfItsOwnProcess(self.make(), self.name, self.left_out)
 
     def _end_with_parent(self) -> None:
         """End this process after its parent has died: an environment that hangs would run on for ever."""
@@ -87,33 +113,34 @@ class EnvironmentProcesses(AsyncVectorEnv):
 
     _idle = False  # no call is in progress, so the processes can be asked to end
 
-    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]], *, shared_memory: bool = True) -> None:
+    def __init__(
+        self, name: str, makers: Sequence[Callable[[], gymnasium.Env]], *, left_out: Sequence[str] = ()
+    ) -> None:
         """Start the processes.
 
         Args:
           name: id of the environments, for errors.
           makers: picklable functions, each of which creates one environment.
-          shared_memory: whether observations come in shared memory, which must be able to hold all their components: it
-            cannot hold a text with other letters than its space.
+          left_out: names of components of the observation that nobody reads.
 
         Raises EnvironmentSetupError if a process dies, and whatever the first environment raises.
         """
         self._name = name
-        wrapped = [_Maker(name, maker, os.getpid()) for maker in makers]
+        wrapped = [_Maker(name, maker, tuple(left_out), os.getpid()) for maker in makers]
         with _interrupts_blocked():
             try:
-                self._start(wrapped, shared_memory)
+                self._start(wrapped)
             except (EOFError, ConnectionError):
                 error = self._death()
                 self.close(terminate=True)
                 raise error from None
         self._idle = True
 
-    def _start(self, makers: Sequence[_Maker], shared_memory: bool) -> None:
+    def _start(self, makers: Sequence[_Maker]) -> None:
         # Zenoh does not work after a fork.
         options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
         try:
-            super().__init__(makers, **options, shared_memory=shared_memory)
+            super().__init__(makers, **options)
         except (TypeError, ValueError) as error:
             if not isinstance(error.__cause__, CustomSpaceError) and "dynamic shape" not in str(error):
                 raise

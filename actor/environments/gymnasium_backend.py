@@ -210,7 +210,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
         if registered.entry_point is None:  # its environments share a random generator, so more than one would not do
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
-        return EnvironmentProcesses(spec.id, [factory] * count, shared_memory=not spec.leave_out)
+        return EnvironmentProcesses(spec.id, [factory] * count, left_out=spec.leave_out)
     return EnvironmentsInTurn([factory] * count)
 
 

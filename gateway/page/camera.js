@@ -16,9 +16,7 @@ export class Camera {
     this.connection = connection;
     this.button = byId("camera-switch");
     this.button.onclick = () => this.#switch(!this.#on);
-    document.addEventListener("visibilitychange", () => {
-      if (this.#on) this.connection.send({ type: "camera", on: !document.hidden }); // a hidden page needs no pictures
-    });
+    document.addEventListener("visibilitychange", () => this.#on && this.#ask());
     const facts = [...this.#facts].flatMap(([name, value]) => [element("dt", {}, name), value]);
     const side = element("div", { class: "side" }, element("dl", {}, ...facts), this.#actions);
     byId("camera-view").append(this.#canvas, side);
@@ -37,7 +35,12 @@ export class Camera {
     setText(this.button, on ? "Hide the episode" : "Show an episode");
     byId("camera-view").hidden = !on;
     if (on) setText(byId("camera-note"), "The first picture comes in a few seconds.");
-    this.connection.send({ type: "camera", on });
+    this.#ask();
+  }
+
+  /** Ask for pictures, or for no more. A hidden page needs none. */
+  #ask() {
+    this.connection.send({ type: "camera", on: this.#on && !document.hidden });
   }
 
   /** Show a frame: four bytes with the length of a map in JSON, that map, and a JPEG, if there is one. */

@@ -53,7 +53,7 @@ _PACKAGES = (
 
 def run_name(directory: Path) -> str:
     """Return the name of the run in a directory: the directory's own, in the characters that a name may have."""
-    return keys.as_name(directory.resolve().name)
+    return keys.as_name(Path(os.path.abspath(directory)).name)  # of a link, its own name
 
 
 def default_directory(name: str, spec: RunSpec) -> Path:

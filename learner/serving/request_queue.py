@@ -9,7 +9,7 @@ from daedalus.transport.interface import Request
 
 # Senders take a request for lost that waits 30 s, and send it again.
 _OLDEST_SECONDS = 10.0  # while a request has waited longer, others are refused
-_LATE_SECONDS = 15.0
+LATE_SECONDS = 15.0  # after which a request needs an answer; an accepted rollout may wait for its batch after that
 
 
 class RequestQueue:
@@ -38,8 +38,8 @@ class RequestQueue:
             self._changed.notify()
         return True
 
-    def take(self, timeout: float | None = None) -> Request | None:
-        """Wait for the oldest request and return it, or None if the queue is closed and empty.
+    def take(self, timeout: float | None = None) -> tuple[float, Request] | None:
+        """Wait for the oldest request; return when it arrived, and it, or None if the queue is closed and empty.
 
         Raises queue.Empty if no request comes within `timeout` seconds, or after `wake`.
         """
@@ -50,15 +50,15 @@ class RequestQueue:
                 raise queue.Empty
             if not self._requests:
                 return None
-            _, request = self._requests.popleft()
+            arrived, request = self._requests.popleft()
             self._bytes -= request.size
-            return request
+            return arrived, request
 
     def take_late(self) -> list[Request]:
         """Take the requests that have waited so long that they need an answer now."""
         late, now = [], time.monotonic()
         with self._changed:
-            while self._requests and now - self._requests[0][0] > _LATE_SECONDS:
+            while self._requests and now - self._requests[0][0] > LATE_SECONDS:
                 _, request = self._requests.popleft()
                 self._bytes -= request.size
                 late.append(request)

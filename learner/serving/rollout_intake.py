@@ -24,9 +24,9 @@ from daedalus.learner.run.updates import updates_of
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
-from daedalus.learner.serving.held_answers import MOST_SECONDS, HeldAnswers
+from daedalus.learner.serving.held_answers import HeldAnswers
 from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
-from daedalus.learner.serving.request_queue import RequestQueue
+from daedalus.learner.serving.request_queue import LATE_SECONDS, RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
@@ -232,14 +232,15 @@ class RolloutIntake:
         while True:
             self._answer_held()
             try:
-                request = self._requests.take(HEARTBEAT_SECONDS)
+                taken = self._requests.take(HEARTBEAT_SECONDS)
             except queue.Empty:
                 continue
-            if request is None:
+            if taken is None:
                 break
+            arrived, request = taken
             sender, payload = keys.last_chunk(request.key), request.payload
             content = self._intake.read(sender, payload)
-            if not self._wait_for_room(content):
+            if not self._wait_for_room(content, arrived + LATE_SECONDS):
                 self._answer_busy(request)
                 continue
             with self._lock:
@@ -253,13 +254,12 @@ class RolloutIntake:
             self._held.release()
         self._answer_held()
 
-    def _wait_for_room(self, content: Upload | Rejected) -> bool:
-        """Wait until the buffer has room; return False if that takes so long that the sender needs an answer.
+    def _wait_for_room(self, content: Upload | Rejected, answer_by: float) -> bool:
+        """Wait until the buffer has room; return False if there is none by `answer_by`, on the monotonic clock.
 
         No other rollouts are judged meanwhile, which slows their senders down. But no answer is late: its sender would
         take the rollout for lost, and send it again.
         """
-        answer_by = time.monotonic() + MOST_SECONDS
         while True:
             with self._lock:
                 if self._has_room_for(content):

@@ -78,7 +78,9 @@ class Learner:
         self._optimizer = build_optimizer(spec, self._flat.values)
         self._assembler = BatchAssembler(spaces, self.device)
         self._observations = ObservationStatistics(self._network.normalizer)
-        self._rewards = RewardNormalizer(spec.discount_factor) if spec.normalize_rewards else None
+        self._rewards: RewardNormalizer | None = None
+        if spec.normalize_rewards:
+            self._rewards = RewardNormalizer(spec.discount_factor, synchronous=spec.record.synchronous)
         self.first_pass: FirstPass | None = None  # of the newest batch, until its memory is used for the next one
         self._received_diagnostics: dict[str, float] = {}  # of the newest gradient of an actor
         self.metrics = UpdateMetrics(spaces, self.device)

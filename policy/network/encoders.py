@@ -57,7 +57,9 @@ class FlatEncoder(nn.Module):
         space = self._spaces[name]
         if isinstance(space, ArraySpace):
             return _numbers(observations)
-        variables, values = (each.to(observations.device) for each in self._choices[name])
+        variables, values = self._choices[name]
+        if variables.device != observations.device:  # once
+            self._choices[name] = variables, values = variables.to(observations.device), values.to(observations.device)
         # Of one variable nothing is selected, which would take longer than the comparison.
         chosen = observations if space.size == 1 else observations.index_select(-1, variables)
         # Comparisons, because torch's one_hot reads the values, which a recording (algorithms/recording.py) cannot.

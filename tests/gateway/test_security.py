@@ -198,20 +198,28 @@ def test_connection_without_a_request_is_closed(
         assert silent.recv(1) == b""
 
 
-def test_websockets_without_a_message_are_limited_and_the_oldest_ends(
-    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+def test_large_first_messages_that_do_not_end_are_limited_and_the_oldest_ends(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "_MAX_NEWCOMERS", 2)
     known = []
     for number in range(3):
         known.append(connect())
         assert known[-1].hello(f"c-{number}")["type"] == "welcome"
+    part = b"\x81\xff" + (200_000).to_bytes(8, "big") + bytes(4) + b"x" * 20_000  # a text of 200,000 bytes begins
     silent = [connect() for _ in range(3)]
+    begun = [connect() for _ in range(3)]
+    for client in begun:
+        client.socket.socket.sendall(part)
+        for _ in range(2):
+            gateway.call(lambda: None)  # its event loop has read the part
     with pytest.raises(ConnectionClosed):
-        silent[0].receive()
-    assert silent[2].hello("late")["type"] == "welcome"
+        begun[0].receive()
+    assert [client.hello(f"s-{number}")["type"] for number, client in enumerate(silent)] == ["welcome"] * 3
     assert all(client.act([0.0, 0.0, 0.0, 0.0])["type"] == "action" for client in known)
-    assert silent[1].hello("later")["type"] == "welcome"
+    for client in begun[1:]:
+        client.socket.socket.sendall(b"x" * 180_000)
+        assert client.receive()["code"] == "malformed", "it was not ended"
 
 
 def test_connections_are_limited(learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:

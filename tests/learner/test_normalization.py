@@ -157,9 +157,22 @@ def test_returns_of_the_agents_of_a_client_run_on_agent_by_agent(stack: int) -> 
     assert float(normalizer.moments.variance) ** 0.5 == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize("synchronous", [True, False])
+def test_returns_of_one_agent_run_on_whatever_few_observations_it_has(synchronous: bool) -> None:
+    normalizer = RewardNormalizer(0.9, synchronous=synchronous)
+    random, first, rows = np.random.default_rng(1), 0.0, 4
+    for sequence in range(100):
+        rollout = played(sequence, 0, 1.0, rows=rows)
+        rollout.frames[NAME][0], rollout.frames[NAME][-1] = first, random.integers(4)
+        first = rollout.frames[NAME][-1].copy()
+        normalizer.add([rollout])
+    expected = (1.0 - 0.9 ** np.arange(1, 100 * rows + 1)) / 0.1
+    assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
+
+
 def test_returns_run_on_over_rows_that_a_client_does_not_send() -> None:
     """As in runs of a2c, while the client waits for the next policy."""
-    normalizer = RewardNormalizer(0.5)
+    normalizer = RewardNormalizer(0.5, synchronous=True)
     normalizer.add([played(0, 0, 1.0), played(1, 100, 1.0)])
     expected = (1.0 - 0.5 ** np.arange(1, 33)) / 0.5
     assert float(normalizer.moments.mean) == pytest.approx(expected.mean(), rel=1e-6)
@@ -170,10 +183,9 @@ def test_running_returns_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     returns = RunningReturns(DISCOUNT)
     for rollout in [sent(0, actor) for actor in "abc"]:
         returns.add(rollout)
-    assert list(returns._newest) == ["b", "c"]
+    assert [stream.actor for stream in returns._running] == ["b", "c"]
     returns.add(sent(1, "b"))
-    assert list(returns._newest) == ["c", "b"]
-    assert [actor for actor, *_ in returns._running] == ["c", "b"]
+    assert [stream.actor for stream in returns._running] == ["c", "b"]
 
 
 def test_observations_of_valid_rows_are_counted_once_in_each_component() -> None:

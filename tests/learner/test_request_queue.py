@@ -23,10 +23,16 @@ class UnansweredRequest:
         raise AssertionError("the queue must not reply")
 
 
+def taken(queue: RequestQueue) -> object:
+    """Return the next request, or None."""
+    entry = queue.take()
+    return None if entry is None else entry[1]
+
+
 def test_requests_are_taken_in_order_of_arrival() -> None:
     queue, requests = RequestQueue(100, 100), [UnansweredRequest(size) for size in (3, 0, 9)]
     assert all(queue.offer(request) for request in requests)
-    assert [queue.take() for _ in requests] == requests
+    assert [taken(queue) for _ in requests] == requests
 
 
 def test_request_above_the_byte_limit_is_refused_until_there_is_room() -> None:
@@ -63,7 +69,7 @@ def test_requests_that_have_waited_too_long_are_taken_at_once(monkeypatch: pytes
     queue, requests = RequestQueue(100, 100), [UnansweredRequest(size) for size in (3, 4)]
     assert all(queue.offer(request) for request in requests)
     assert queue.take_late() == []
-    monkeypatch.setattr(request_queue, "_LATE_SECONDS", -1.0)
+    monkeypatch.setattr(request_queue, "LATE_SECONDS", -1.0)
     assert queue.take_late() == requests
     assert (queue.bytes, queue.take_late()) == (0, [])
 
@@ -86,23 +92,23 @@ def test_queue_equals_a_bounded_list_model(steps: list[int | None]) -> None:
             assert queue.offer(request) == fits
             held += [request] if fits else []
         elif held:
-            assert queue.take() is held.pop(0)
+            assert taken(queue) is held.pop(0)
 
 
 def test_take_returns_queued_requests_and_then_none_after_close() -> None:
     queue, request = RequestQueue(10, 100), UnansweredRequest(1)
     queue.offer(request)
     queue.close()
-    assert queue.take() is request
+    assert taken(queue) is request
     assert queue.take() is None
 
 
 def test_take_blocks_until_a_request_or_close() -> None:
-    queue, request, taken = RequestQueue(10, 100), UnansweredRequest(1), []
+    queue, request, served = RequestQueue(10, 100), UnansweredRequest(1), []
 
     def work() -> None:
-        while (one := queue.take()) is not None:
-            taken.append(one)
+        while (one := taken(queue)) is not None:
+            served.append(one)
 
     worker = threading.Thread(target=work, daemon=True)
     worker.start()
@@ -110,7 +116,7 @@ def test_take_blocks_until_a_request_or_close() -> None:
     queue.close()
     worker.join(60.0)
     assert not worker.is_alive()
-    assert taken == [request]
+    assert served == [request]
 
 
 def test_a_woken_queue_raises_once_and_keeps_its_requests() -> None:
@@ -119,4 +125,4 @@ def test_a_woken_queue_raises_once_and_keeps_its_requests() -> None:
     waiting.offer(request)
     with pytest.raises(queue.Empty):
         waiting.take()
-    assert waiting.take() is request
+    assert taken(waiting) is request

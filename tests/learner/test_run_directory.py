@@ -158,6 +158,8 @@ def test_name_of_a_run_is_that_of_its_directory(tmp_path: Path, monkeypatch: pyt
     assert {
         run_directory.run_name(path) for path in (directory, Path(), Path("../try-1"), directory / "checkpoints" / "..")
     } == {"try-1"}
+    (tmp_path / "current").symlink_to(directory)
+    assert run_directory.run_name(tmp_path / "current") == "current"
     assert run_directory.run_name(tmp_path / "try#1") != run_directory.run_name(tmp_path / "try 1")
 
 
