@@ -18,7 +18,7 @@ class _Handler(WSGIRequestHandler):
 
     timeout = _QUIET_SECONDS
 
-    def log_message(self, *_: Any) -> None:
+    def log_message(self, format: str, *args: Any) -> None:
         """Log nothing."""
 
 
