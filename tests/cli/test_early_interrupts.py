@@ -21,9 +21,10 @@ from daedalus.cli.processes import stop_on_signals
 print("stopped" if stop_on_signals().wait(60.0) else "not stopped", flush=True)
 """
 PROGRAM = """
-import sys
+import os, sys
 from daedalus.cli import main
-main._MODULES["evaluate"] = "waiting"
+execv = os.execv
+os.execv = lambda program, line: execv(program, [*line[:3], "waiting"])  # in place of the module of the command
 sys.argv[1:] = ["evaluate"]
 sys.exit(main.main())
 """
@@ -60,7 +61,7 @@ def test_ctrl_c_before_the_handlers_stops_the_process_in_order(
 
 # In place of a command without handlers: Ctrl-C arrives in code that replaces KeyboardInterrupt, as pydantic does.
 REPLACING = """
-import signal, sys
+import signal, sys, types
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores SIGINT in jobs of its background
 from daedalus.cli import main
 
@@ -70,7 +71,7 @@ def build(_arguments):
     except KeyboardInterrupt as error:
         raise ValueError("cannot build the validator") from error
 
-main._COMMANDS["plot"] = build
+main.COMMANDS["plot"] = types.SimpleNamespace(function="build", run=build)
 sys.argv[1:] = ["plot"]
 sys.exit(main.main())
 """

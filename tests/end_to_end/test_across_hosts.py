@@ -95,7 +95,7 @@ def test_actors_on_three_hosts_solve_cartpole_over_tls(tmp_path: Path, network: 
     budget = ("--env-steps", 5_000_000)
     learner = central.start("learner", "cartpole", *everywhere, "--run-dir", "run", *budget)
     for host, actor in zip(players, actors, strict=True):
-        actor.expect(rf"joined run 'run' as '{host.name}\.\d+'")
+        actor.expect(rf"joined run 'run' as '{host.name}\.[\w-]+-\d+'")
     assert learner.wait() == 0, learner.output
     for actor in actors:
         assert actor.wait() == 0, actor.output

@@ -26,7 +26,7 @@ def tls(address: str) -> str:
 def test_authorised_actors_solve_cartpole_over_tls(start: Start, tls: str, certificates: Path) -> None:
     learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
     arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
-    arm.expect(r"joined run 'run' as 'arm\.\d+'")
+    arm.expect(r"joined run 'run' as 'arm\.[\w-]+-\d+'")
     start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("joined run")
     assert learner.wait() == 0, learner.output
     assert arm.wait() == 0, arm.output

@@ -117,7 +117,7 @@ def test_last_checkpoint_is_saved_although_the_last_metrics_fail(
 ) -> None:
     monkeypatch.setattr(actor_server, "_LEAVE_SECONDS", 0.0)
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, last: bool) -> None:
         raise ZeroDivisionError("a bug in a diagnostic of the user's algorithm")
 
     monkeypatch.setattr(RunReporter, "details", fail)
