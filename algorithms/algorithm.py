@@ -88,7 +88,6 @@ class Algorithm:
         """Do what follows an update, such as changing the target network. Only the learner calls this method.
 
         Args:
-          policy_version: number of updates so far, from 1. It leaves out those that `losses` could have made of a
-            batch and did not.
+          policy_version: version of the new weights, from 1. Versions for which `losses` made no update are skipped.
           forward: the network, with its new parameters.
         """

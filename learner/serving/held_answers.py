@@ -2,7 +2,7 @@
 
 from daedalus.transport.interface import Request
 
-MOST_SECONDS = 10.0  # an answer waits no longer: its sender would take the rollout for lost
+_MOST_SECONDS = 10.0  # an answer waits no longer: its sender would take the rollout for lost
 
 
 class HeldAnswers:
@@ -34,7 +34,7 @@ class HeldAnswers:
 
     def take(self, now: float) -> list[Request]:
         """Return the requests to answer now: those that were released, and all if they have waited too long."""
-        if self._since is not None and now > self._since + MOST_SECONDS:
+        if self._since is not None and now > self._since + _MOST_SECONDS:
             self.release()
         released, self._released = self._released, []
         return released

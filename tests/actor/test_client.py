@@ -53,7 +53,7 @@ def test_client_rollouts_reach_the_learner(learner: ScriptedLearner) -> None:
 
 def test_client_may_wait_for_ever(learner: ScriptedLearner) -> None:
     with Client("tcp/127.0.0.1:1", **SPACES, timeout=math.inf) as client:
-        client.act(OBSERVATION)
+        assert client.act(OBSERVATION) in SPACES["action_space"]
 
 
 def test_act_raises_the_quarantine_that_ended_the_client(learner: ScriptedLearner) -> None:

@@ -1,4 +1,4 @@
-"""gateway/page/actor.js in Node: it is told of the end of the run although no answer is awaited at that moment."""
+"""gateway/page/actor.js in Node: the next call raises the end of the run, although none waited when it came."""
 
 import subprocess
 from collections.abc import Callable

@@ -86,7 +86,7 @@ def intake() -> Iterator[Intake]:
 def test_no_answer_is_late_while_the_learner_computes_a_long_batch(
     intake: Intake, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(held_answers, "MOST_SECONDS", 0.3)
+    monkeypatch.setattr(held_answers, "_MOST_SECONDS", 0.3)
     monkeypatch.setattr(rollout_intake, "LATE_SECONDS", 0.3)
     intake.offer(0, 1)
     assert intake.answers(2) == [(0, "accepted"), (1, "accepted")]
