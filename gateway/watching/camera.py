@@ -26,7 +26,8 @@ LENGTH = struct.Struct("<I")
 MAX_FRAME_BYTES = 8 << 20
 _POLL_SECONDS = 0.5  # for a policy, and for a newer one
 _AGAIN_SECONDS = 5.0  # after the process failed
-_END_SECONDS = 2.0
+_END_SECONDS = 2.0  # after SIGTERM
+_KILLED_SECONDS = 1.0  # after SIGKILL
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -93,10 +94,10 @@ class CameraProcess:
             self._task = None
 
     async def close(self) -> None:
-        """End the process. At most about 3 s."""
+        """End the process. At most about 4 s."""
         self._stop()
         if self._tasks:
-            await asyncio.wait(list(self._tasks), timeout=_END_SECONDS + 1.0)
+            await asyncio.wait(list(self._tasks), timeout=_END_SECONDS + _KILLED_SECONDS + 1.0)
 
     def _show(self, frame: bytes) -> None:
         self._frame, self._number = frame, self._number + 1
@@ -136,7 +137,7 @@ class CameraProcess:
         finally:
             for task in working:
                 task.cancel()
-            await _ended(process)
+            await _end(process, working)
 
     async def _feed(self, writer: asyncio.StreamWriter, policy: NewestPolicy) -> None:
         """Send the policy, and every newer one of the same session."""
@@ -170,13 +171,21 @@ async def _send(writer: asyncio.StreamWriter, message: bytes) -> None:
     await writer.drain()
 
 
-async def _ended(process: asyncio.subprocess.Process) -> None:
+async def _end(process: asyncio.subprocess.Process, working: Sequence[asyncio.Future[None]]) -> None:
     """End a process, also if this task is cancelled once more."""
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
-        try:
-            await asyncio.wait([asyncio.ensure_future(process.wait())], timeout=_END_SECONDS)
-        finally:
-            if process.returncode is None:
+    drained = asyncio.ensure_future(_drain(process, working))
+    try:
+        await asyncio.wait([drained], timeout=_END_SECONDS)
+    finally:
+        if not drained.done():
+            with contextlib.suppress(ProcessLookupError):
                 process.kill()
-                await process.wait()
+            await asyncio.wait([drained], timeout=_KILLED_SECONDS)
+
+
+async def _drain(process: asyncio.subprocess.Process, working: Sequence[asyncio.Future[None]]) -> None:
+    """Wait for the end of a process, and read what it has written: with unread output its pipes stay open for ever."""
+    await asyncio.wait(working)
+    await process.communicate()

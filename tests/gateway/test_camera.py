@@ -192,6 +192,29 @@ def test_the_page_is_told_why_there_is_no_picture() -> None:
     assert "The camera cannot play: " in asyncio.run(watch())
 
 
+def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
+    flood = "import struct, sys\nwhile True: sys.stdout.buffer.write(struct.pack('<I', 300_000) + bytes(300_000))"
+    newest = policy()
+
+    async def watch() -> None:
+        before = open_files()
+        camera = CameraProcess((sys.executable, "-c", flood))
+        camera.newest_policy = lambda: newest
+        frames = camera.frames()
+        async with asyncio.timeout(LIMIT):
+            await anext(frames)
+            await frames.aclose()
+            await camera.close()
+            while open_files() > before:
+                await asyncio.sleep(0.05)
+
+    asyncio.run(watch())
+
+
+def open_files() -> int:
+    return len(os.listdir("/dev/fd"))
+
+
 def test_facts_that_json_does_not_have_are_null() -> None:
     data = frame({"reward": np.nan, "total": -np.inf, "actions": [{"numbers": [(1.0, np.inf)]}]}, b"jpeg")
     (length,) = struct.unpack("<I", data[:4])
