@@ -15,7 +15,7 @@ from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.losses import mean, value_loss
 from daedalus.algorithms.own_algorithm import check_updates
 from daedalus.algorithms.precision import is_mixed
-from daedalus.algorithms.ranks import Share
+from daedalus.algorithms.ranks import RankPart
 from daedalus.algorithms.recording import OperationRecorder
 from daedalus.algorithms.registry import build_algorithm
 from daedalus.policy.network.actor_critic import ActorCritic
@@ -65,7 +65,7 @@ class GradientComputer:
     def compute(self, batch: Batch, entropy_bonus: float) -> Iterator[Terms]:
         """Write the gradient of each update of a batch to `parameters.gradients`, and yield its loss terms.
 
-        The caller applies the gradient before it asks for the next update. Of a share of a batch, both are those of the
+        The caller applies the gradient before it asks for the next update. Of a part of a batch, both are those of the
         whole batch.
         """
         # The statistics of observations do not change within a batch: normalise once for all passes.
@@ -78,25 +78,25 @@ class GradientComputer:
             updates += 1
             self._first_pass = losses.first_pass
             if isinstance(losses, MinibatchLosses):
-                gradient, *each = self._of_minibatch(losses, bonus, record=batch.share is None)
+                gradient, *each = self._of_minibatch(losses, bonus, record=batch.rank_part is None)
                 shares = losses.minibatch.shares
             else:
                 gradient, *each = self._differentiated(losses, bonus)
                 shares = losses.shares
             self.parameters.gradients.copy_(gradient)
             terms = Terms(*each)
-            if batch.share is not None:
-                terms, _ = self._over_ranks(batch.share, terms, shares)
+            if batch.rank_part is not None:
+                terms, _ = self._over_ranks(batch.rank_part, terms, shares)
             yield terms
-        if batch.share is not None:
-            yield from self._of_other_ranks(batch.share, batch.share.updates - updates)
+        if batch.rank_part is not None:
+            yield from self._of_other_ranks(batch.rank_part, batch.rank_part.updates - updates)
 
-    def _of_other_ranks(self, share: Share, most: int) -> Iterator[Terms]:
+    def _of_other_ranks(self, part: RankPart, most: int) -> Iterator[Terms]:
         """Take part in the updates that an algorithm of the user makes on other ranks only, until it makes none."""
-        none = share.valid.new_zeros(1)
+        none = part.valid.new_zeros(1)
         for _ in range(most):
             self.parameters.gradients.zero_()
-            terms, makers = self._over_ranks(share, Terms(*none.expand(len(Terms._fields))), none, makes_update=False)
+            terms, makers = self._over_ranks(part, Terms(*none.expand(len(Terms._fields))), none, makes_update=False)
             if not makers:
                 return
             yield terms
@@ -124,7 +124,7 @@ class GradientComputer:
         return self.parameters.differentiated(loss), *terms
 
     def _over_ranks(
-        self, share: Share, terms: Terms, shares: Tensor, *, makes_update: bool = True
+        self, part: RankPart, terms: Terms, shares: Tensor, *, makes_update: bool = True
     ) -> tuple[Terms, Tensor]:
         """Replace the gradient of this rank by the mean over all ranks.
 
@@ -134,10 +134,10 @@ class GradientComputer:
         """
         number = (shares > 0.0).sum().to(torch.float32)
         counts = [number, torch.full_like(number, makes_update)]
-        *sums, total, makers = share.ranks.sum(torch.stack([*(each * number for each in terms), *counts]))
+        *sums, total, makers = part.ranks.sum(torch.stack([*(each * number for each in terms), *counts]))
         total = total.clamp(min=1.0)
         self.parameters.gradients.mul_(number / total)
-        self.parameters.gradients.copy_(share.ranks.sum(self.parameters.gradients))
+        self.parameters.gradients.copy_(part.ranks.sum(self.parameters.gradients))
         return Terms(*(each / total for each in sums)), makers
 
     def take_first_pass(self) -> FirstPass | None:

@@ -58,7 +58,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
     With memory, a batch is split by environment, because the memory learns from consecutive rows. Without memory, it
     is split into single rows, and reset rows are omitted. A batch with fewer parts than `count` makes as many
     minibatches as it has parts, so that none is empty. All have one size, that of a batch without reset rows: rows that
-    are missing are filled up by a copy of another row whose share is 0. Of a share of a batch, each minibatch has those
+    are missing are filled up by a copy of another row whose share is 0. Of a part of a batch, each minibatch has those
     of its parts that are in the share; one without any has a part whose shares are 0.
 
     Args:
@@ -74,7 +74,7 @@ def minibatches(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tenso
 def _by_environment(
     batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int
 ) -> Iterator[Minibatch]:
-    whole = batch.valid if batch.share is None else batch.share.valid
+    whole = batch.valid if batch.rank_part is None else batch.rank_part.valid
     order = batch.ranks.permutation(whole.shape[1]).to(whole.device)
     for part in map(partial(_own_environments, batch), order.tensor_split(min(count, len(order)))):
         valid = batch.valid[:, part] if len(part) else torch.zeros_like(batch.valid[:, :1])
@@ -93,7 +93,7 @@ def _by_environment(
 
 
 def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, count: int) -> Iterator[Minibatch]:
-    whole = batch.valid if batch.share is None else batch.share.valid
+    whole = batch.valid if batch.rank_part is None else batch.rank_part.valid
     rows = whole.flatten().nonzero().squeeze(1)  # [N]
     order = rows[batch.ranks.permutation(len(rows)).to(rows.device)]
     number = min(count, len(order))
@@ -101,7 +101,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
         return
     own = [_own_rows(batch, part) for part in order.tensor_split(number)]
     counted = [len(part) for part in own]
-    size = 1 if batch.share is not None else -(-whole.numel() // number)
+    size = 1 if batch.rank_part is not None else -(-whole.numel() // number)
     own = [_filled_up(part, size) for part in own]
     order, sizes = torch.cat(own), [len(part) for part in own]
     shares = {pair: _equal_shares(batch.valid, *pair) for pair in set(zip(counted, sizes, strict=True))}
@@ -139,20 +139,20 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
 
 def _own_environments(batch: Batch, environments: Tensor) -> Tensor:
     """Return those of some environments of the whole batch that are in the batch, by their number in the batch."""
-    if batch.share is None:
+    if batch.rank_part is None:
         return environments
-    own = environments[(environments >= batch.share.first) & (environments < batch.share.end)]
-    return own - batch.share.first
+    own = environments[(environments >= batch.rank_part.first) & (environments < batch.rank_part.end)]
+    return own - batch.rank_part.first
 
 
 def _own_rows(batch: Batch, rows: Tensor) -> Tensor:
     """Return those of some rows of the whole batch that are in the batch. Rows are counted as T x B."""
-    if batch.share is None:
+    if batch.rank_part is None:
         return rows
-    share, width = batch.share, batch.share.valid.shape[1]
+    rank_part, width = batch.rank_part, batch.rank_part.valid.shape[1]
     environments = rows % width
-    own = (environments >= share.first) & (environments < share.end)
-    return rows[own] // width * (share.end - share.first) + environments[own] - share.first
+    own = (environments >= rank_part.first) & (environments < rank_part.end)
+    return rows[own] // width * (rank_part.end - rank_part.first) + environments[own] - rank_part.first
 
 
 def _filled_up(rows: Tensor, size: int) -> Tensor:

@@ -36,7 +36,7 @@ ONE_RANK: Ranks = _OneRank()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Share:
+class RankPart:
     """Which part of a whole batch a rank has. Its environments are columns first to end of the whole batch."""
 
     ranks: Ranks

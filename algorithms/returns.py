@@ -43,21 +43,12 @@ def lambda_returns(
       truncated: bool, episode cut by a limit and not by the environment.
       trace_lambda: from 0 to 1.
 
-    Returns: [T, B] targets G_t. Sutton & Barto (2018), equation 12.2 in its recursive form, and 7.1 for lambda = 1.
+    Returns: [T, B] targets G_t. Sutton & Barto (2018), equation 12.2 in its recursive form. With lambda = 1 they are
+    n-step returns: equation 7.1, and Mnih et al. (2016), algorithm S3.
     """
     traces = trace_lambda * (~truncated)
     constants = rewards + discounts * (1.0 - traces) * next_values
     return _accumulate(constants, discounts * traces, next_values[-1])
-
-
-def n_step_returns(rewards: Tensor, discounts: Tensor, next_values: Tensor, truncated: Tensor) -> Tensor:
-    """Return discounted returns, bootstrapped where the rollout or an episode is cut.
-
-        G_t = r_t + d_t (V(s_{t+1}) if truncated_t or t = T-1 else G_{t+1})
-
-    Arguments and result as in `lambda_returns`. Mnih et al. (2016), algorithm S3; Sutton & Barto (2018), equation 7.1.
-    """
-    return lambda_returns(rewards, discounts, next_values, truncated, 1.0)
 
 
 def actor_critic_targets(

@@ -19,7 +19,7 @@ atheris: Any = importlib.import_module("atheris")  # from the extra `fuzz`; its 
 
 with atheris.instrument_imports(include=["daedalus", "msgpack"]):
     from daedalus.learner.serving.fleet import Fleet
-    from daedalus.learner.serving.intake import Intake
+    from daedalus.learner.serving.rollout_judge import RolloutJudge
     from daedalus.protocol.codec import PROTOCOL_VERSION, ProtocolError, decode
     from daedalus.protocol.compact import bits_of
     from daedalus.protocol.limits import Limits
@@ -31,8 +31,8 @@ _GOLDEN = Path(__file__).parents[1] / "tests" / "protocol" / "golden"
 _LIMITS = Limits(max_bytes=1 << 20)
 
 
-def _intake() -> Intake:
-    """Return an intake that accepts the golden rollout of arrays."""
+def _judge() -> RolloutJudge:
+    """Return a judge that accepts the golden rollout of arrays."""
     spec = RunSpec.model_validate(
         {"environment": {"id": "CartPole-v1"}, "collection": {"rollout_length": 3, "envs_per_actor": 2}}
     )
@@ -42,12 +42,12 @@ def _intake() -> Intake:
     )
     fleet = Fleet(1, spaces)
     fleet.join(Join(actor="wing-1", incarnation=2**61 + 1, spaces=spaces, environments=2), 0.0)
-    intake = Intake(spec, 2**60 + 3, fleet)
-    intake.state_size = 2
-    return intake
+    judge = RolloutJudge(spec, 2**60 + 3, fleet)
+    judge.state_size = 2
+    return judge
 
 
-_INTAKE = _intake()
+_JUDGE = _judge()
 
 
 def one_input(data: bytes) -> None:
@@ -60,7 +60,7 @@ def one_input(data: bytes) -> None:
     if isinstance(message, CompactSnapshot):
         with contextlib.suppress(ValueError):
             bits_of(message.weights, None)
-    _INTAKE.judge("wing-1", _INTAKE.read("wing-1", data), 81, 0.0)
+    _JUDGE.decide("wing-1", _JUDGE.read("wing-1", data), 81, 0.0)
 
 
 if __name__ == "__main__":

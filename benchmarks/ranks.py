@@ -21,7 +21,7 @@ import torch
 
 from benchmarks.running import machine, table
 from daedalus.cli.ranks import StartedRanks
-from daedalus.learner.ranks.leader import ONE_PROCESS, Distribution
+from daedalus.learner.ranks.leader import NO_OTHER_RANKS, OtherRanks
 from daedalus.learner.run.settings import read_preset, run_spec
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.learner import Learner
@@ -43,7 +43,7 @@ class Measured:
     processes: int
     threads: int
     learner: Learner
-    distribution: Distribution
+    other_ranks: OtherRanks
     rounds: list[float]  # median of each
 
     def measure(self, batch: list[Rollout], seconds: float, wait: Callable[[], None]) -> None:
@@ -97,14 +97,14 @@ def open_learner(spec: RunSpec, processes: int, threads: int, stack: ExitStack) 
     """Return a learner of so many processes, which `stack` ends."""
     spec = spec.model_copy(update={"training": spec.training.model_copy(update={"threads": threads})})
     if processes == 1:
-        return Measured(processes, threads, Learner(spec.training, spec.policy, _SPACES), ONE_PROCESS, [])
+        return Measured(processes, threads, Learner(spec.training, spec.policy, _SPACES), NO_OTHER_RANKS, [])
     ranks = stack.enter_context(StartedRanks(processes, []))
-    distribution = ranks.open(spec, threading.Event())
-    assert distribution is not None
-    stack.callback(distribution.close)
-    learner = Learner(spec.training, spec.policy, _SPACES, distribution=distribution)
-    distribution.begin(_SPACES, learner.shared_state)
-    return Measured(processes, threads, learner, distribution, [])
+    other_ranks = ranks.open(spec, threading.Event())
+    assert other_ranks is not None
+    stack.callback(other_ranks.close)
+    learner = Learner(spec.training, spec.policy, _SPACES, other_ranks=other_ranks)
+    other_ranks.begin(_SPACES, learner.shared_state)
+    return Measured(processes, threads, learner, other_ranks, [])
 
 
 def main() -> None:
@@ -122,7 +122,7 @@ def main() -> None:
 
         def wait() -> None:
             for each in learners:
-                each.distribution.wait()
+                each.other_ranks.wait()
 
         for _ in range(parsed.rounds):
             for each in learners:

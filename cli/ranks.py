@@ -19,13 +19,13 @@ from daedalus.cli.settings_arguments import ChosenRun, check_processes, resolve_
 from daedalus.cli.supervisor import start
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.ranks.meeting import Meeting, meeting_of
-from daedalus.learner.ranks.opening import lead, one_process
+from daedalus.learner.ranks.opening import lead, no_other_ranks
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.user_modules import UserModules, allow_settings, modules_of
 from daedalus.protocol.spec import RunSpec
 
 if TYPE_CHECKING:
-    from daedalus.learner.ranks.leader import Distribution
+    from daedalus.learner.ranks.leader import OtherRanks
 
 _END_SECONDS = 1.5  # for the other ranks to end by themselves
 _EXIT_SECONDS = 3.0  # from a signal to the end of a rank that rank 0 has not ended
@@ -34,8 +34,8 @@ _POLL_SECONDS = 0.02
 _FAILED = 1
 
 
-class OneProcess:
-    """A learner without other ranks."""
+class RankProcesses:
+    """The other ranks of a learner. This base class is for a learner without any."""
 
     def __enter__(self) -> Self:
         return self
@@ -43,9 +43,9 @@ class OneProcess:
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Do nothing."""
 
-    def open(self, spec: RunSpec, stop: threading.Event) -> "Distribution | None":
+    def open(self, spec: RunSpec, stop: threading.Event) -> "OtherRanks | None":
         """See daedalus.learner.ranks.opening.OpenRanks."""
-        return one_process(spec, stop)
+        return no_other_ranks(spec, stop)
 
     def dismiss(self, spec: RunSpec, stop: threading.Event) -> None:
         """End the other ranks of a run that has nothing to do."""
@@ -55,7 +55,7 @@ class OneProcess:
         return str(error), RANK_LOST
 
 
-class StartedRanks(OneProcess):
+class StartedRanks(RankProcesses):
     """Ranks that this process, rank 0, starts on its machine. They end with it, however it ends."""
 
     def __init__(self, number: int, options: Sequence[str]) -> None:
@@ -84,15 +84,15 @@ class StartedRanks(OneProcess):
         self._kill()
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def open(self, spec: RunSpec, stop: threading.Event) -> "Distribution | None":
+    def open(self, spec: RunSpec, stop: threading.Event) -> "OtherRanks | None":
         """See daedalus.learner.ranks.opening.OpenRanks."""
         meeting = Meeting(rank=0, number=self._number, local_rank=0, folder=self._folder, on_this_machine=True)
-        distribution = lead(meeting, None, spec, stop, self._check, self._kill)
-        self._connected = distribution is not None
-        return distribution
+        other_ranks = lead(meeting, None, spec, stop, self._check, self._kill)
+        self._connected = other_ranks is not None
+        return other_ranks
 
     def fault(self, error: RankLostError) -> tuple[str, int]:
-        """See OneProcess. Call it after the context. A rank that failed by itself would fail again."""
+        """See RankProcesses. Call it after the context. A rank that failed by itself would fail again."""
         for rank, status in enumerate(self._statuses, 1):
             if status is not None and status < 0:
                 return f"process {rank} of the learner was killed by signal {-status}", RANK_LOST
@@ -121,19 +121,19 @@ class StartedRanks(OneProcess):
                 process.stdin.close()
 
 
-class LaunchedRanks(OneProcess):
+class LaunchedRanks(RankProcesses):
     """Ranks that torchrun, or another launcher, has started, perhaps on several hosts."""
 
     def __init__(self, meeting: Meeting, options: dict[str, Any]) -> None:
         """Take part as rank 0, with the options of the command line."""
         self._meeting, self._options = meeting, options
 
-    def open(self, spec: RunSpec, stop: threading.Event) -> "Distribution | None":
+    def open(self, spec: RunSpec, stop: threading.Event) -> "OtherRanks | None":
         """See daedalus.learner.ranks.opening.OpenRanks."""
         return lead(self._meeting, self._options, spec, stop, lambda: None, lambda: os._exit(RANK_LOST))
 
     def dismiss(self, spec: RunSpec, stop: threading.Event) -> None:
-        """See OneProcess."""
+        """See RankProcesses."""
         ranks = self.open(spec, stop)
         if ranks is not None:
             ranks.close()
@@ -151,14 +151,14 @@ def meeting_for(arguments: argparse.Namespace) -> Meeting | None:
     return meeting
 
 
-def ranks_for(arguments: argparse.Namespace, run: ChosenRun, meeting: Meeting | None) -> OneProcess:
+def ranks_for(arguments: argparse.Namespace, run: ChosenRun, meeting: Meeting | None) -> RankProcesses:
     """Return the other processes of rank 0 of `daedalus learner`.
 
     Raises SettingsError if there would be nothing for them to do.
     """
     number = (arguments.processes or 1) if meeting is None else meeting.number
     if number == 1:
-        return OneProcess()
+        return RankProcesses()
     check_processes(number, run.spec)
     if meeting is not None:
         return LaunchedRanks(meeting, run_defining(arguments))

@@ -266,9 +266,6 @@ class Gateway:
         """See LinkEvents."""
         self._post(self._on_policy, version)
 
-    def on_learner_lost(self, reason: str) -> None:
-        """See LinkEvents. The clients act on with the last policy."""
-
     def on_run_over(self, reason: str) -> None:
         """See LinkEvents."""
         self._post(self._on_run_over, reason)

@@ -48,10 +48,6 @@ class LinkEvents(Protocol):
         """A newer version is ready to act."""
         ...
 
-    def on_learner_lost(self, reason: str) -> None:
-        """The learner is gone, and is looked for."""
-        ...
-
     def on_run_over(self, reason: str) -> None:
         """The run has ended; another is looked for."""
         ...
@@ -99,7 +95,6 @@ class LearnerLink:
                 self._follow(session)
             except LearnerLostError as error:
                 _logger.info("%s", error)
-                self._events.on_learner_lost(str(error))
             except RunOverError as error:
                 if not error.finished:
                     return

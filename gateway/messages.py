@@ -29,13 +29,6 @@ _HINTS = {
     "ready": "send an act first: the episode has no action yet",
     "acted": "a connection has one hello",
 }
-ERROR_CODES = (
-    "malformed",  # not a message of this protocol
-    "out_of_turn",
-    "misfit",  # a value does not fit the spaces
-    "refused",  # by the learner or by the gateway; do not try again as you are
-    "unavailable",  # no learner, or no room: try again later
-)
 
 
 class Hello(NamedTuple):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.learner.ranks.errors import RankLostError
-from daedalus.learner.ranks.opening import OpenRanks, one_process
+from daedalus.learner.ranks.opening import OpenRanks, no_other_ranks
 from daedalus.learner.reporting.progress import Progress
 from daedalus.learner.reporting.recorder import OpenWriter, Recorder
 from daedalus.learner.reporting.run_records import RunRecords, load_history
@@ -34,7 +34,7 @@ from daedalus.protocol.status import RunStatus
 from daedalus.transport.interface import Transport
 
 if TYPE_CHECKING:
-    from daedalus.learner.ranks.leader import Distribution
+    from daedalus.learner.ranks.leader import OtherRanks
     from daedalus.learner.training.checkpoint import Checkpoint
     from daedalus.learner.training.checkpointer import Checkpointer
     from daedalus.learner.training.learner import Learner
@@ -76,7 +76,7 @@ class LearnerService:
         modules: UserModules = NO_MODULES,
         certificate_days_left: Callable[[], float | None] = lambda: None,
         user_metrics: UserMetrics | None = None,
-        open_ranks: OpenRanks = one_process,
+        open_ranks: OpenRanks = no_other_ranks,
         confirms: bool = False,
     ) -> None:
         """Construct the service.
@@ -101,7 +101,7 @@ class LearnerService:
         self._spec, self._stop, self._progress = spec, stop, progress
         self._open_writers, self._modules, self._open_ranks = open_writers, modules, open_ranks
         self._restored, self._initial = restored, initial if restored is None else None
-        self._ranks: Distribution | None = None  # None: not connected yet
+        self._ranks: OtherRanks | None = None  # None: not connected yet
         self._state = RunState(directory, spec, started, certificate_days_left)
         if restored is not None:
             self._state.restore(restored.counters, restored.policy.spec)

@@ -1,4 +1,4 @@
-"""Compact weights for slow links: bfloat16, optionally as differences to a version that the reader holds.
+"""Compact weights: bfloat16, optionally as differences to a version that the reader holds.
 
 A bfloat16 is the upper half of a float32, rounded to the nearest even. From one update to the next most values are
 unchanged and the others change little, so the differences are small integers. They are mapped to unsigned numbers

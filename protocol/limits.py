@@ -1,7 +1,7 @@
 """Limits of each kind of message, checked before memory is allocated for it.
 
 A reader decodes a message with the limits of the kind that it expects. The limits of a rollout depend on the run's
-spec and are computed by the learner (learner/serving/intake.py).
+spec and are computed by the learner (learner/serving/rollout_judge.py).
 """
 
 from dataclasses import dataclass

@@ -118,7 +118,7 @@ class SnapshotRequest:
     """Request of an actor for the newest snapshot. Actor -> learner, on `snapshots`.
 
     If `compact` is false, the answer is the newest Snapshot, or a Refusal `not_ready` if the actor holds it.
-    If `compact` is true, the answer is one part of a CompactSnapshot, for a slow link. The request for part 0 makes the
+    If `compact` is true, the answer is one part of a CompactSnapshot. The request for part 0 makes the
     learner encode its newest snapshot as differences to `held_version`; the requests for the other parts give the
     policy version of that snapshot, and the same `held_version`.
     """
@@ -154,7 +154,7 @@ class SnapshotPart:
 class CompactSnapshot:
     """Snapshot in bfloat16, whole or as differences to an earlier version (protocol/compact.py).
 
-    Learner -> actors on slow links, in SnapshotParts.
+    Learner -> actors that request it, in SnapshotParts.
     """
 
     learner_epoch: int

@@ -444,11 +444,6 @@ class RunSpec(Specification):
         """How many rollouts make a batch where no barrier decides it."""
         return self.training.batch_rollouts or self.algorithm.batch_rollouts or self.collection.actors
 
-    @property
-    def policy_lag_bound(self) -> int:
-        """Largest policy lag that is learned from, in updates, with the expected actors."""
-        return self.policy_lag_bound_with(0)
-
     def policy_lag_bound_with(self, live: int) -> int:
         """Return the largest policy lag that is learned from, in updates, with so many live actors.
 

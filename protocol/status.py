@@ -28,7 +28,7 @@ class ActorStatus(Specification):
     rollouts_missed: int  # sequence numbers that never arrived
     busy_answers: int  # how often the learner answered busy
     policy_lag: int  # of its newest rollout, in updates
-    compact_snapshots: bool  # it requests compact snapshots at its own rate, instead of receiving every snapshot
+    compact_snapshots: bool  # it requests compact snapshots, not whole ones
     bytes_up_per_hour: float  # of rollouts, at the rate of the last seconds
     bytes_down_per_hour: float  # of snapshots
     # What a client reports of its newest process (protocol/client_report.py); 0 and empty for any other actor.

@@ -19,7 +19,7 @@ class ActorConfig:
     environments: int | None = None  # E; None: as many as the learner's specification says
     runtime: Literal["onnx", "torch"] = "onnx"
     modules: UserModules = NO_MODULES  # that may be imported for environments
-    link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: receive all; auto: measure the link and decide
+    link: LinkChoice = "auto"  # wan: fetch compact snapshots; lan: as on a fast link; auto: measure the link and decide
     timeout: float | None = None  # seconds to look for a learner; None: for ever
     waits_for_return: bool = False  # whether to look for ever for a learner that has gone, whatever the timeout
     max_policy_age: float | None = None  # seconds within which the learner must confirm the policy; None: no limit

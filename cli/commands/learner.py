@@ -36,7 +36,7 @@ from daedalus.cli.processes import (
     stop_on_signals,
 )
 from daedalus.cli.quick_check import expected_defaults, expected_spaces
-from daedalus.cli.ranks import OneProcess, StartedRanks, follow_launched, meeting_for, ranks_for
+from daedalus.cli.ranks import RankProcesses, StartedRanks, follow_launched, meeting_for, ranks_for
 from daedalus.cli.settings_arguments import ChosenRun, choose_run, learner_parser, resolve
 from daedalus.cli.supervised_learner import supervise_learner
 from daedalus.cli.tracking.tracker_processes import TrackerProcesses
@@ -144,7 +144,7 @@ def _serve(
     started: float,
     user_metrics: UserMetrics,
     context: dict[str, str],
-    ranks: OneProcess,
+    ranks: RankProcesses,
     stack: ExitStack,
 ) -> int:
     """Run the learner to its end and return the exit status. Raises _FAILURES or RankLostError.

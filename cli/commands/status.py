@@ -37,7 +37,7 @@ examples:
   daedalus status --alive runs/cartpole      on the learner's machine: is the learner alive?
 
 epsilon is the probability with which an actor takes a random action, in the end. MB/h up counts rollouts, MB/h down
-counts snapshots. An s marks an actor that fetches compact snapshots, over a slow link.
+counts snapshots. An s marks an actor that fetches compact snapshots.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
 0 alive or starting, 1 not alive or no such directory"""

@@ -9,13 +9,13 @@ from pydantic import ValidationError
 
 from daedalus.algorithms.batch import BatchAssembler
 from daedalus.algorithms.errors import AlgorithmError
-from daedalus.algorithms.ranks import Share
+from daedalus.algorithms.ranks import RankPart
 from daedalus.learner.ranks.agreement import Options, checked
+from daedalus.learner.ranks.commands import Command, CommandKind, receive
 from daedalus.learner.ranks.errors import RanksDisagreeError
 from daedalus.learner.ranks.group import Group
 from daedalus.learner.ranks.leader import exchange, report_first_pass
-from daedalus.learner.ranks.orders import Kind, Order, receive
-from daedalus.learner.ranks.shares import bounds_of
+from daedalus.learner.ranks.parts import bounds_of
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.errors import NetworkError
@@ -54,17 +54,17 @@ class Follower:
 
     def run(self) -> None:
         """Obey rank 0 until it ends the run. Raises RanksDisagreeError or RankLostError."""
-        while (order := receive(self._group)).kind is not Kind.END:
-            if order.kind is Kind.BEGIN:
+        while (command := receive(self._group)).kind is not CommandKind.END:
+            if command.kind is CommandKind.BEGIN:
                 self._begin()
-            elif order.kind is Kind.STATE:
+            elif command.kind is CommandKind.STATE:
                 exchange(self._group, self._built.shared_state())
-            elif order.kind is Kind.BATCH:
-                self._update(order)
+            elif command.kind is CommandKind.BATCH:
+                self._update(command)
 
     @property
     def _built(self) -> Learner:
-        assert self._learner is not None, "rank 0 has ordered no beginning"
+        assert self._learner is not None, "rank 0 has not begun"
         return self._learner
 
     def _begin(self) -> None:
@@ -86,17 +86,17 @@ class Follower:
         self._group.report(text)
         return RanksDisagreeError(text)
 
-    def _update(self, order: Order) -> None:
+    def _update(self, command: Command) -> None:
         """Make the updates of a batch."""
         group, learner = self._group, self._built
         assert self._assembler is not None
-        valid = torch.zeros(order.rows, order.environments)
+        valid = torch.zeros(command.rows, command.environments)
         exchange(group, [*learner.constants, valid])
-        first, end = bounds_of(order.environments, group.number)[group.rank]
-        batch = self._assembler.allocate(order.rows, max(end - first, 1), learner.state_size)
+        first, end = bounds_of(command.environments, group.number)[group.rank]
+        batch = self._assembler.allocate(command.rows, max(end - first, 1), learner.state_size)
         group.receive(batch.tensors(), 0)
-        share = Share(ranks=group, first=first, end=end, valid=valid, updates=order.end - order.version)
-        learner.policy_version = order.version
-        learned = learner.learn_from(replace(batch, share=share), order.progress, order.end)
+        part = RankPart(ranks=group, first=first, end=end, valid=valid, updates=command.end - command.version)
+        learner.policy_version = command.version
+        learned = learner.learn_from(replace(batch, rank_part=part), command.progress, command.end)
         if learned and learner.first_pass is not None:
             report_first_pass(group, learner.first_pass, end - first)

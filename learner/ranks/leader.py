@@ -1,6 +1,6 @@
-"""What rank 0 does with the other ranks: it gives them their shares of each batch and collects what they measured.
+"""What rank 0 does with the other ranks: it gives them their parts of each batch and collects what they measured.
 
-A learner of one process has the null object ONE_PROCESS in its place.
+A learner of one process has the null object NO_OTHER_RANKS in its place.
 """
 
 import logging
@@ -14,20 +14,20 @@ from torch import Tensor
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.diagnostics import FirstPass
 from daedalus.learner.ranks.agreement import Run, described
+from daedalus.learner.ranks.commands import Command, CommandKind, give
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.ranks.group import Group
-from daedalus.learner.ranks.orders import Kind, Order, give
-from daedalus.learner.ranks.shares import bounds_of, share_of
+from daedalus.learner.ranks.parts import bounds_of, part_of
 from daedalus.protocol.spaces import Spaces
 
 _logger = logging.getLogger(__name__)
 
-_WAIT_SECONDS = 5.0  # between two orders to wait
+_WAIT_SECONDS = 5.0  # between two commands to wait
 _STATE_BATCHES = 100  # between two exchanges of the state, so that differently rounding processors stay together
 
 
-class Distribution(Protocol):
-    """How the updates of a learner are distributed."""
+class OtherRanks(Protocol):
+    """The other processes that compute the updates of a learner."""
 
     def begin(self, spaces: Spaces, state: Callable[[], Sequence[Tensor]]) -> None:
         """Let the other processes construct their learners, with the state of this one's.
@@ -40,8 +40,8 @@ class Distribution(Protocol):
         """
         ...
 
-    def share(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
-        """Return the share of a batch that this process learns from, after the others have got theirs.
+    def part(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
+        """Return the part of a batch that this process learns from, after the others have got theirs.
 
         Args:
           batch: the whole batch, in main memory.
@@ -53,7 +53,7 @@ class Distribution(Protocol):
         ...
 
     def collect(self, first_pass: FirstPass) -> FirstPass:
-        """Return the first pass of the whole batch for that of this process's share."""
+        """Return the first pass of the whole batch for that of this process's part."""
         ...
 
     def wait(self) -> None:
@@ -65,13 +65,13 @@ class Distribution(Protocol):
         ...
 
 
-class _OneProcess:
-    """See Distribution."""
+class _NoOtherRanks:
+    """See OtherRanks."""
 
     def begin(self, spaces: Spaces, state: Callable[[], Sequence[Tensor]]) -> None:
         pass
 
-    def share(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
+    def part(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
         return batch
 
     def collect(self, first_pass: FirstPass) -> FirstPass:
@@ -84,11 +84,11 @@ class _OneProcess:
         pass
 
 
-ONE_PROCESS: Distribution = _OneProcess()
+NO_OTHER_RANKS: OtherRanks = _NoOtherRanks()
 
 
 class Leader:
-    """Rank 0 of a learner of several processes. See Distribution; each method raises RankLostError if it loses one."""
+    """Rank 0 of a learner of several processes. See OtherRanks; each method raises RankLostError if it loses one."""
 
     def __init__(self, group: Group, run: Run) -> None:
         """Check that all ranks were started for the same run. Raises RanksDisagreeError or RankLostError."""
@@ -96,36 +96,38 @@ class Leader:
         self._batches = 0
         self._bounds: list[tuple[int, int]] = []  # of the newest batch
         self._state: Callable[[], Sequence[Tensor]] = tuple
-        self._ordered_at = time.monotonic()
+        self._commanded_at = time.monotonic()
         group.announce(described(run))
         self._check_reports()
 
     def begin(self, spaces: Spaces, state: Callable[[], Sequence[Tensor]]) -> None:
-        """See Distribution."""
+        """See OtherRanks."""
         self._state = state
-        self._order(Order(kind=Kind.BEGIN))
+        self._command(Command(kind=CommandKind.BEGIN))
         self._group.announce(spaces.model_dump_json())
         self._check_reports()
         self._synchronize()
         _logger.info("%d processes compute the updates", self._group.number)
 
-    def share(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
-        """See Distribution."""
+    def part(self, batch: Batch, constants: Sequence[Tensor], version: int, end: int, progress: float) -> Batch:
+        """See OtherRanks."""
         self._batches += 1
         if self._batches % _STATE_BATCHES == 0:
-            self._order(Order(kind=Kind.STATE))
+            self._command(Command(kind=CommandKind.STATE))
             self._synchronize()
         rows, width = batch.rewards.shape
         self._bounds = bounds_of(width, self._group.number)
-        self._order(Order(kind=Kind.BATCH, rows=rows, environments=width, version=version, end=end, progress=progress))
+        self._command(
+            Command(kind=CommandKind.BATCH, rows=rows, environments=width, version=version, end=end, progress=progress)
+        )
         exchange(self._group, [*constants, batch.valid])
-        own, *others = (share_of(batch, self._group, *bounds, end - version) for bounds in self._bounds)
+        own, *others = (part_of(batch, self._group, *bounds, end - version) for bounds in self._bounds)
         for rank, other in enumerate(others, 1):
             self._group.send(other.tensors(), rank)
         return own
 
     def collect(self, first_pass: FirstPass) -> FirstPass:
-        """See Distribution."""
+        """See OtherRanks."""
         stacked = _stacked(first_pass)
         parts = [stacked]
         for rank in self._group.others:
@@ -136,20 +138,20 @@ class Leader:
         return FirstPass(log_probs[0] if log_probs else None, behaviour, values, targets, advantages, valid)
 
     def wait(self) -> None:
-        """See Distribution."""
-        if time.monotonic() > self._ordered_at + _WAIT_SECONDS:
-            self._order(Order(kind=Kind.WAIT))
+        """See OtherRanks."""
+        if time.monotonic() > self._commanded_at + _WAIT_SECONDS:
+            self._command(Command(kind=CommandKind.WAIT))
 
     def close(self) -> None:
-        """See Distribution."""
+        """See OtherRanks."""
         try:
-            self._order(Order(kind=Kind.END))
+            self._command(Command(kind=CommandKind.END))
         except RankLostError:
             return
 
-    def _order(self, order: Order) -> None:
-        give(self._group, order)
-        self._ordered_at = time.monotonic()
+    def _command(self, command: Command) -> None:
+        give(self._group, command)
+        self._commanded_at = time.monotonic()
 
     def _synchronize(self) -> None:
         exchange(self._group, self._state())
@@ -167,7 +169,7 @@ def exchange(group: Group, tensors: Sequence[Tensor]) -> None:
 
 
 def report_first_pass(group: Group, first_pass: FirstPass, environments: int) -> None:
-    """Send the first pass of a share, of so many environments, to rank 0. See Leader.collect."""
+    """Send the first pass of a part, of so many environments, to rank 0. See Leader.collect."""
     group.send([_stacked(first_pass)[:, :, :environments].contiguous()], 0)
 
 

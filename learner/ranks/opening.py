@@ -11,19 +11,19 @@ from daedalus.protocol.spec import RunSpec
 if TYPE_CHECKING:
     from daedalus.learner.ranks.agreement import Options
     from daedalus.learner.ranks.group import Group
-    from daedalus.learner.ranks.leader import Distribution
+    from daedalus.learner.ranks.leader import OtherRanks
 
 _POLL_SECONDS = 0.1
 _GRACE_SECONDS = 2.0  # for the other ranks to answer after a signal has stopped this one
 
-OpenRanks = Callable[[RunSpec, threading.Event], "Distribution | None"]  # None: stopped before all had connected
+OpenRanks = Callable[[RunSpec, threading.Event], "OtherRanks | None"]  # None: stopped before all had connected
 
 
-def one_process(_spec: RunSpec, _stop: threading.Event) -> "Distribution | None":
-    """Return the distribution of a learner without other ranks."""
-    from daedalus.learner.ranks.leader import ONE_PROCESS
+def no_other_ranks(_spec: RunSpec, _stop: threading.Event) -> "OtherRanks | None":
+    """Return the null object for a learner without other ranks."""
+    from daedalus.learner.ranks.leader import NO_OTHER_RANKS
 
-    return ONE_PROCESS
+    return NO_OTHER_RANKS
 
 
 def lead(
@@ -33,7 +33,7 @@ def lead(
     stop: threading.Event,
     check: Callable[[], None],
     give_up: Callable[[], None],
-) -> "Distribution | None":
+) -> "OtherRanks | None":
     """Connect rank 0 with all others. Return None if `stop` is set before.
 
     Args:

@@ -1,4 +1,4 @@
-"""Compact snapshots for actors on slow links: weights in bfloat16, as differences to the version that an actor holds.
+"""Compact snapshots for actors that request them: weights in bfloat16, as differences to the version they hold.
 
 A compact snapshot is sent in parts. Each request of a fetch gives the version that the actor holds, and all but the
 first also the version of the snapshot: encoded snapshots are kept by these two, whoever asks. State, no I/O and no

@@ -1,4 +1,4 @@
-"""Serving of compact snapshots to actors on slow links. Has its own thread, because differences take time."""
+"""Serving of compact snapshots to actors that request them. Has its own thread, because differences take time."""
 
 import queue
 import threading

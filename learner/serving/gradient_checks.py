@@ -60,7 +60,7 @@ def restored(gradient: Gradient) -> Gradient:
     return replace(gradient, gradient={**gradient.gradient, **float32(bits_of(compact, None))})
 
 
-def first_violation(gradient: Gradient, spec: RunSpec, shapes: Shapes, spaces: Spaces, environments: int) -> str:
+def gradient_violation(gradient: Gradient, spec: RunSpec, shapes: Shapes, spaces: Spaces, environments: int) -> str:
     """Return a description of the first violation of a `restored` gradient, or an empty string.
 
     Args:

@@ -25,9 +25,9 @@ from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Actor, Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
 from daedalus.learner.serving.held_answers import HeldAnswers
-from daedalus.learner.serving.intake import Intake, Rejected, acknowledgement
 from daedalus.learner.serving.request_queue import LATE_SECONDS, RequestQueue
 from daedalus.learner.serving.rollout_buffer import BarrierBuffer, RolloutBuffer, StreamBuffer, TakenRollouts
+from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge, acknowledgement
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS, Limits
@@ -73,7 +73,7 @@ class RolloutIntake:
         self._spec, self._lock, self._fleet, self._counters = spec, lock, fleet, counters
         self._published_version, self._events = published_version, events
         self._version = start_version  # rollouts of this version have a policy lag of 0
-        self._intake = Intake(spec, learner_epoch, fleet)
+        self._judge = RolloutJudge(spec, learner_epoch, fleet)
         self._buffer = _buffer(spec)
         self._requests = RequestQueue(spec.service.queue_bytes, _most_requests(spec, live=0))
         self._named: set[str] = set()  # actors that were logged as left out
@@ -118,15 +118,13 @@ class RolloutIntake:
           state_size: of the recurrent state in a rollout.
           gradient_shapes: shapes of the parameters that have gradients, by name.
         """
-        self._intake.state_size, self._intake.gradient_shapes = state_size, gradient_shapes
+        self._judge.state_size, self._judge.gradient_shapes = state_size, gradient_shapes
 
     def offer(self, request: Request) -> None:
         """Queue a rollout, or answer busy. Does not block."""
         if self._ending is not None:
             request.reply(encode(self._ending))
-        elif self._refuses_size(request):
-            pass
-        elif not self._requests.offer(request):
+        elif not self._refuses_size(request) and not self._requests.offer(request):
             self._answer_busy(request)
 
     def _answer_busy(self, request: Request) -> None:
@@ -139,11 +137,11 @@ class RolloutIntake:
     def _refuses_size(self, request: Request) -> bool:
         """Refuse a request that cannot be a rollout of its sender, without a copy of its payload."""
         sender = keys.last_chunk(request.key)
-        refused = self._intake.refuse_size(sender, request.size)
+        refused = self._judge.refuse_size(sender, request.size)
         if refused is None:
             return False
         with self._lock:
-            refused = self._intake.judge(sender, refused, self._version, time.monotonic())
+            refused = self._judge.decide(sender, refused, self._version, time.monotonic())
             assert isinstance(refused, Rejected)
             self._count_rejection(sender, refused)
         request.reply(encode(acknowledgement(refused, self._published_version())))
@@ -219,7 +217,7 @@ class RolloutIntake:
                 actors[rollout.identity.actor].rejected["stale"] += 1
         if not taken.rollouts:
             return
-        updates = updates_of(self._spec.training, taken.rollouts, memory=self._intake.state_size > 0)
+        updates = updates_of(self._spec.training, taken.rollouts, memory=self._judge.state_size > 0)
         self._counters.trained(taken.rollouts, version, updates)
         for rollout in taken.rollouts:
             if rollout.identity.actor in actors:
@@ -239,12 +237,12 @@ class RolloutIntake:
                 break
             arrived, request = taken
             sender, payload = keys.last_chunk(request.key), request.payload
-            content = self._intake.read(sender, payload)
+            content = self._judge.read(sender, payload)
             if not self._wait_for_room(content, arrived + LATE_SECONDS):
                 self._answer_busy(request)
                 continue
             with self._lock:
-                answer = self._judge(sender, content, len(payload))
+                answer = self._decide(sender, content, len(payload))
                 is_held = answer.verdict == "accepted" and self._held.holds and self._ending is None
                 if is_held:
                     self._held.add(request)
@@ -287,14 +285,14 @@ class RolloutIntake:
         for request, answer in answers:
             request.reply(encode(replace(answer, policy_version=self._published_version())))
 
-    def _judge(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
+    def _decide(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
             content = Rejected(
                 verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
             )
         if not isinstance(content, Rejected):
             self._buffer.heard(sender)
-        verdict = self._intake.judge(sender, content, self._version, time.monotonic())
+        verdict = self._judge.decide(sender, content, self._version, time.monotonic())
         self._fleet.received(sender, size)
         if isinstance(verdict, Rejected):
             self._count_rejection(sender, verdict)

@@ -96,7 +96,7 @@ class SnapshotPublisher:
         """Publish a policy version if enough rollouts were trained on since the last snapshot.
 
         With a small fleet, publish every update. With a large fleet, publish after a quarter of the actors have
-        contributed: each snapshot is sent to all actors, and an actor uses at most one snapshot for each rollout.
+        contributed: each snapshot is copied and encoded, and an actor uses at most one for each rollout.
         Publish in any case after a quarter of the policy lag bound, so that rollouts stay well within the bound.
 
         Args:

@@ -13,7 +13,7 @@ from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import TARGET, GradientInputs, exact, packed
 from daedalus.algorithms.gradients import GradientComputer, Terms
 from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer
-from daedalus.learner.ranks.leader import ONE_PROCESS, Distribution
+from daedalus.learner.ranks.leader import NO_OTHER_RANKS, OtherRanks
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.run.updates import updates_of
 from daedalus.learner.training.errors import CheckpointMismatchError
@@ -46,7 +46,7 @@ class Learner:
         policy: PolicySpec,
         spaces: Spaces,
         modules: UserModules = NO_MODULES,
-        distribution: Distribution = ONE_PROCESS,
+        other_ranks: OtherRanks = NO_OTHER_RANKS,
     ) -> None:
         """Construct the learner at policy version 0, with parameters initialised from `spec.seed`.
 
@@ -55,7 +55,7 @@ class Learner:
           policy: settings of the network.
           spaces: components of observations and actions.
           modules: may be imported for the policy.
-          distribution: gives other processes their shares of each batch.
+          other_ranks: other processes that compute parts of each batch.
 
         Raises SettingsError if the device is not available, NetworkError if the policy does not support the spaces,
         AlgorithmError if the algorithm of the user cannot be used.
@@ -68,7 +68,7 @@ class Learner:
         torch.manual_seed(spec.seed)
         torch.set_num_threads(spec.threads)
         self._spec, self._spaces = spec, spaces
-        self._distribution = distribution
+        self._other_ranks = other_ranks
         self.device = torch.device(spec.device)
         self._network = ActorCritic(policy, spaces, modules, spec).to(self.device)
         self._gradients = GradientComputer(spec, self._network, spaces, modules)
@@ -119,12 +119,12 @@ class Learner:
     def _make_updates(self, rollouts: Sequence[Rollout], progress: float, end: int) -> bool:
         """Make updates until policy version `end`. Return False at the first whose gradient is not finite."""
         batch = self._joined(rollouts)
-        share = self._distribution.share(batch, self.constants, self.policy_version, end, progress)
-        if not self.learn_from(share, progress, end):
+        part = self._other_ranks.part(batch, self.constants, self.policy_version, end, progress)
+        if not self.learn_from(part, progress, end):
             return False
         self._observations.add(batch)
         if self.first_pass is not None:
-            self.first_pass = self._distribution.collect(self.first_pass)
+            self.first_pass = self._other_ranks.collect(self.first_pass)
             self.metrics.add_batch_metrics(batch_metrics(self.first_pass))
         self.metrics.add_batch(batch)
         return True

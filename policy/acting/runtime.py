@@ -160,11 +160,6 @@ class OnnxRuntime:
         """See PolicyRuntime."""
         return self._explores
 
-    @property
-    def weight_names(self) -> tuple[str, ...]:
-        """Names of the weights that the program requires."""
-        return tuple(self._shapes)
-
     def load(self, weights: dict[str, np.ndarray]) -> None:
         """See PolicyRuntime."""
         for name, shape in self._shapes.items():

@@ -9,7 +9,7 @@ from test_client_collector import IDENTITY, ROWS, Played, Robot, run_spec, synch
 
 from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_collector import ClientCollector
-from daedalus.learner.serving.intake import _episode_violation
+from daedalus.learner.serving.rollout_judge import _episode_violation
 from daedalus.protocol.uploads import Rollout
 
 AGENTS = 3

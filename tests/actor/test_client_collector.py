@@ -18,7 +18,7 @@ from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.environments.make import make_environments
 from daedalus.actor.errors import ActorError
-from daedalus.learner.serving.intake import _episode_violation
+from daedalus.learner.serving.rollout_judge import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic

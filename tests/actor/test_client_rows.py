@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from daedalus.actor.collecting.client_rows import ClientRows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.transforms import Transforms
-from daedalus.learner.serving.intake import _episode_violation
+from daedalus.learner.serving.rollout_judge import _episode_violation
 from daedalus.policy.acting.program import export_program
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.network.actor_critic import ActorCritic

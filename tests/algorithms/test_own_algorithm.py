@@ -152,7 +152,7 @@ def test_the_record_of_the_class_schedules_the_run(modules: UserModules) -> None
     assert not unresolved.algorithm.synchronous
     assert with_record(unresolved, modules).algorithm.synchronous
     passes = resolved(modules, "Passes", passes=2, minibatches=3)
-    assert (passes.batch_rollouts, passes.training.updates_per_batch, passes.policy_lag_bound) == (5, 6, 12)
+    assert (passes.batch_rollouts, passes.training.updates_per_batch, passes.policy_lag_bound_with(0)) == (5, 6, 12)
     with pytest.raises(SettingsError, match="batch_rollouts has no meaning for own_algorithms:Barrier"):
         resolved(modules, "Barrier", batch_rollouts=2)
 

@@ -8,7 +8,7 @@ from oracles import Stream, lambda_return, n_step_return, vtrace, vtrace_advanta
 from torch import Tensor
 from torch.testing import assert_close
 
-from daedalus.algorithms.returns import actor_critic_targets, lambda_returns, n_step_returns, vtrace_targets
+from daedalus.algorithms.returns import actor_critic_targets, lambda_returns, vtrace_targets
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 NUMBER = st.floats(-10.0, 10.0, width=32)
@@ -67,8 +67,8 @@ def assert_rows(result: Tensor, columns: list[Stream], expected) -> None:
 
 @repeatable
 @given(ROLLOUTS, UNIT)
-def test_n_step_returns_are_the_explicit_sums(columns: list[Stream], gamma: float) -> None:
-    result = n_step_returns(*Columns(columns, gamma).of_returns)
+def test_lambda_of_1_gives_n_step_returns_as_explicit_sums(columns: list[Stream], gamma: float) -> None:
+    result = lambda_returns(*Columns(columns, gamma).of_returns, 1.0)
     assert_rows(result, columns, lambda x, t: n_step_return(x, gamma, t, len(x.r)))
 
 
@@ -110,13 +110,6 @@ def test_lambda_of_0_gives_one_step_returns(columns: list[Stream], gamma: float)
     data = Columns(columns, gamma)
     expected = data.rewards + data.discounts * data.next_values
     assert_close(lambda_returns(*data.of_returns, 0.0), expected)
-
-
-@repeatable
-@given(ROLLOUTS, UNIT)
-def test_lambda_of_1_gives_n_step_returns(columns: list[Stream], gamma: float) -> None:
-    data = Columns(columns, gamma)
-    assert torch.equal(lambda_returns(*data.of_returns, 1.0), n_step_returns(*data.of_returns))
 
 
 @repeatable
@@ -198,7 +191,7 @@ def test_n_step_returns_equal_a_hand_worked_example() -> None:
     #   G_1 = 2 + 1/2 * 19   = 11.5
     #   G_0 = 1 + 1/2 * 11.5 = 6.75
     cut = torch.zeros(3, 1, dtype=torch.bool)
-    result = n_step_returns(column(1, 2, 4), column(0.5, 0.5, 0.5), column(10, 20, 30), cut)
+    result = lambda_returns(column(1, 2, 4), column(0.5, 0.5, 0.5), column(10, 20, 30), cut, 1.0)
     assert torch.equal(result, column(6.75, 11.5, 19))
 
 
@@ -246,7 +239,7 @@ def test_truncation_bootstraps_and_termination_does_not_within_one_rollout() -> 
     truncated = torch.tensor([no, yes, no, no, no, no, no]).unsqueeze(1)
     played = [0, 1, 3, 4, 6]
     expected = column(7, 12, 5, 4, 41)
-    assert torch.equal(n_step_returns(rewards, discounts, next_values, truncated)[played], expected)
+    assert torch.equal(lambda_returns(rewards, discounts, next_values, truncated, 1.0)[played], expected)
     values = torch.cat([column(0), next_values[:-1]])
     on_policy = torch.zeros_like(rewards)
     targets = vtrace_targets(on_policy, rewards, discounts, values, next_values, truncated, 1.0, 1.0, 1.0)

@@ -12,7 +12,7 @@ from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed, unpacked
 from daedalus.algorithms.gradients import Terms
 from daedalus.algorithms.rollout_gradients import RolloutGradients
-from daedalus.learner.serving.gradient_checks import first_violation, restored
+from daedalus.learner.serving.gradient_checks import gradient_violation, restored
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.errors import PolicyError
 from daedalus.protocol.codec import decode, encode
@@ -193,7 +193,7 @@ def test_an_actor_recovers_from_a_reward_that_is_not_finite(bad: float) -> None:
     rewards[-1, :] = bad
     rollouts = [replace(played("a", 0), rewards=rewards), played("a", 1), played("a", 2)]
     violations = [
-        first_violation(restored(sent(actor, each)), spec, learner.gradient_shapes, SPACES, ENVIRONMENTS)
+        gradient_violation(restored(sent(actor, each)), spec, learner.gradient_shapes, SPACES, ENVIRONMENTS)
         for each in rollouts
     ]
     assert "not finite" in violations[0]
@@ -207,7 +207,7 @@ def test_a_gradient_of_equal_targets_has_no_explained_variance() -> None:
     actor.load(snapshot(by_gradients))
     rollout = replace(played("a", 0), rewards=np.full_like(played("a", 0).rewards, 0.7))
     gradient = restored(sent(actor, rollout))
-    assert first_violation(gradient, spec, by_gradients.gradient_shapes, SPACES, ENVIRONMENTS) == ""
+    assert gradient_violation(gradient, spec, by_gradients.gradient_shapes, SPACES, ENVIRONMENTS) == ""
     by_gradients.apply([gradient], 0.0)
     by_rollouts.step([rollout], 0.0)
     for learner in (by_rollouts, by_gradients):

@@ -12,7 +12,7 @@ Start = Callable[..., Running]
 
 # A module, and an assignment in it that makes the named thread raise the next time it works.
 LEARNER_FAULTS = {
-    "intake": "daedalus.learner.serving.intake:Intake.read",
+    "intake": "daedalus.learner.serving.rollout_judge:RolloutJudge.read",
     "compact snapshots": "daedalus.learner.serving.compact_snapshot_cache:CompactSnapshotCache.answer",
     "recorder": "daedalus.learner.reporting.csv_writer:CsvWriter.write",
     "session watchdog": "daedalus.learner.serving.session_watchdog:SessionWatchdog._watch",

@@ -5,10 +5,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import onnx
 from processes import LIMIT
 
 from daedalus.policy.acting.program import export_program
-from daedalus.policy.acting.runtime import OnnxRuntime, program_hash
+from daedalus.policy.acting.runtime import program_hash
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.protocol import keys
 from daedalus.protocol.codec import decode, encode
@@ -90,8 +91,9 @@ class RecordingLearner:
         if join.spaces is not None and not self.weights:
             self.network = ActorCritic(self.spec.policy, join.spaces, training=self.spec.training)
             self.model = export_program(self.network, join.spaces)
-            self.weights = {name: p.detach().numpy().copy() for name, p in self.network.named_parameters()}
-            self.weights = {name: self.weights[name] for name in OnnxRuntime(self.model).weight_names}
+            inputs = {entry.name for entry in onnx.load_model_from_string(self.model).graph.input}
+            parameters = dict(self.network.named_parameters())
+            self.weights = {name: parameters[name].detach().numpy().copy() for name in inputs & parameters.keys()}
         request.reply(encode(Welcome(run="r", learner_epoch=self.epoch, seed=11, epsilon=self.epsilon, spec=self.spec)))
 
     def _on_rollout(self, request: Request) -> None:

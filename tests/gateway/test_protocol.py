@@ -3,7 +3,7 @@
 import importlib.resources
 import itertools
 import json
-from typing import Any
+from typing import Any, get_args
 
 import jsonschema
 import pytest
@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_a
 from scripted_learner import ScriptedLearner
 
 from daedalus.gateway import messages
+from daedalus.gateway.errors import ErrorCode
 from daedalus.transport.memory import MemoryNetwork
 
 SCHEMA = json.loads(importlib.resources.files("daedalus.gateway").joinpath("protocol.json").read_text())
@@ -45,7 +46,7 @@ def check(message: dict[str, Any], side: str) -> None:
 def test_schema_is_one_and_knows_every_message_and_code() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     assert [entry["$ref"].rpartition("/")[2] for entry in SCHEMA["$defs"]["client"]["oneOf"]] == list(messages._FIELDS)
-    assert SCHEMA["$defs"]["error"]["properties"]["code"]["enum"] == list(messages.ERROR_CODES)
+    assert SCHEMA["$defs"]["error"]["properties"]["code"]["enum"] == list(get_args(ErrorCode))
     for kind, (required, optional) in messages._FIELDS.items():
         definition = SCHEMA["$defs"][kind]
         assert set(definition["required"]) == {"type", *required}

@@ -1,4 +1,4 @@
-"""learner/serving/compact_snapshot_cache.py: compact snapshots for actors on slow links."""
+"""learner/serving/compact_snapshot_cache.py: compact snapshots for actors that request them."""
 
 import numpy as np
 import pytest

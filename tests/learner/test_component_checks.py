@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from building import ENVIRONMENTS, EPOCH, ROWS, joined_fleet, make_rollout, run_spec
 
-from daedalus.learner.serving.intake import Intake, Rejected
+from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.protocol.codec import encode
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 
@@ -39,8 +39,8 @@ def content() -> dict[str, Any]:
 
 def verdict_on(changed: dict[str, Any]) -> str:
     """Return why a rollout is rejected, or an empty string."""
-    intake = Intake(run_spec(), EPOCH, joined_fleet("a", spaces=SPACES))
-    verdict = intake.judge("a", intake.read("a", encode(make_rollout(**changed))), 0, 0.0)
+    judge = RolloutJudge(run_spec(), EPOCH, joined_fleet("a", spaces=SPACES))
+    verdict = judge.decide("a", judge.read("a", encode(make_rollout(**changed))), 0, 0.0)
     return verdict.reason if isinstance(verdict, Rejected) else ""
 
 
@@ -116,6 +116,6 @@ def test_probability_of_discrete_actions_is_at_most_one() -> None:
 
 
 def _discrete_verdict(log_probs: np.ndarray) -> str:
-    intake = Intake(run_spec(), EPOCH, joined_fleet("a"))
-    verdict = intake.read("a", encode(make_rollout(behaviour_log_probs=log_probs)))
+    judge = RolloutJudge(run_spec(), EPOCH, joined_fleet("a"))
+    verdict = judge.read("a", encode(make_rollout(behaviour_log_probs=log_probs)))
     return verdict.reason if isinstance(verdict, Rejected) else ""

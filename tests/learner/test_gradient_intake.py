@@ -10,7 +10,7 @@ from building import ENVIRONMENTS, EPOCH, ROWS, SPACES, identity, joined_fleet, 
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.components import first_component_violation
-from daedalus.learner.serving.intake import Intake, Rejected
+from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Message
@@ -45,14 +45,14 @@ GOOD = gradient()
 class Harness:
     def __init__(self) -> None:
         self.fleet = joined_fleet("a", "b")
-        self.intake = Intake(SPEC, EPOCH, self.fleet)
-        self.intake.gradient_shapes = LEARNER.gradient_shapes
+        self.judge = RolloutJudge(SPEC, EPOCH, self.fleet)
+        self.judge.gradient_shapes = LEARNER.gradient_shapes
 
     def receive(self, message: Message, sender: str = "a") -> Upload | Rejected:
         data = encode(message)
-        refused = self.intake.refuse_size(sender, len(data))
+        refused = self.judge.refuse_size(sender, len(data))
         assert refused is None, refused
-        return self.intake.judge(sender, self.intake.read(sender, data), VERSION, 1.0)
+        return self.judge.decide(sender, self.judge.read(sender, data), VERSION, 1.0)
 
 
 @pytest.fixture
@@ -183,15 +183,15 @@ def test_the_promises_about_rollouts_hold_for_gradients(
 
 def test_a_run_of_rollouts_rejects_gradients() -> None:
     fleet = joined_fleet("a")
-    intake = Intake(run_spec(), EPOCH, fleet)
-    verdict = intake.read("a", encode(GOOD))
+    judge = RolloutJudge(run_spec(), EPOCH, fleet)
+    verdict = judge.read("a", encode(GOOD))
     assert isinstance(verdict, Rejected)
     assert verdict.cause == "malformed"
 
 
 def test_the_size_of_a_gradient_is_bounded(harness: Harness) -> None:
     largest = max(len(encode(gradient(spec=spec_of(algorithm)))) for algorithm in ("a2c", "a3c"))
-    assert harness.intake.refuse_size("a", largest) is None
-    refused = harness.intake.refuse_size("a", 1 << 20)
+    assert harness.judge.refuse_size("a", largest) is None
+    refused = harness.judge.refuse_size("a", 1 << 20)
     assert refused is not None
     assert refused.cause == "malformed"

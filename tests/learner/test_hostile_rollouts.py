@@ -22,7 +22,7 @@ from plain import plain
 
 from daedalus.learner.reporting.report import episode_statistics
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.intake import Intake, Rejected
+from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol.codec import encode
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -31,7 +31,7 @@ from daedalus.protocol.uploads import Rollout
 CELLS = (ROWS, ENVIRONMENTS)
 NORMALIZED = PolicySpec(hidden=(8,), activation="relu", normalize_observations=True)
 POLICIES = (POLICY, RECURRENT, PolicySpec(hidden=(8,), activation="relu"), NORMALIZED)
-# The bounds of the intake, numbers around them, and the ends of float32.
+# The bounds of the judge, numbers around them, and the ends of float32.
 NUMBERS = [0.0, -0.0, 1e-45, 1.0, -1.0, 1e-4, 1e6, -1e6, 1e9, -1e9, 1e15, -1e15, 1e20, 3.4e38, -3.4e38]
 SPECIAL = [np.nan, np.inf, -np.inf]
 BOUNDS = {"frames": 1e15, "initial_state": 1.0, "behaviour_log_probs": 1e6, "rewards": 1e9, "episode_returns": np.inf}
@@ -109,9 +109,9 @@ def test_extreme_rollouts_do_not_break_the_learner(data: st.DataObject) -> None:
     counters = RunCounters(10)
     for sequence in range(4):
         rollout = data.draw(hostile(sequence, learner.state_size))
-        intake = Intake(run_spec(), EPOCH, joined_fleet("a"))  # without quarantine
-        intake.state_size = learner.state_size
-        verdict = intake.judge("a", intake.read("a", encode(rollout)), 0, 0.0)
+        judge = RolloutJudge(run_spec(), EPOCH, joined_fleet("a"))  # without quarantine
+        judge.state_size = learner.state_size
+        verdict = judge.decide("a", judge.read("a", encode(rollout)), 0, 0.0)
         if isinstance(verdict, Rejected):
             assert verdict.cause == "unfit"
             continue

@@ -178,7 +178,7 @@ def test_evaluator_is_not_counted_as_an_actor(tmp_path: Path) -> None:
         training_run.end()
     assert {row["actors"] for row in training_run.rows()} <= {"0", "1"}
     summary = json.loads((training_run.directory / "summary.json").read_text())
-    assert summary["policy_lag_max"] <= training_run.spec.policy_lag_bound
+    assert summary["policy_lag_max"] <= training_run.spec.policy_lag_bound_with(0)
 
 
 @pytest.mark.parametrize(

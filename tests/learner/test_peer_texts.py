@@ -9,8 +9,8 @@ from building import ENVIRONMENTS, EPOCH, SPACES, identity, joined_fleet, make_r
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page, totals
-from daedalus.learner.serving.intake import Intake, Rejected
 from daedalus.learner.serving.query_responses import QueryResponses
+from daedalus.learner.serving.rollout_judge import Rejected, RolloutJudge
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import STATUS_LIMITS, Limits
@@ -24,12 +24,12 @@ CAUSES = ("malformed", "unfit", "duplicate", "stale", "surplus", "quarantined", 
 
 def quarantine(fleet: Fleet, name: str, component: str) -> str:
     """Let an actor send rollouts with a component of this name until it is quarantined; return the reason it gets."""
-    intake = Intake(run_spec(), EPOCH, fleet)
+    judge = RolloutJudge(run_spec(), EPOCH, fleet)
     verdict = None
     for sequence in range(3):
         rollout = make_rollout(identity(name, sequence))
         data = encode(replace(rollout, frames={component: rollout.frames["observation"]}))
-        verdict = intake.judge(name, intake.read(name, data), 0, 1.0)
+        verdict = judge.decide(name, judge.read(name, data), 0, 1.0)
     assert isinstance(verdict, Rejected)
     assert fleet.actors[name].quarantined
     return verdict.reason

@@ -18,12 +18,12 @@ from daedalus.cli.processes import RANK_LOST
 from daedalus.cli.ranks import LaunchedRanks, StartedRanks, follow
 from daedalus.learner.ranks import agreement
 from daedalus.learner.ranks.agreement import Options, this_run
+from daedalus.learner.ranks.commands import receive
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.ranks.follower import Follower
 from daedalus.learner.ranks.leader import Leader
 from daedalus.learner.ranks.meeting import Meeting, meeting_of
 from daedalus.learner.ranks.opening import lead
-from daedalus.learner.ranks.orders import receive
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.user_modules import NO_MODULES
@@ -49,7 +49,7 @@ def test_a_rank_that_dies_in_an_update_is_noticed_at_once() -> None:
 
     spec = spec_of(POLICY)
     leader, other = lead_with(work, spec=spec)
-    learner = Learner(spec.training, POLICY, SPACES, distribution=leader)
+    learner = Learner(spec.training, POLICY, SPACES, other_ranks=leader)
     leader.begin(SPACES, learner.shared_state)
     assert died.wait(SECONDS)
     other.ended()
@@ -192,7 +192,7 @@ def test_a_wrong_meeting_is_refused_in_one_line(changed: dict[str, str], message
 def test_an_idle_rank_0_shows_that_it_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.ranks.leader._WAIT_SECONDS", 0.0)
     with ranked_learner(2, run_spec(), SPACES) as (learner, _):
-        leader = learner._distribution
+        leader = learner._other_ranks
         for _ in range(3):
             leader.wait()
         assert learner.step(make_rollouts(1), 0.0) == []

@@ -18,7 +18,7 @@ from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
 from daedalus.learner.ranks import leader
-from daedalus.learner.ranks.shares import bounds_of, share_of
+from daedalus.learner.ranks.parts import bounds_of, part_of
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.algorithms import AlgorithmRecord
@@ -88,7 +88,7 @@ def gradients_of_halves(spec: RunSpec, learner: Learner, rollouts: list[Rollout]
     width = batch.rewards.shape[1]
     total, rows = torch.zeros(()), batch.valid.sum()
     for bounds in bounds_of(width, 2):
-        half = replace(share_of(batch, batch.ranks, *bounds, updates=1), share=None)
+        half = replace(part_of(batch, batch.ranks, *bounds, updates=1), rank_part=None)
         next(learner._gradients.compute(half, learner.entropy_bonus(0.0)))
         total = total + learner._flat.gradients * (half.valid.sum() / rows)
     return total

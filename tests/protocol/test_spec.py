@@ -232,7 +232,7 @@ def test_stack_longer_than_a_rollout_is_rejected_with_a_remedy() -> None:
 )
 def test_default_lag_bound_counts_batches(fields: dict[str, Any], updates: int, bound: int) -> None:
     spec = RunSpec.model_validate({"environment": {"id": "e"}, "training": fields})
-    assert (spec.training.updates_per_batch, spec.policy_lag_bound) == (updates, bound)
+    assert (spec.training.updates_per_batch, spec.policy_lag_bound_with(0)) == (updates, bound)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def test_default_lag_bound_has_room_for_all_rollouts_in_flight(
     collection = {"actors": actors, "window": window}
     training = {"algorithm": algorithm, "passes": 3, "minibatches": 3}
     spec = RunSpec.model_validate({"environment": {"id": "e"}, "collection": collection, "training": training})
-    assert spec.policy_lag_bound == bound
+    assert spec.policy_lag_bound_with(0) == bound
 
 
 def test_every_algorithm_has_its_mathematics() -> None:

@@ -5,8 +5,8 @@ from collections.abc import Set
 from dataclasses import dataclass, field
 
 from daedalus.learner.serving.actor_server import ActorServer
-from daedalus.learner.serving.intake import Rejected
 from daedalus.learner.serving.rollout_buffer import TakenRollouts
+from daedalus.learner.serving.rollout_judge import Rejected
 from daedalus.protocol.messages import Acknowledgement, Snapshot
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, RolloutIdentity, Upload
@@ -131,7 +131,7 @@ class Ledger:
         if not taken.rollouts:
             return
         synchronous = self._spec.algorithm.synchronous
-        bound = 0 if synchronous else self._spec.policy_lag_bound
+        bound = 0 if synchronous else self._spec.policy_lag_bound_with(0)
         for rollout in taken.rollouts:
             identity, lag = rollout.identity, version - rollout.policy_version
             self.require(identity not in life.trained, "trained twice:", identity)
@@ -157,11 +157,11 @@ class Ledger:
 
 def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
     """Note every verdict, and every rollout that is put into the buffer and taken out of it."""
-    intake, buffer = server.rollouts._intake, server.rollouts._buffer
-    judge, add, take = intake.judge, buffer.add, buffer.take
+    judge, buffer = server.rollouts._judge, server.rollouts._buffer
+    decide, add, take = judge.decide, buffer.add, buffer.take
 
-    def noted_judge(sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
-        verdict = judge(sender, content, policy_version, now)
+    def noted_decide(sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
+        verdict = decide(sender, content, policy_version, now)
         if isinstance(content, Rollout):
             ledger.judged(life, content, verdict, server.fleet.actors[sender].incarnation)
         return verdict
@@ -175,5 +175,5 @@ def observe(server: ActorServer, ledger: Ledger, life: Life) -> None:
         ledger.took(life, taken, policy_version, live - buffer.left_out)
         return taken
 
-    intake.judge = noted_judge  # type: ignore[method-assign]
+    judge.decide = noted_decide  # type: ignore[method-assign]
     buffer.add, buffer.take = noted_add, noted_take  # type: ignore[method-assign]

@@ -13,7 +13,7 @@ import pytest
 from daedalus.actor.session.in_flight_rollouts import InFlightRollouts
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.learner.run.counters import RunCounters
-from daedalus.learner.serving.intake import Intake
+from daedalus.learner.serving.rollout_judge import RolloutJudge
 from daedalus.learner.serving.sequence_window import SequenceWindow
 from daedalus.protocol.messages import Acknowledgement
 from daedalus.protocol.uploads import Rollout
@@ -78,7 +78,7 @@ def accepts_duplicates(patch: pytest.MonkeyPatch) -> None:
 
 def does_not_fence(patch: pytest.MonkeyPatch) -> None:
     """Rollouts for another learner epoch, or of another incarnation, are accepted."""
-    patch.setattr(Intake, "_check_identity", lambda _intake, _sender, _rollout: None)
+    patch.setattr(RolloutJudge, "_check_identity", lambda _judge, _sender, _rollout: None)
 
 
 def counts_twice(patch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from daedalus.learner.serving.components import first_component_violation
 from daedalus.learner.serving.fleet import Actor, Fleet
-from daedalus.learner.serving.gradient_checks import Shapes, first_violation, gradient_limits, restored
+from daedalus.learner.serving.gradient_checks import Shapes, gradient_limits, gradient_violation, restored
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement
@@ -54,7 +54,7 @@ class Rejected:
     reason: str
 
 
-class Intake:
+class RolloutJudge:
     """Judge of rollouts by the run's specification and the state of the fleet."""
 
     def __init__(self, spec: RunSpec, learner_epoch: int, fleet: Fleet) -> None:
@@ -122,7 +122,7 @@ class Intake:
         violation = self._first_violation(upload, spaces, actor)
         return Rejected(verdict="rejected", cause="unfit", reason=violation) if violation else upload
 
-    def judge(self, sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
+    def decide(self, sender: str, content: Upload | Rejected, policy_version: int, now: float) -> Upload | Rejected:
         """Decide on a result of `read`, count the verdict, and return it. The caller holds the lock.
 
         Args:
@@ -193,7 +193,7 @@ class Intake:
     def _first_violation(self, rollout: Upload, spaces: Spaces, actor: Actor) -> str:
         """Return a description of the first violation of the specification, or an empty string."""
         if isinstance(rollout, Gradient):
-            return first_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
+            return gradient_violation(rollout, self._spec, self.gradient_shapes, spaces, actor.environments)
         return (
             self._shape_violation(rollout, actor)
             or first_component_violation(rollout, spaces)
