@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 from daedalus.transport.slow_calls import in_progress
 
@@ -26,6 +26,8 @@ UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other progra
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
+_LAST_WORD_SECONDS = 0.5  # for a last line that may block
+_TRACEBACK_SECONDS = 5.0  # for a traceback that may block
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
 _MACOS_DESCRIPTORS = 10_240  # the kernel of macOS refuses more, whatever the hard limit is
 
@@ -127,9 +129,23 @@ def _exit_if_stuck(stop: _Stop) -> None:
     stop.wait()
     if stop.noticed.wait(_STUCK_SECONDS):
         time.sleep(_END_SECONDS)
+    _end_with(_say_stuck, within=_LAST_WORD_SECONDS)
+
+
+def _say_stuck() -> None:
+    _logger.error("asked to stop, but a call, such as a step of the environment, does not return: the process ends")
+    sys.stdout.flush()
+
+
+def _end_with(last_words: Callable[[], None], *, within: float) -> NoReturn:
+    """Say the last words, and end this process with status 1, at most `within` seconds later.
+
+    The words block where a terminal is stopped or a pipe is not read: then the process ends without them.
+    """
     try:
-        _logger.error("asked to stop, but a call, such as a step of the environment, does not return: the process ends")
-        sys.stdout.flush()
+        saying = threading.Thread(target=last_words, name="last-words", daemon=True)
+        saying.start()
+        saying.join(within)
     finally:
         os._exit(1)
 
@@ -265,15 +281,16 @@ def exit_on_thread_exceptions() -> None:
 
     def end_process(arguments: threading.ExceptHookArgs) -> None:
         name = arguments.thread.name if arguments.thread else "unknown"
-        try:
+
+        def say_why() -> None:
             print(f"exception in thread {name}:", file=sys.stderr)
             traceback.print_exception(arguments.exc_type, arguments.exc_value, arguments.exc_traceback)
             sys.stderr.flush()
             _logger.critical("exception in thread %s: %s: the process ends", name, arguments.exc_type.__name__)
             sys.stdout.flush()
-        finally:
-            # sys.exit would end only this thread, and an orderly end could wait for the failed thread without end.
-            os._exit(1)
+
+        # sys.exit would end only this thread, and an orderly end could wait for the failed thread without end.
+        _end_with(say_why, within=_TRACEBACK_SECONDS)
 
     threading.excepthook = end_process
 

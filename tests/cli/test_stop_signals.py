@@ -95,6 +95,23 @@ CHILD = """
     stop.wait()
 """
 
+# Nobody reads standard output, and the main thread holds the lock of the log while it writes there.
+BLOCKED_OUTPUT = """
+    import logging
+    from daedalus.cli.logs import configure_logging
+    processes._STUCK_SECONDS = 0.2
+    processes.stop_on_signals(exit_if_stuck=True)
+    configure_logging(process="actor")
+    os.write(1, b"ready\\n")
+    os.set_blocking(1, False)
+    try:
+        while True:
+            os.write(1, bytes(1))
+    except BlockingIOError:
+        os.set_blocking(1, True)
+    logging.getLogger("daedalus").error("an error that nobody reads")
+"""
+
 
 @pytest.mark.parametrize(
     ("program", "by_signal", "status"),
@@ -107,6 +124,7 @@ CHILD = """
         (SEEN_BY_A_THREAD, True, 7),
         (MANY, True, 9),
         (CHILD, True, 0),
+        (BLOCKED_OUTPUT, True, 1),
     ],
     ids=[
         "stuck",
@@ -117,6 +135,7 @@ CHILD = """
         "seen by a thread",
         "many signals",
         "child",
+        "blocked output",
     ],
 )
 def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:

@@ -45,3 +45,26 @@ def test_exception_in_a_thread_ends_the_process_with_a_traceback(cause: str) -> 
     assert "in fail" in ended.stderr
     assert ended.stderr.rstrip().endswith("RuntimeError: a fault of ours")
     assert re.search("exception in thread .*: RuntimeError", ended.stdout)
+
+
+def test_exception_ends_a_process_whose_output_nobody_reads() -> None:
+    program = """
+        import os, threading, time
+        from daedalus.cli import processes
+
+        processes._TRACEBACK_SECONDS = 0.2
+        processes.exit_on_thread_exceptions()
+        os.set_blocking(2, False)
+        try:
+            while True:
+                os.write(2, bytes(1))
+        except BlockingIOError:
+            os.set_blocking(2, True)
+        threading.Thread(target=lambda: 1 / 0).start()
+        time.sleep(1000)
+    """
+    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], stderr=subprocess.PIPE) as process:
+        try:
+            assert process.wait(SECONDS) == 1
+        finally:
+            process.kill()
