@@ -84,6 +84,11 @@ def one_line(text: str) -> str:
     return printable(" ".join(text.split()))
 
 
+def print_error(command: str, text: object) -> None:
+    """Write why `daedalus COMMAND` fails to standard error. The text may contain what a peer sent."""
+    print(f"daedalus {command}: {printable(str(text))}", file=sys.stderr)
+
+
 class _LineHandler(logging.Handler):
     """Handler that writes each record as one line. It ignores a closed terminal."""
 

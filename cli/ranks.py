@@ -4,7 +4,6 @@ import argparse
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from daedalus.cli.child_output import inherited
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import RANK_LOST
 from daedalus.cli.settings_arguments import ChosenRun, check_processes, resolve_spec
 from daedalus.cli.supervisor import start
@@ -197,11 +196,11 @@ def follow(meeting: Meeting, options: dict[str, Any] | None, modules: UserModule
             Follower(group, options, modules, meeting.local_rank).run()
     except RanksDisagreeError as error:
         if options is not None:  # else rank 0 says it, in the same terminal
-            print(f"daedalus learner: {error}", file=sys.stderr)
+            print_error("learner", error)
         return _FAILED
     except RankLostError as error:
         if options is not None and not stop.is_set():
-            print(f"daedalus learner: rank {meeting.rank} has lost rank 0: {error}", file=sys.stderr)
+            print_error("learner", f"rank {meeting.rank} has lost rank 0: {error}")
         return RANK_LOST
     return 0
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from daedalus.cli.child_output import inherited
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import UNSAVED
 from daedalus.cli.supervisor import FailedError, Supervised, start, stop
 from daedalus.learner.run import run_directory
@@ -53,7 +53,7 @@ def supervise_learner(directory: Path, arguments: argparse.Namespace, stopping: 
         status = _watched(learner, stopping)
         return _FAILED if status == UNSAVED else status
     except FailedError as error:
-        print(f"daedalus learner: {error}", file=sys.stderr)
+        print_error("learner", error)
         return _FAILED
     finally:
         stop([learner.process], _END_SECONDS)

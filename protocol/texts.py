@@ -1,6 +1,7 @@
 """Texts for a person who reads them: those of peers, bounded, and numbers. Pure functions."""
 
 MAX_NAME, MAX_TEXT = 64, 300  # bytes in UTF-8: of a name, and of a reason or an event
+MAX_ANSWER_TEXT = 1000  # bytes in UTF-8: of the reason in an answer to this process
 
 
 def bounded_text(text: str, most: int = MAX_TEXT) -> str:

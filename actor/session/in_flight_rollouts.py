@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daedalus.protocol.messages import Acknowledgement
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 
 _BUSY_SECONDS = 0.005  # before the first retry after `busy`; doubles with each
 _LOST_SECONDS = 0.1  # before the first retry without any answer; doubles with each
@@ -101,7 +102,7 @@ class InFlightRollouts:
         del self.rollouts[sequence]
         self.last_was_rejected = answer.verdict == "rejected"
         self.rejections_in_a_row = self.rejections_in_a_row + 1 if self.last_was_rejected else 0
-        self.reason = answer.reason
+        self.reason = bounded_text(answer.reason, MAX_ANSWER_TEXT)
         if answer.verdict in ("fenced", "quarantined", "finished", "drained"):
             self.ended_by = answer.verdict
 

@@ -24,6 +24,7 @@ from daedalus.protocol.messages import (
     Snapshot,
     Welcome,
 )
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.interface import RefusedError, Transport, TransportError
 from daedalus.transport.slow_calls import SlowCall
 
@@ -132,7 +133,7 @@ class LearnerQueries:
                 if refusal.code == "not_ready":  # the learner is stopping; another process may continue the run
                     return None
                 kind = NameInUseError if refusal.code == "name_taken" else ActorRefusedError
-                raise kind(f"the learner refused this actor: {refusal.reason}")
+                raise kind(f"the learner refused this actor: {bounded_text(refusal.reason, MAX_ANSWER_TEXT)}")
         return None
 
     def report_failure(self, run: str, join: Join, error: Exception) -> None:

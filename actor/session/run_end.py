@@ -7,6 +7,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import RunEnded
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.interface import Inbox, Transport
 
 DRAINED = "an operator drained this actor: it leaves the run"
@@ -58,7 +59,7 @@ class RunEndWatch:
         The epoch of a finished run does not matter: a later learner may have finished it during a long rollout.
         """
         if message.outcome == "finished":
-            raise RunOverError(f"the run is over: {message.reason}", finished=True)
+            raise RunOverError(f"the run is over: {bounded_text(message.reason, MAX_ANSWER_TEXT)}", finished=True)
         if message.learner_epoch == self.learner_epoch:
             self.learner_stopped = True
 

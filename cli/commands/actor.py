@@ -17,7 +17,7 @@ from daedalus.actor.evaluation.evaluator import Evaluator
 from daedalus.actor.session.config import ActorConfig
 from daedalus.actor.session.service import ActorService
 from daedalus.cli.commands import actor_arguments as options
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import exit_on_thread_exceptions, exit_status, exit_with_parent, stop_on_signals
 from daedalus.policy.acting.runtime import PolicyError
 from daedalus.protocol.messages import Welcome
@@ -38,7 +38,7 @@ def main() -> int:
         credentials = credentials_to_connect(arguments.connect, arguments.tls, "actor")
         config = options.config(arguments, credentials)
     except (ValueError, *SECURITY_ERRORS) as error:
-        print(f"daedalus actor: {error}", file=sys.stderr)
+        print_error("actor", error)
         return 2
     stop = stop_on_signals(exit_if_stuck=True)
     if arguments.exit_with_parent:
@@ -57,7 +57,7 @@ def main() -> int:
                 break
             config = replace(config, incarnation=secrets.randbits(62))
     except (ActorError, EnvironmentSetupError, PolicyError, TransportError) as error:
-        print(f"daedalus actor: {error}", file=sys.stderr)
+        print_error("actor", error)
         return 1
     return 0
 

@@ -4,12 +4,12 @@ import argparse
 import datetime
 import math
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.client_tokens import ClientTokens
+from daedalus.cli.logs import print_error
 from daedalus.transport.credentials import CLIENTS, WARNING_DAYS, CredentialsError
 
 if TYPE_CHECKING:
@@ -111,10 +111,10 @@ def certs(arguments: list[str]) -> int:
             verbs = {"issue": _issue, "renew": _renew, "revoke": _revoke, "list": _list}
             lines = verbs[parsed.verb](CertificateFolder(parsed.directory), parsed)
     except ImportError:
-        print('daedalus certs: cryptography is not installed: pip install "daedalus-rl[certs]"', file=sys.stderr)
+        print_error("certs", 'cryptography is not installed: pip install "daedalus-rl[certs]"')
         return 1
     except (CredentialsError, OSError, ValueError) as error:
-        print(f"daedalus certs: {error}", file=sys.stderr)
+        print_error("certs", error)
         return 1
     print("\n".join(lines))
     return 0

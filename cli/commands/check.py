@@ -18,6 +18,7 @@ from daedalus.actor.checking.report import (
 )
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
+from daedalus.cli.logs import print_error
 from daedalus.cli.quick_check import with_preset
 from daedalus.cli.settings_arguments import add_settings, resolve_spec
 from daedalus.learner.run.default_settings import default_settings
@@ -65,10 +66,10 @@ def check(arguments: list[str]) -> int:
     try:
         spec = resolve_spec(parsed)
     except SettingsError as error:
-        print(f"daedalus check: {error}", file=sys.stderr)
+        print_error("check", error)
         return 2
     if not parsed.seconds > 0.0:
-        print(f"daedalus check: --seconds is {parsed.seconds:g}: choose a number above 0", file=sys.stderr)
+        print_error("check", f"--seconds is {parsed.seconds:g}: choose a number above 0")
         return 2
     lines = _checked(spec, parsed)
     print("\n".join(f"{name:<14}{text}" for name, text in lines))

@@ -2,7 +2,6 @@
 
 import argparse
 import itertools
-import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
@@ -10,7 +9,7 @@ from daedalus.cli.comparing.comparison import compare_groups
 from daedalus.cli.comparing.recorded_run import SECONDS, RunDataError
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.comparing.tables import as_csv, as_text
-from daedalus.cli.logs import printable
+from daedalus.cli.logs import print_error
 
 _DESCRIPTION = """\
 Compares finished runs of one environment. Runs with equal settings apart from the seed are one group, which is named
@@ -53,15 +52,15 @@ def compare(arguments: list[str]) -> int:
     try:
         groups, problems = select(parts, finished=True, columns=[SECONDS])
         for problem in problems:
-            print(f"daedalus compare: {printable(problem)}", file=sys.stderr)
+            print_error("compare", problem)
         comparison = compare_groups(groups, parsed.threshold)
         if parsed.csv is not None:
             parsed.csv.write_text(as_csv(comparison), "utf-8", newline="")
     except RunDataError as error:
-        print(f"daedalus compare: {printable(str(error))}", file=sys.stderr)
+        print_error("compare", error)
         return 1
     except OSError as error:
-        print(f"daedalus compare: {parsed.csv}: {error.strerror}", file=sys.stderr)
+        print_error("compare", f"{parsed.csv}: {error.strerror}")
         return 1
     print(as_text(comparison))
     return 0

@@ -1,16 +1,17 @@
 """`daedalus drain`: ask actors to leave after their current rollout, and wait until they have left."""
 
 import argparse
-import sys
 import time
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser, seconds
+from daedalus.cli.logs import print_error
 from daedalus.cli.status_query import ask, no_answer
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Refusal
 from daedalus.protocol.status import RunStatus
+from daedalus.protocol.texts import MAX_ANSWER_TEXT, bounded_text
 from daedalus.transport.connecting import connect_until_interrupted
 from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import SECURITY_ERRORS, credentials_to_connect
@@ -56,19 +57,19 @@ def drain(arguments: list[str]) -> int:
         names = [keys.check_name(name, "actor name") for name in parsed.actors]
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except (ValueError, *SECURITY_ERRORS) as error:
-        print(f"daedalus drain: {error}", file=sys.stderr)
+        print_error("drain", error)
         return BAD_USAGE
     try:
         transport = connect_until_interrupted(parsed.connect, credentials)
         try:
             drain_actors(transport, parsed.run, names, parsed.timeout)
         except KeyboardInterrupt:
-            print("daedalus drain: interrupted; the requests remain in force", file=sys.stderr)
+            print_error("drain", "interrupted; the requests remain in force")
             return FAILED
         finally:
             transport.close()
     except (TransportError, ProtocolError, DrainError) as error:
-        print(f"daedalus drain: {error}", file=sys.stderr)
+        print_error("drain", error)
         return FAILED
     return LEFT
 
@@ -111,7 +112,7 @@ def _request(transport: Transport, run: str, name: str) -> None:
     for answer in answers:
         message = decode(answer, ACKNOWLEDGEMENT_LIMITS)
         if isinstance(message, Refusal):
-            raise DrainError(message.reason)
+            raise DrainError(bounded_text(message.reason, MAX_ANSWER_TEXT))
     print(f"actor {name} leaves run {run!r} after its current rollout", flush=True)
 
 

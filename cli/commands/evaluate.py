@@ -22,7 +22,7 @@ from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environment
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
     exit_status,
@@ -74,7 +74,7 @@ def main(
     try:
         check(arguments)
     except ValueError as error:
-        print(f"daedalus evaluate: {error}", file=sys.stderr)
+        print_error("evaluate", error)
         return 2
     if arguments.exit_with_parent:
         exit_with_parent(stop)
@@ -82,11 +82,11 @@ def main(
         with redirect_stdout(sys.stderr):  # the environment may print
             result = run_evaluation(arguments, stop, sys.stderr)
     except ModuleNotAllowedError as error:
-        print(f"daedalus evaluate: {allowing(error, ['daedalus', 'evaluate', *words])}", file=sys.stderr)
+        print_error("evaluate", allowing(error, ["daedalus", "evaluate", *words]))
         return 2
     except _FAILURES as error:
         # The signal may also have ended the processes of the environments: their errors are not the reason then.
-        print(f"daedalus evaluate: {'stopped' if stop.is_set() else error}", file=sys.stderr)
+        print_error("evaluate", "stopped" if stop.is_set() else error)
         return 1
     print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
     return 0

@@ -3,13 +3,12 @@
 import argparse
 import contextlib
 import logging
-import sys
 import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.status_query import ask, fleet_size
 from daedalus.protocol.codec import ProtocolError
@@ -110,15 +109,12 @@ def exporter(arguments: list[str]) -> int:
 
         from daedalus.cli.metrics_server import MetricsServer
     except ModuleNotFoundError:
-        print(
-            'daedalus exporter: prometheus-client is not installed: pip install "daedalus-rl[monitoring]"',
-            file=sys.stderr,
-        )
+        print_error("exporter", 'prometheus-client is not installed: pip install "daedalus-rl[monitoring]"')
         return 1
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
-        print(f"daedalus exporter: {error}", file=sys.stderr)
+        print_error("exporter", error)
         return 2
     configure_logging(parsed.log_level, as_json=parsed.log_json, process="exporter")
     stop = stop_on_signals()
@@ -128,10 +124,7 @@ def exporter(arguments: list[str]) -> int:
     try:
         server = MetricsServer(host, port, registry)
     except OSError as error:
-        print(
-            f"daedalus exporter: cannot listen on {host}:{port}: {error.strerror}: choose another --listen",
-            file=sys.stderr,
-        )
+        print_error("exporter", f"cannot listen on {host}:{port}: {error.strerror}: choose another --listen")
         return 1
     thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()
@@ -139,7 +132,7 @@ def exporter(arguments: list[str]) -> int:
     try:
         _follow(collector, parsed.connect, credentials, stop)
     except TransportError as error:  # retrying will not help
-        print(f"daedalus exporter: {error}", file=sys.stderr)
+        print_error("exporter", error)
         return 1
     finally:
         server.shutdown()

@@ -16,7 +16,7 @@ from pathlib import Path
 from daedalus.actor.errors import ActorError
 from daedalus.cli.arguments import add_allow_module, add_connect, add_insecure, add_tls, command_parser
 from daedalus.cli.gateway_packages import INSTALL
-from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.other_runs import OtherRuns
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
@@ -176,7 +176,7 @@ def main() -> int:
         chosen = _Chosen.of(arguments)
         host, port = _listening_address(arguments.listen, chosen.serving is not None, arguments.insecure)
     except (ValueError, OSError, *SECURITY_ERRORS) as error:
-        print(f"daedalus gateway: {error}", file=sys.stderr)
+        print_error("gateway", error)
         return 2
     raise_descriptor_limit()
     stop = stop_on_signals(exit_if_stuck=True)
@@ -187,16 +187,16 @@ def main() -> int:
     except OSError as error:
         reason = (error.strerror or str(error)).partition(" (while attempting")[0]  # of socket.create_server
         text = f"cannot listen on {arguments.listen}: {reason}: choose another --listen"
-        print(f"daedalus gateway: {text}", file=sys.stderr)
+        print_error("gateway", text)
         return 1
     try:
         asyncio.run(_serve(arguments, chosen, listener, stop))
         return 0
     except (ActorError, PolicyError, TransportError, OSError, ValueError) as error:
-        print(f"daedalus gateway: {error}", file=sys.stderr)
+        print_error("gateway", error)
         return 1
     except ImportError:
-        print(f"daedalus gateway: {INSTALL}", file=sys.stderr)
+        print_error("gateway", INSTALL)
         return 1
     finally:
         listener.close()

@@ -23,7 +23,7 @@ from daedalus.algorithms.errors import AlgorithmError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.learner_network import announce, learner_credentials, open_transport
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import (
     ORDERED,
@@ -110,10 +110,10 @@ def main() -> int:
                 run, _ = _with_spaces(run, arguments, stop)
             return supervise_learner(run.directory, arguments, stop)
     except ModuleNotAllowedError as error:
-        print(f"daedalus learner: {allowing(error, ['daedalus', 'learner', *sys.argv[1:]])}", file=sys.stderr)
+        print_error("learner", allowing(error, ["daedalus", "learner", *sys.argv[1:]]))
         return BAD_USAGE
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
-        print(f"daedalus learner: {error}", file=sys.stderr)
+        print_error("learner", error)
         return BAD_USAGE
     display = SilentProgress if arguments.no_progress else Progress
     progress = display(sys.stdout, run.spec.training.env_steps)
@@ -128,10 +128,10 @@ def main() -> int:
             return _serve(run, arguments, credentials, stop, progress, began, user_metrics, context, ranks, stack)
     except RankLostError as error:
         text, status = ranks.fault(error)
-        print(f"daedalus learner: {text}", file=sys.stderr)
+        print_error("learner", text)
         return status
     except _FAILURES as error:
-        print(f"daedalus learner: {error}", file=sys.stderr)
+        print_error("learner", error)
         return FAILED
 
 

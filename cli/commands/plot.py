@@ -1,7 +1,6 @@
 """`daedalus plot`: draw the learning curves of one or more runs from their metrics.csv."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
@@ -9,6 +8,7 @@ from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
 from daedalus.cli.comparing.selection import select
+from daedalus.cli.logs import print_error
 
 _DESCRIPTION = """\
 Draws return, entropy, value loss and policy lag of runs. Runs with equal settings apart from the seed are one curve:
@@ -60,19 +60,19 @@ def plot(arguments: list[str]) -> int:
         columns = () if parsed.profile else COLUMNS if parsed.by == ENV_STEPS else (*COLUMNS, SECONDS)
         groups, problems = select(parts, finished=parsed.profile, columns=columns)
         for problem in problems:
-            print(f"daedalus plot: {problem}", file=sys.stderr)
+            print_error("plot", problem)
         if parsed.profile:
             draw_profiles(groups, parsed.output)
         else:
             draw_curves(groups, parsed.output, parsed.by)
     except ModuleNotFoundError:
-        print(f"daedalus plot: {INSTALL}", file=sys.stderr)
+        print_error("plot", INSTALL)
         return 1
     except OSError as error:
-        print(f"daedalus plot: {parsed.output}: {error.strerror or error}", file=sys.stderr)
+        print_error("plot", f"{parsed.output}: {error.strerror or error}")
         return 1
     except RunDataError as error:
-        print(f"daedalus plot: {error}", file=sys.stderr)
+        print_error("plot", error)
         return 1
     print(f"wrote {parsed.output}")
     return 0

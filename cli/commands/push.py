@@ -6,7 +6,7 @@ from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.comparing.recorded_run import RunDataError
-from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.policy.saving.hub import HubError
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
@@ -54,10 +54,10 @@ def push(arguments: list[str]) -> int:
     try:
         address = upload(parsed.directory, parsed.repository, private=parsed.private)
     except (HubError, RunDataError, NoPolicyError, DamagedError) as error:
-        print(f"daedalus push: {error}", file=sys.stderr)
+        print_error("push", error)
         return 1
     except KeyboardInterrupt:
-        print("daedalus push: stopped", file=sys.stderr)
+        print_error("push", "stopped")
         return 1
     print(f"pushed to {address}")
     return 0

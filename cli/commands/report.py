@@ -1,13 +1,13 @@
 """`daedalus report`: write one HTML file about one or more runs."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
 from daedalus.cli.comparing.selection import select
+from daedalus.cli.logs import print_error
 from daedalus.cli.reports.page import comparison_page, run_page
 from daedalus.cli.reports.run_record import read_record
 from daedalus.policy.saving.replacing import replace_text
@@ -63,10 +63,10 @@ def report(arguments: list[str]) -> int:
     try:
         groups, problems = select(parts, finished=False, columns=[SECONDS])
         for problem in problems:
-            print(f"daedalus report: {problem}", file=sys.stderr)
+            print_error("report", problem)
         records = {run.directory: read_record(run) for group in groups for run in group.runs}
     except RunDataError as error:
-        print(f"daedalus report: {error}", file=sys.stderr)
+        print_error("report", error)
         return 1
     if len(records) == 1 and not problems:
         ((directory, record),) = records.items()
@@ -77,7 +77,7 @@ def report(arguments: list[str]) -> int:
     try:
         replace_text(output, page)
     except OSError as error:
-        print(f"daedalus report: {output}: {error.strerror}; choose another file with --output", file=sys.stderr)
+        print_error("report", f"{output}: {error.strerror}; choose another file with --output")
         return 1
     print(f"wrote {output}")
     return 0

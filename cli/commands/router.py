@@ -3,10 +3,9 @@
 import argparse
 import logging
 import math
-import sys
 
 from daedalus.cli.arguments import add_insecure, add_tls, command_parser
-from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.processes import raise_descriptor_limit, stop_on_signals
 from daedalus.cli.settings_arguments import LISTEN
 from daedalus.transport.addresses import check_connecting
@@ -83,7 +82,7 @@ def router(arguments: list[str]) -> int:
             check_connecting(parsed.connect, tls=parsed.tls is not None)
         credentials = credentials_to_listen([parsed.listen], parsed.tls, "router", insecure=parsed.insecure)
     except SECURITY_ERRORS as error:
-        print(f"daedalus router: {error}", file=sys.stderr)
+        print_error("router", error)
         return 2
     raise_descriptor_limit()
     stop = stop_on_signals()
@@ -92,7 +91,7 @@ def router(arguments: list[str]) -> int:
         limit = int(parsed.max_message_megabytes * 2**20)
         transport = listen([parsed.listen], parsed.connect, credentials, max_message_bytes=limit)
     except (TransportError, CredentialsError) as error:
-        print(f"daedalus router: {error}", file=sys.stderr)
+        print_error("router", error)
         return 1
     try:
         _logger.info("listening on %s", " and ".join(reachable([parsed.listen], hosts)))

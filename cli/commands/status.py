@@ -2,12 +2,11 @@
 
 import argparse
 import json
-import sys
 from functools import partial
 from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
-from daedalus.cli.logs import one_line, printable
+from daedalus.cli.logs import one_line, print_error, printable
 from daedalus.cli.status_query import ask, ask_events, fleet_size, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
@@ -85,7 +84,7 @@ def status(arguments: list[str]) -> int:
     try:
         credentials = credentials_to_connect(parsed.connect, parsed.tls, "operator", "learner", "router")
     except SECURITY_ERRORS as error:
-        print(f"daedalus status: {error}", file=sys.stderr)
+        print_error("status", error)
         return BAD_USAGE
     try:
         if parsed.watch:
@@ -98,10 +97,10 @@ def status(arguments: list[str]) -> int:
         finally:
             transport.close()
     except (TransportError, ProtocolError) as error:
-        print(f"daedalus status: {error}", file=sys.stderr)
+        print_error("status", error)
         return NO_ANSWER
     if not statuses:
-        print(f"daedalus status: {unanswered}", file=sys.stderr)
+        print_error("status", unanswered)
         return NO_ANSWER
     if parsed.quiet:
         _show_problems(statuses)
@@ -122,12 +121,12 @@ def _watch(parsed: argparse.Namespace, credentials: Credentials | None) -> int:
 
 def _check_alive(directory: Path) -> int:
     if not directory.is_dir():
-        print(f"daedalus status: {directory} does not exist: name a run directory", file=sys.stderr)
+        print_error("status", f"{directory} does not exist: name a run directory")
         return NO_ANSWER
     silent = silence(directory)
     if silent is None:
         return HEALTHY
-    print(f"daedalus status: the learner of {directory} has been silent for {silent:.0f} s", file=sys.stderr)
+    print_error("status", f"the learner of {directory} has been silent for {silent:.0f} s")
     return NO_ANSWER
 
 

@@ -12,7 +12,7 @@ import tomli_w
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.comparing.recorded_run import RunDataError
-from daedalus.cli.logs import configure_logging
+from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
 from daedalus.cli.settings_arguments import add_log, add_settings, resolve_spec
@@ -111,7 +111,7 @@ def sweep(arguments: list[str]) -> int:
 
 
 def _failed(message: str, status: int) -> int:
-    print(f"daedalus sweep: {message}", file=sys.stderr)
+    print_error("sweep", message)
     return status
 
 

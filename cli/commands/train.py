@@ -18,7 +18,7 @@ from daedalus.cli.arguments import (
 )
 from daedalus.cli.child_output import ChildOutput, inherited
 from daedalus.cli.gateway_packages import GATEWAY_PACKAGES, INSTALL
-from daedalus.cli.logs import add_logging, configure_logging
+from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.own_algorithm import with_record
 from daedalus.cli.processes import exit_with_parent, process_started, stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_spaces
@@ -117,10 +117,10 @@ def train(arguments: list[str]) -> int:
         directory = parsed.run_dir or named_directory(parsed.preset, spec)
         lock = run_directory.create_locked(directory, spec, numbered=parsed.run_dir is None, init_from=parsed.init_from)
     except (RunInUseError, EnvironmentProblemError) as error:
-        print(f"daedalus train: {error}", file=sys.stderr)
+        print_error("train", error)
         return 1
     except (SettingsError, *SECURITY_ERRORS) as error:
-        print(f"daedalus train: {error}", file=sys.stderr)
+        print_error("train", error)
         return 2
     with lock:
         return _run(lock, spec, parsed, started, screen, parsed.init_from, resume=False, spaces=spaces)
@@ -141,13 +141,13 @@ def resume(arguments: list[str]) -> int:
         init_from = initial_to_resume(parsed.directory)
         lock = RunLock(parsed.directory)
     except ModuleNotAllowedError as error:
-        print(f"daedalus resume: {allowing(error, ['daedalus', 'resume', *arguments])}", file=sys.stderr)
+        print_error("resume", allowing(error, ["daedalus", "resume", *arguments]))
         return 2
     except RunInUseError as error:
-        print(f"daedalus resume: {error}", file=sys.stderr)
+        print_error("resume", error)
         return 1
     except (SettingsError, UserModuleError, *SECURITY_ERRORS) as error:
-        print(f"daedalus resume: {error}", file=sys.stderr)
+        print_error("resume", error)
         return 2
     with lock:
         finished = finished_run(parsed.directory, spec)
@@ -159,7 +159,7 @@ def resume(arguments: list[str]) -> int:
             spaces = None if begun else checked_spaces(spec, fork=True)
             run_directory.write_config(parsed.directory, spec)
         except (EnvironmentProblemError, SettingsError) as error:
-            print(f"daedalus resume: {error}", file=sys.stderr)
+            print_error("resume", error)
             return 1
         return _run(lock, spec, parsed, started, screen, init_from, resume=True, spaces=spaces, finished=finished)
 

@@ -96,6 +96,20 @@ def test_refusal_ends_the_actor_with_the_reason(network: MemoryNetwork) -> None:
     assert not any(join.failure for join in learner.joins.queue)  # the learner knows the reason
 
 
+@pytest.mark.parametrize("when", ["join", "rollout"])
+def test_reason_of_a_learner_neither_forges_a_line_nor_commands_the_terminal(network: MemoryNetwork, when: str) -> None:
+    learner, reason = ScriptedLearner(network), "no\x1b]0;owned\x07\nactor: joined"
+    if when == "join":
+        learner.refusal = Refusal(code="mismatch", reason=reason)
+    actor = RunningActor(network)
+    if when == "rollout":
+        learner.publish(0)
+        _, request = learner.receive()
+        request.reply(encode(Acknowledgement(verdict="quarantined", reason=reason)))
+    actor.join()
+    assert "this actor: no ]0;owned actor: joined" in str(actor.error)
+
+
 def test_failure_of_an_actor_is_reported_to_its_learner(network: MemoryNetwork) -> None:
     environment = SPEC.environment.model_copy(update={"id": "absent_environment:Absent-v0"})
     learner = ScriptedLearner(network, SPEC.model_copy(update={"environment": environment}))

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from daedalus.cli.logs import EVENTS, configure_logging
+from daedalus.cli.logs import EVENTS, configure_logging, print_error
 
 LOGGER = logging.getLogger("daedalus.test")
 TIME = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z"
@@ -85,3 +85,8 @@ def test_command_for_a_person_shows_messages_alone_and_only_events_that_need_att
         logging.getLogger(EVENTS).warning("refused", extra={"actor": "arm-1", "event": "refused"})
         LOGGER.info("resuming")
     assert lines == ["arm-1: refused", "resuming", "arm-1: joined", "arm-1: refused", "resuming"]
+
+
+def test_control_characters_of_an_error_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    print_error("actor", ValueError("no\x1b[2J"))
+    assert capsys.readouterr().err == "daedalus actor: no\\x1b[2J\n"
