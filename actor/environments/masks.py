@@ -38,10 +38,18 @@ class Masks:
     def __call__(self, action_mask: Any, needed: np.ndarray) -> dict[str, np.ndarray]:
         """Return the masks {name: [E, choices]} bool; see Transforms.observe."""
         if not self._names:
+            if self._spaces and _holds_mask(action_mask):
+                raise EnvironmentSetupError(
+                    f"info has an {MASK_KEY} after a step, but reset gave none: give it in reset too"
+                )
             return {}
         if action_mask is None:
             raise EnvironmentSetupError(f"the environment's info has no {MASK_KEY!r} any more: give it in every step")
         given = self._by_component(action_mask)
+        for name in given.keys() - set(self._names):
+            raise EnvironmentSetupError(
+                f"the {MASK_KEY} has an entry for {name!r} after a step, but reset gave none: give it in reset too"
+            )
         return {name: self._checked(name, given.get(name), needed) for name in self._names}
 
     def _by_component(self, action_mask: Any) -> dict[str, np.ndarray]:
@@ -155,6 +163,15 @@ def _joined(mask: Any) -> np.ndarray:
         parts = [_joined(part) for part in mask if part is not None]  # None stands for a component without choices
         return np.concatenate(parts) if parts else np.zeros(0, np.bool_)
     return np.asarray(mask).ravel()
+
+
+def _holds_mask(action_mask: Any) -> bool:
+    """Return whether a batch of masks has any. gymnasium batches None of all environments as objects."""
+    if isinstance(action_mask, dict):
+        return any(_holds_mask(mask) for name, mask in action_mask.items() if str(name)[:1] != "_")
+    if isinstance(action_mask, np.ndarray) and action_mask.dtype == np.object_:
+        return any(mask is not None for mask in action_mask.flat)
+    return action_mask is not None
 
 
 def only_of_masks(action_mask: Any) -> Any:

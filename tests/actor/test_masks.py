@@ -51,13 +51,17 @@ class Narrowing(gymnasium.Env):
         return self._shown()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        assert self.mask()[action], "an illegal action was taken"
+        assert self.mask()[action] or self._convention.endswith("in reset"), "an illegal action was taken"
         self._step += 1
         seen, info = self._shown()
         return seen, 1.0, self._step == 3, False, info
 
     def _shown(self) -> tuple[Any, dict]:
         seen = np.array([self._step], np.float32)
+        if self._convention in ("none in reset", "null in reset") and self._step == 0:
+            return seen, {} if self._convention == "none in reset" else {"action_mask": None}
+        if self._convention.endswith("in reset"):
+            return seen, {"action_mask": self.mask().astype(np.int8)}
         if self._convention == "observation":
             return {"seen": seen, "action_mask": self.mask().astype(np.int8)}, {}
         return seen, {"action_mask": self.mask().astype(np.int8)} if self._convention == "info" else {}
@@ -191,6 +195,33 @@ def test_environments_without_masks_have_none() -> None:
     assert environments.reset(1).masks == {}
 
 
+def test_none_in_place_of_a_mask_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Narrowing, "_shown", lambda self: (np.zeros(1, np.float32), {"action_mask": None}))
+    environments = make_environments(EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": "info"}), 2)
+    environments.reset(1)
+    assert environments.step(first_actions(environments.spaces))[0].masks == {}
+
+
+@pytest.mark.parametrize("convention", ["none in reset", "null in reset"])
+@pytest.mark.parametrize("for_evaluation", [False, True])
+def test_masks_that_come_only_with_steps_are_refused(convention: str, for_evaluation: bool) -> None:
+    """Only the first reset shows whether there are masks: these would be ignored, and illegal actions be played."""
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
+    environments = make_environments(spec, 2, for_evaluation=for_evaluation)
+    environments.reset(1)
+    with pytest.raises(EnvironmentSetupError, match="info has an action_mask after a step, but reset gave none: give"):
+        environments.step(first_actions(environments.spaces))
+
+
+@pytest.mark.parametrize("convention", ["none in reset", "null in reset"])
+def test_the_check_reports_masks_that_come_only_with_steps(convention: str) -> None:
+    spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
+    (problem,) = check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20).problems
+    assert problem == (
+        "environment Narrowing-v0: info has an action_mask after a step, but reset gave none: give it in reset too"
+    )
+
+
 def test_masks_of_several_components_are_a_map() -> None:
     action = gym.Dict({"a": gym.Discrete(2), "b": gym.MultiDiscrete([2, 3]), "c": gym.Box(-1, 1)})
     example = {"b": np.ones((1, 5), np.int8)}
@@ -280,6 +311,12 @@ def test_forbidding_every_choice_is_refused_unless_no_action_is_taken() -> None:
 def test_mask_that_does_not_fit_is_refused(mask: Any, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         observe(mask)
+
+
+def test_mask_of_a_component_that_had_none_at_first_is_refused() -> None:
+    transforms = Transforms(SPEC, gym.Box(0, 1), BOTH, {"0": np.ones((1, 2))})
+    with pytest.raises(ValueError, match="has an entry for '1' after a step, but reset gave none: give it in reset"):
+        transforms.observe_one(np.zeros(1), {"0": np.ones(2), "1": np.ones(3)})
 
 
 BOTH = gym.Tuple((gym.Discrete(2), gym.Discrete(3)))
