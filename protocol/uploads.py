@@ -73,6 +73,11 @@ class Rollout:
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
     overridden: np.ndarray | None = None  # [T, E] bool, somebody else chose the action; None: in no row
 
+    @property
+    def nbytes(self) -> int:
+        """Size of the observations, actions and masks in memory, in bytes. The other arrays are small."""
+        return sum(array.nbytes for part in (self.frames, self.actions, self.masks) for array in part.values())
+
     def __post_init__(self) -> None:
         if self.rewards.ndim != 2:
             raise ValueError(f"rewards must be [T, E], not {self.rewards.shape}")
@@ -158,6 +163,11 @@ class Gradient:
     episode_returns: np.ndarray  # as in Rollout, like the next two
     episode_lengths: np.ndarray
     episode_info: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the gradient in memory, in bytes. The other arrays are small."""
+        return sum(array.nbytes for array in self.gradient.values())
 
     def __post_init__(self) -> None:
         if not self.gradient:

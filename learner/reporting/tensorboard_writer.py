@@ -1,5 +1,6 @@
 """Metrics writer for TensorBoard event files."""
 
+import contextlib
 import io
 import itertools
 import os
@@ -39,7 +40,13 @@ class TensorBoardWriter:
         now = time.time()
         name = f"events.out.tfevents.{int(now):010d}.{socket.gethostname()}.{os.getpid()}.{next(self._numbers)}"
         self._writer = RecordWriter(open(directory / name, "ab"))  # noqa: SIM115 - closed in close()
-        self._add(self._event(wall_time=now, file_version="brain.Event:2"))
+        try:
+            self._add(self._event(wall_time=now, file_version="brain.Event:2"))
+        except OSError:  # a full disk: whoever tries again later would leave one empty file after the other
+            with contextlib.suppress(OSError):
+                self._writer.close()
+            (directory / name).unlink(missing_ok=True)
+            raise
 
     def write(self, row: Mapping[str, float], details: Details) -> None:
         """Write one event. See MetricsWriter."""

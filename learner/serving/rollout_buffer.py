@@ -3,6 +3,7 @@
 No I/O, no threads.
 """
 
+import logging
 from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from typing import Protocol
 
 from daedalus.learner.serving.stragglers import Stragglers
 from daedalus.protocol.uploads import Upload
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,23 +58,36 @@ class BarrierBuffer:
     """Buffer of a synchronous algorithm: a batch is one rollout of every live actor, sorted by name.
 
     The first batch also waits for `first` live actors. A batch does not wait for an actor that has left or that is
-    overdue (stragglers.py), but contains its rollout of the current version.
+    overdue (stragglers.py), but contains its rollout of the current version. A batch that fills `most_bytes` is
+    complete, too: one peer may join under many names, and send rollouts of zeros, which compress to nothing.
     """
 
-    def __init__(self, first: int) -> None:
-        self._first = first
+    def __init__(self, first: int, most_bytes: Callable[[], int]) -> None:
+        """Construct an empty buffer.
+
+        Args:
+          first: number of live actors that the first batch waits for.
+          most_bytes: returns the size of the rollouts in memory that no batch exceeds by more than one rollout.
+        """
+        self._first, self._most_bytes = first, most_bytes
         self._started = False
         self._stragglers = Stragglers()
         self._waiting: dict[str, Upload] = {}
+        self._bytes = 0  # of the waiting rollouts
 
     def has_room_for(self, rollout: Upload) -> bool:
-        """Return whether the batch has no rollout of this actor yet. See RolloutBuffer."""
-        return rollout.identity.actor not in self._waiting
+        """Return whether the batch has no rollout of this actor yet, and is not full. See RolloutBuffer."""
+        return rollout.identity.actor not in self._waiting and not self._is_full
 
     def add(self, rollout: Upload) -> None:
         """See RolloutBuffer."""
         self._waiting[rollout.identity.actor] = rollout
+        self._bytes += rollout.nbytes
         self._stragglers.delivered(rollout.identity.actor)
+
+    @property
+    def _is_full(self) -> bool:
+        return bool(self._waiting) and self._bytes >= self._most_bytes()
 
     def heard(self, actor: str) -> None:
         """See RolloutBuffer."""
@@ -80,13 +96,19 @@ class BarrierBuffer:
     def take(self, live: Set[str], policy_version: int, now: float) -> TakenRollouts:
         """See RolloutBuffer."""
         awaited = self._stragglers.awaited(live, self._waiting.keys(), now)
-        if not self._started and len(live) < self._first:
+        is_first = not self._started and len(live) < self._first
+        if (is_first or awaited or not self._waiting) and not self._is_full:
             return TakenRollouts(rollouts=[], stale=[])
-        if not self._waiting or awaited:
-            return TakenRollouts(rollouts=[], stale=[])
+        if is_first or awaited:
+            _logger.warning(
+                "a batch has only %d rollouts, because these fill %d MiB of memory",
+                len(self._waiting),
+                self._bytes >> 20,
+            )
         self._started = True
         rollouts = [self._waiting[actor] for actor in sorted(self._waiting)]
         self._waiting.clear()
+        self._bytes = 0
         return TakenRollouts(rollouts=rollouts, stale=[])
 
     @property

@@ -37,6 +37,9 @@ from daedalus.protocol.uploads import Upload
 from daedalus.transport.interface import Request
 
 HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
+# Largest batch of a synchronous run in memory, whichever is larger: bytes, or the rollouts of so many fleets as large
+# as the run expects.
+_MOST_BATCH_BYTES, _MOST_FLEETS = 1 << 30, 8
 _CLOSE_SECONDS = 4.0  # for the intake thread to answer the queued rollouts
 
 _ACCEPTED = Acknowledgement(verdict="accepted")
@@ -74,7 +77,7 @@ class RolloutIntake:
         self._published_version, self._events = published_version, events
         self._version = start_version  # rollouts of this version have a policy lag of 0
         self._judge = RolloutJudge(spec, learner_epoch, fleet)
-        self._buffer = _buffer(spec)
+        self._buffer = _buffer(spec, self._judge)
         self._requests = RequestQueue(spec.service.queue_bytes, _most_requests(spec, live=0))
         self._named: set[str] = set()  # actors that were logged as left out
         self._ending: Acknowledgement | None = None  # of all rollouts after the end
@@ -288,7 +291,7 @@ class RolloutIntake:
     def _decide(self, sender: str, content: Upload | Rejected, size: int) -> Acknowledgement:
         if self._is_surplus(content):
             content = Rejected(
-                verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor"
+                verdict="rejected", cause="surplus", reason="the batch already has a rollout of this actor, or is full"
             )
         if not isinstance(content, Rejected):
             self._buffer.heard(sender)
@@ -339,7 +342,8 @@ def _most_requests(spec: RunSpec, live: int) -> int:
     return max(batches * spec.batch_rollouts, 2 * max(spec.collection.actors, live))
 
 
-def _buffer(spec: RunSpec) -> RolloutBuffer:
+def _buffer(spec: RunSpec, judge: RolloutJudge) -> RolloutBuffer:
     if spec.algorithm.synchronous:
-        return BarrierBuffer(spec.collection.actors)
+        actors = spec.collection.actors
+        return BarrierBuffer(actors, lambda: max(_MOST_BATCH_BYTES, _MOST_FLEETS * actors * judge.expected_bytes))
     return StreamBuffer(spec.batch_rollouts, spec.policy_lag_bound_with)

@@ -88,10 +88,16 @@ class RolloutJudge:
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         return None
 
+    @property
+    def expected_bytes(self) -> int:
+        """Largest size in memory of an upload with the run's own number of environments; 0 before an actor joins."""
+        spaces = self._fleet.spaces
+        return 0 if spaces is None else self._limits(spaces, self._envs_per_actor).max_bytes
+
     def read(self, sender: str, data: bytes) -> Upload | Rejected:
         """Decode a message of `sender`, and check its content against the specification.
 
-        Call this method without the lock: decoding is slow and changes no state. `judge` repeats the checks whose
+        Call this method without the lock: decoding is slow and changes no state. `decide` repeats the checks whose
         result may change in the meantime.
         """
         spaces, actor = self._fleet.spaces, self._fleet.actors.get(sender)
@@ -100,7 +106,7 @@ class RolloutJudge:
         if actor.quarantined:
             return Rejected(verdict="quarantined", cause="quarantined", reason=actor.quarantined)
         limits = self._limits(spaces, actor.environments)
-        most = max(_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS * self._limits(spaces, self._envs_per_actor).max_bytes)
+        most = max(_MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS * self.expected_bytes)
         if limits.max_bytes > most:
             reason = (
                 f"a rollout of {actor.environments} environments has {limits.max_bytes:,} bytes, at most {most:,} are "

@@ -1,6 +1,7 @@
 """Metrics writers: the files are readable by csv and by TensorBoard."""
 
 import csv
+import errno
 import tracemalloc
 from contextlib import closing
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from daedalus.learner.reporting.csv_writer import CsvWriter
 from daedalus.learner.reporting.metrics import COLUMNS, Details, tag
@@ -116,6 +118,18 @@ def test_tensorboard_scalars_are_against_env_steps(tmp_path: Path) -> None:
     assert sorted(events.Tags()["scalars"]) == ["time/updates", "train/policy_loss"]
     assert [(scalar.step, scalar.value) for scalar in events.Scalars("train/policy_loss")] == [(100, 0.5), (250, -1.5)]
     assert [(scalar.step, scalar.value) for scalar in events.Scalars("time/updates")] == [(100, 3.0)]
+
+
+def test_tensorboard_leaves_no_file_behind_that_it_cannot_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flush(_writer: RecordWriter) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RecordWriter, "flush", flush)
+    with pytest.raises(OSError, match="No space"):
+        TensorBoardWriter(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_tag_is_in_a_group() -> None:

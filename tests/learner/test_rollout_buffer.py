@@ -25,7 +25,7 @@ def sequences(rollouts: Sequence[Upload]) -> list[int]:
 
 
 def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name() -> None:
-    buffer, live = BarrierBuffer(1), {"a", "b", "c"}
+    buffer, live = BarrierBuffer(1, lambda: 1 << 30), {"a", "b", "c"}
     for actor in ("c", "a"):
         buffer.add(rollout(actor))
         assert actors(buffer.take(live, 0, 0.0)) == []
@@ -35,7 +35,7 @@ def test_barrier_waits_for_every_live_actor_and_sorts_rollouts_by_name() -> None
 
 
 def test_first_batch_of_the_barrier_waits_for_the_configured_number_of_actors() -> None:
-    buffer = BarrierBuffer(3)
+    buffer = BarrierBuffer(3, lambda: 1 << 30)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
     assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
@@ -45,7 +45,7 @@ def test_first_batch_of_the_barrier_waits_for_the_configured_number_of_actors() 
 
 
 def test_later_batches_of_the_barrier_wait_only_for_live_actors() -> None:
-    buffer = BarrierBuffer(2)
+    buffer = BarrierBuffer(2, lambda: 1 << 30)
     buffer.add(rollout("a"))
     buffer.add(rollout("b"))
     assert actors(buffer.take({"a", "b"}, 0, 0.0)) == ["a", "b"]
@@ -54,21 +54,21 @@ def test_later_batches_of_the_barrier_wait_only_for_live_actors() -> None:
 
 
 def test_barrier_does_not_wait_for_an_actor_that_has_left() -> None:
-    buffer = BarrierBuffer(1)
+    buffer = BarrierBuffer(1, lambda: 1 << 30)
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
     assert actors(buffer.take({"a"}, 0, 0.0)) == ["a"]
 
 
 def test_barrier_uses_the_rollout_of_an_actor_that_has_left() -> None:
-    buffer = BarrierBuffer(1)
+    buffer = BarrierBuffer(1, lambda: 1 << 30)
     buffer.add(rollout("b"))
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a"}, 0, 0.0)) == ["a", "b"]
 
 
 def test_barrier_waits_for_an_actor_that_joins_later() -> None:
-    buffer = BarrierBuffer(1)
+    buffer = BarrierBuffer(1, lambda: 1 << 30)
     buffer.add(rollout("a"))
     assert actors(buffer.take({"a", "b"}, 0, 0.0)) == []
     buffer.add(rollout("b"))
@@ -76,7 +76,7 @@ def test_barrier_waits_for_an_actor_that_joins_later() -> None:
 
 
 def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
-    buffer = BarrierBuffer(1)
+    buffer = BarrierBuffer(1, lambda: 1 << 30)
     buffer.add(rollout("a"))
     assert not buffer.has_room_for(rollout("a", 1))
     assert buffer.has_room_for(rollout("b"))
@@ -84,8 +84,23 @@ def test_barrier_has_room_for_one_rollout_of_each_actor() -> None:
     assert buffer.has_room_for(rollout("a", 1))
 
 
+def test_batch_of_the_barrier_is_complete_when_its_rollouts_fill_the_memory(caplog: pytest.LogCaptureFixture) -> None:
+    size = rollout("a").nbytes
+    buffer, live = BarrierBuffer(4, lambda: 2 * size), {"a", "b", "c", "d"}
+    buffer.add(rollout("a"))
+    assert actors(buffer.take(live, 0, 0.0)) == []
+    assert buffer.has_room_for(rollout("b"))
+    buffer.add(rollout("b"))
+    assert not buffer.has_room_for(rollout("c"))
+    assert actors(buffer.take(live, 0, 0.0)) == ["a", "b"]
+    assert "a batch has only 2 rollouts" in caplog.text
+    buffer.add(rollout("c"))
+    assert actors(buffer.take(live, 1, 0.0)) == []
+    assert buffer.has_room_for(rollout("d"))
+
+
 def test_empty_barrier_returns_no_batch() -> None:
-    assert actors(BarrierBuffer(0).take(set(), 0, 0.0)) == []
+    assert actors(BarrierBuffer(0, lambda: 1 << 30).take(set(), 0, 0.0)) == []
 
 
 # --------------------------------------------------------------------------------------------- the stream

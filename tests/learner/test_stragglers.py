@@ -14,7 +14,7 @@ class Barrier:
     """Barrier of three actors with a virtual clock. The learner looks every 0.2 s."""
 
     def __init__(self, first: int = 1) -> None:
-        self.buffer = BarrierBuffer(first)
+        self.buffer = BarrierBuffer(first, lambda: 1 << 30)
         self.now = 50.0
         self.version = 0
         self.batches: list[str] = []  # the actors of each batch
