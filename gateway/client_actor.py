@@ -14,6 +14,7 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
+from daedalus.gateway.client_images import check_images
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.errors import ClientError
@@ -64,6 +65,7 @@ class ClientActor:
             transforms = Transforms(spec.environment, self.spaces.observation_space, self.spaces.action_space, mask)
         except (ActorError, EnvironmentSetupError) as error:
             raise ClientError("refused", str(error)) from None
+        check_images(self.spaces.stated, spec.environment)
         return replace(self.join, spaces=transforms.spaces, environments=1), transforms
 
     def joined(self, session: Welcome, transforms: Transforms) -> None:

@@ -25,7 +25,7 @@ _TYPE_CODES = {"float32": "d", "uint8": "B", "uint16": "H"}  # of array.array
 _Component = ArraySpace | DiscreteSpace | ContinuousSpace
 
 
-class _UniformBox(gym.Box):
+class UniformBox(gym.Box):
     """A Box with two bounds for all its numbers, held once: gymnasium's takes ten bytes for each number.
 
     Any client can state a large space, and the learner refuses it only later.
@@ -115,9 +115,9 @@ def _first_fault(fault: ValidationError | RecursionError) -> str:
 def _gym(space: _Component) -> gymnasium.Space:
     match space:
         case ArraySpace(dtype="uint8"):
-            return _UniformBox(0, 255, space.shape, np.uint8)
+            return UniformBox(0, 255, space.shape, np.uint8)
         case ArraySpace():
-            return _UniformBox(-np.inf, np.inf, space.shape, np.float32)
+            return UniformBox(-np.inf, np.inf, space.shape, np.float32)
         case DiscreteSpace(counts=(count,)):
             return gym.Discrete(count)
         case DiscreteSpace():

@@ -13,7 +13,7 @@ from daedalus.gateway.errors import ClientError
 from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.learner_link import LearnerLink
 from daedalus.protocol import keys
-from daedalus.protocol.messages import Welcome
+from daedalus.protocol.messages import Join, Welcome
 from daedalus.transport.interface import Declaration, Transport, TransportError
 
 _THREADS = 16  # requests at the same time, which may wait
@@ -57,9 +57,9 @@ class Joining:
         """Join the newest learner, once there is one. Raises ClientError if the client cannot take part."""
         seat.is_joining = True
         try:
-            while (session := self._run.session) is None or not await self._ask(seat, session):
-                if session is self._run.session:
-                    await (self._run.change() if session is None else asyncio.sleep(_RETRY_SECONDS))
+            while (session := self._run.session) is None or not await self._join(seat, session):
+                if self._run.session is None:
+                    await self._run.change()
         finally:
             seat.is_joining = False
 
@@ -71,9 +71,20 @@ class Joining:
         except ClientError as error:
             seat.on_end(error)
 
-    async def _ask(self, seat: Seat, session: Welcome) -> bool:
-        """Ask to join a learner; return whether the client now takes part in the newest session."""
+    async def _join(self, seat: Seat, session: Welcome) -> bool:
+        """Ask the learner of a session again and again; return False once another learner is followed, or none."""
         join, transforms = seat.actor.prepare(session.spec)
+        while session is self._run.session:
+            welcome = await self._ask(seat, session, join)
+            if welcome is not None:
+                seat.actor.joined(welcome, transforms)  # with the client's own epsilon
+                return True
+            if session is self._run.session:
+                await asyncio.sleep(_RETRY_SECONDS)
+        return False
+
+    async def _ask(self, seat: Seat, session: Welcome, join: Join) -> Welcome | None:
+        """Ask to join a learner; return its answer if the client now takes part in the newest session."""
         began = time.monotonic()
         request = self._link.queries.request_join
         try:
@@ -84,13 +95,12 @@ class Joining:
         except NameInUseError as error:
             if began > seat.since + _NAME_IN_USE_SECONDS:
                 raise ClientError("refused", str(error)) from None
-            return False
+            return None
         except (ActorError, RunOverError, TransportError) as error:
             raise ClientError("refused", str(error)) from None
         if welcome is None or session is not self._run.session:
-            return False
+            return None
         if welcome.learner_epoch != session.learner_epoch:
             self._link.look_again()
-            return False
-        seat.actor.joined(welcome, transforms)  # with the client's own epsilon
-        return True
+            return None
+        return welcome

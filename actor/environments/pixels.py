@@ -1,7 +1,9 @@
 """Transforms of frames before they are stored and sent: crop, grey, resize. Pure functions, all E frames at once."""
 
+import math
 from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -10,39 +12,50 @@ from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.protocol.spaces import colours_last
 from daedalus.protocol.spec import EnvironmentSpec
 
+Shape = tuple[int, ...]  # of one frame
+
 _GREY_WEIGHTS = (77, 150, 29)  # of red, green, blue in 256ths: ITU-R BT.601's 0.299, 0.587, 0.114
 
 
+class _Transform(NamedTuple):
+    """One transform of frames whose colours are on the last axis. Its functions of shapes are for one frame."""
+
+    name: str  # as the specification states it
+    apply: Callable[[np.ndarray], np.ndarray]
+    shape: Callable[[Shape], Shape]  # of the transformed frame; raises ValueError if the transform does not fit
+    work_bytes: Callable[[Shape], int]  # size of the largest array that `apply` allocates for one frame
+
+
 class Pixels:
-    """The pixel transforms of a specification, in order; the identity if it has none."""
+    """The pixel transforms of a specification, in order; the identity if it has none.
+
+    `shape` is that of one transformed frame. `largest_bytes` is the size of the largest array in the transforms of one
+    frame, the frame included. Both are computed without an array: a space may be very large.
+    """
 
     def __init__(self, spec: EnvironmentSpec, space: gymnasium.spaces.Box) -> None:
         """Raises EnvironmentSetupError if a transform does not fit the space."""
-        asked: list[tuple[str, Callable[[np.ndarray], np.ndarray]]] = []
-        if spec.crop is not None:
-            asked.append((f"crop={spec.crop}", partial(crop, margins=spec.crop)))
-        if spec.grey:
-            asked.append(("grey", grey))
-        if spec.resize is not None:
-            asked.append((f"resize={spec.resize}", partial(resize, size=spec.resize)))
-        self._transforms = [transform for _, transform in asked]
+        self._transforms = _transforms(spec)
         self._colours_first = len(space.shape) == 3 and not colours_last(space.shape)
-        frames = np.zeros((1, *space.shape), space.dtype)
-        for name, transform in asked:
+        shape = (*space.shape[1:], space.shape[0]) if self._colours_first else space.shape
+        self.largest_bytes = math.prod(shape) * np.dtype(space.dtype).itemsize
+        for transform in self._transforms:
             try:
-                if frames.dtype != np.uint8 or frames.ndim not in (3, 4):
+                if space.dtype != np.uint8 or len(shape) not in (2, 3):
                     raise ValueError("frames must be uint8 images of shape (H, W), (H, W, C) or (C, H, W)")
-                frames = self._apply(transform, frames)
+                transformed = transform.shape(shape)
             except ValueError as error:
                 raise EnvironmentSetupError(
-                    f"environment.{name} does not fit observation space {described(space)}: {error}"
+                    f"environment.{transform.name} does not fit observation space {described(space)}: {error}"
                 ) from None
-        self.shape: tuple[int, ...] = frames.shape[1:]  # of one transformed frame
+            self.largest_bytes = max(self.largest_bytes, transform.work_bytes(shape))
+            shape = transformed
+        self.shape = (shape[-1], *shape[:-1]) if self._colours_first and len(shape) == 3 else shape
 
     def __call__(self, frames: np.ndarray) -> np.ndarray:
         """Return frames [E, *space.shape] transformed to [E, *shape]."""
         for transform in self._transforms:
-            frames = self._apply(transform, frames)
+            frames = self._apply(transform.apply, frames)
         return frames
 
     def _apply(self, transform: Callable[[np.ndarray], np.ndarray], frames: np.ndarray) -> np.ndarray:
@@ -53,28 +66,54 @@ class Pixels:
         return np.moveaxis(transformed, -1, 1) if transformed.ndim == 4 else transformed
 
 
+def _transforms(spec: EnvironmentSpec) -> list[_Transform]:
+    """Return the transforms of a specification in order."""
+    transforms = []
+    if (margins := spec.crop) is not None:
+        shape = partial(_cropped_shape, margins=margins)
+        transforms.append(_Transform(f"crop={margins}", partial(crop, margins=margins), shape, _no_bytes))
+    if spec.grey:  # its largest array has two bytes for each pixel, where the frame has three
+        transforms.append(_Transform("grey", grey, _grey_shape, _no_bytes))
+    if (size := spec.resize) is not None:
+        shape, work_bytes = partial(_resized_shape, size=size), partial(_resize_bytes, size=size)
+        transforms.append(_Transform(f"resize={size}", partial(resize, size=size), shape, work_bytes))
+    return transforms
+
+
+def _no_bytes(shape: Shape) -> int:
+    return 0
+
+
 def crop(frames: np.ndarray, margins: tuple[int, int, int, int]) -> np.ndarray:
     """Return a view of frames [E, H, W, ...] without `margins` pixels at the top, bottom, left and right."""
+    top, _, left, _ = margins
+    height, width = _cropped_shape(frames.shape[1:], margins)[:2]
+    return frames[:, top : top + height, left : left + width]
+
+
+def _cropped_shape(shape: Shape, margins: tuple[int, int, int, int]) -> Shape:
     top, bottom, left, right = margins
-    height, width = frames.shape[1:3]
+    height, width = shape[:2]
     if top + bottom >= height or left + right >= width:
         raise ValueError(f"the margins leave nothing of {height} x {width} pixels")
-    return frames[:, top : height - bottom, left : width - right]
+    return (height - top - bottom, width - left - right, *shape[2:])
 
 
 def grey(frames: np.ndarray) -> np.ndarray:
     """Return the luma by ITU-R BT.601 of RGB frames [E, H, W, 3], rounded to integers [E, H, W]."""
-    if frames.ndim != 4 or frames.shape[3] != 3:
-        raise ValueError(f"a frame of shape {frames.shape[1:]} is not RGB: it must have 3 colours")
-    luma, part = (
-        np.full(frames.shape[:3], 128, np.uint16),
-        np.empty(frames.shape[:3], np.uint16),
-    )  # 128: rounds to the nearest
+    shape = (frames.shape[0], *_grey_shape(frames.shape[1:]))
+    luma, part = np.full(shape, 128, np.uint16), np.empty(shape, np.uint16)  # 128: rounds to the nearest
     for channel, weight in enumerate(_GREY_WEIGHTS):
         np.multiply(frames[..., channel], weight, out=part, dtype=np.uint16)
         luma += part  # at most 255 * 256 + 128, which fits
     luma >>= 8
     return luma.astype(np.uint8)
+
+
+def _grey_shape(shape: Shape) -> Shape:
+    if len(shape) != 3 or shape[2] != 3:
+        raise ValueError(f"a frame of shape {shape} is not RGB: it must have 3 colours")
+    return shape[:2]
 
 
 def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -87,6 +126,15 @@ def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     sums = _area_sums(_area_sums(frames, 1, size[0]), 2, size[1])
     sums /= height * width
     return np.rint(sums, out=sums).astype(np.uint8)
+
+
+def _resized_shape(shape: Shape, size: tuple[int, int]) -> Shape:
+    return (*size, *shape[2:])
+
+
+def _resize_bytes(shape: Shape, size: tuple[int, int]) -> int:
+    """Return the size of the sums over rows, float32, which have the new height and the old width."""
+    return 4 * size[0] * math.prod(shape[1:])
 
 
 def _area_sums(frames: np.ndarray, axis: int, target: int) -> np.ndarray:

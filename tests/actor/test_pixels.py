@@ -1,6 +1,7 @@
 """Crop, grey and resize, compared with loops over the pixels."""
 
 import itertools
+import tracemalloc
 from fractions import Fraction
 
 import gymnasium
@@ -95,6 +96,44 @@ def test_colours_may_come_first() -> None:
     np.testing.assert_array_equal(pixels(images.transpose(0, 3, 1, 2)), expected.transpose(0, 3, 1, 2))
     luma = Pixels(EnvironmentSpec(id="x", grey=True), _space(3, 10, 12))(images.transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(luma, grey(images))
+
+
+@pytest.mark.parametrize("frame", [(20, 30, 3), (3, 20, 30), (20, 30), (20, 30, 1), (1, 20, 30)])
+@pytest.mark.parametrize("crop_margins", [None, (1, 2, 3, 4)])
+@pytest.mark.parametrize("is_grey", [False, True])
+@pytest.mark.parametrize("size", [None, (5, 6), (50, 60)])
+def test_shape_is_that_of_the_transformed_frames(
+    frame: tuple[int, ...], crop_margins: tuple[int, int, int, int] | None, is_grey: bool, size: tuple[int, int] | None
+) -> None:
+    spec = EnvironmentSpec(id="x", crop=crop_margins, grey=is_grey, resize=size)
+    try:
+        pixels = Pixels(spec, _space(*frame))
+    except EnvironmentSetupError:
+        assert is_grey
+        assert 3 not in frame
+        return
+    assert pixels(_noise(2, *frame)).shape == (2, *pixels.shape)
+
+
+def test_largest_array_of_the_transforms_is_known_before_it_is_allocated() -> None:
+    """Enlarging the height gives an array of float32 with the new height and the old width."""
+    tall = Pixels(EnvironmentSpec(id="x", resize=(84, 84)), _space(4, 1_000_000))
+    assert tall.shape == (84, 84)
+    assert tall.largest_bytes == 84 * 1_000_000 * 4
+    assert Pixels(EnvironmentSpec(id="x", grey=True, resize=(84, 84)), _space(3, 96, 100)).largest_bytes == 84 * 100 * 4
+    assert Pixels(EnvironmentSpec(id="x", resize=(8, 8)), _space(96, 100, 3)).largest_bytes == 96 * 100 * 3
+
+
+def test_construction_allocates_no_frame() -> None:
+    spec = EnvironmentSpec(id="x", crop=(0, 1, 0, 0), grey=True, resize=(84, 84))
+    space = _space()
+    space._shape = (16, 1_300_000, 3)
+    tracemalloc.start()
+    try:
+        assert Pixels(spec, space).shape == (84, 84)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_frames_pass_unchanged_without_transforms() -> None:

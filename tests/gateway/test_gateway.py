@@ -13,6 +13,7 @@ from processes import LIMIT, until
 from scripted_learner import SPEC, Policy, ScriptedLearner, acknowledge
 from websockets.exceptions import ConnectionClosed
 
+from daedalus.actor.session.learner_queries import LearnerQueries
 from daedalus.gateway import connection, policy_versions, server
 from daedalus.gateway import gateway as gateway_module
 from daedalus.gateway.client_actor import ClientActor
@@ -21,7 +22,7 @@ from daedalus.gateway.messages import Act
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime
 from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
-from daedalus.protocol.messages import Acknowledgement, Refusal, RunEnded
+from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 from daedalus.transport.interface import TransportError
 from daedalus.transport.memory import MemoryNetwork
@@ -316,6 +317,23 @@ def test_client_waits_for_a_learner(network: MemoryNetwork, connect: Connect) ->
         assert client.act([0.0, 0.0, 0.0, 0.0])["type"] == "action"
     finally:
         learner.transport.close()
+
+
+def test_request_to_join_is_prepared_once_and_sent_again_until_it_is_answered(
+    learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared, asked = [], []
+    prepare, request_join = ClientActor.prepare, LearnerQueries.request_join
+
+    def unanswered_twice(queries: LearnerQueries, run: str, join: Join) -> Welcome | None:
+        if join.actor == "arm-1":
+            asked.append(join)
+        return None if join.actor == "arm-1" and len(asked) < 3 else request_join(queries, run, join)
+
+    monkeypatch.setattr(ClientActor, "prepare", lambda actor, spec: prepared.append(spec) or prepare(actor, spec))
+    monkeypatch.setattr(LearnerQueries, "request_join", unanswered_twice)
+    assert connect().hello("arm-1")["type"] == "welcome"
+    assert (len(prepared), len(asked)) == (1, 3)
 
 
 def test_client_is_told_that_no_learner_came(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,10 @@ from gymnasium import spaces as gym
 from scripted_learner import Policy, ScriptedLearner
 
 from daedalus.actor.environments.transforms import Transforms
+from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_spaces import ClientSpaces
 from daedalus.gateway.errors import ClientError
+from daedalus.protocol.messages import Join
 from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.protocol.uploads import Rollout
 from daedalus.transport.memory import MemoryNetwork
@@ -304,3 +306,35 @@ def test_override_is_an_action_of_the_space(value: Any) -> None:
 def test_wrong_override_is_named(action: Any, value: Any, text: str) -> None:
     with pytest.raises(ClientError, match=text):
         ClientSpaces({"observation": PLAIN}, {"action": action}).check_action(value)
+
+
+@pytest.mark.parametrize("shape", [[16, 1_300_000, 3], [4, 16_000_000], [9000, 16]])
+def test_image_that_is_too_large_for_the_transforms_is_refused_at_once(shape: list[int]) -> None:
+    stated = {"observation": {"kind": "array", "shape": shape, "dtype": "uint8"}}
+    spaces = ClientSpaces(stated, {"action": {"kind": "discrete", "counts": [2]}})
+    actor = ClientActor(Join(actor="a", incarnation=1), spaces, None)  # type: ignore[arg-type] - it sends nothing
+    tracemalloc.start()
+    try:
+        with pytest.raises(
+            ClientError, match=r"observation is an image .* at most 8,192 pixels a side"
+        ):
+            actor.prepare(run_spec(resize=(84, 84)))
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_images_of_a_camera_are_not_too_large() -> None:
+    stated = {
+        "camera": {"kind": "array", "shape": [1080, 1920, 3], "dtype": "uint8"},
+        "bytes": {"kind": "array", "shape": [9000, 4], "dtype": "uint8"},  # no image: it is not transformed
+        "unseen": {"kind": "array", "shape": [4320, 7680], "dtype": "uint8"},
+    }
+    spaces = ClientSpaces(stated, {"action": {"kind": "discrete", "counts": [2]}})
+    actor = ClientActor(Join(actor="a", incarnation=1), spaces, None)  # type: ignore[arg-type] - it sends nothing
+    join, _ = actor.prepare(run_spec(crop=(0, 0, 4, 4), grey=True, resize=(84, 84), leave_out=("unseen",)))
+    assert join.spaces is not None
+    assert {name: space.shape for name, space in join.spaces.observations.items()} == {
+        "camera": (84, 84),
+        "bytes": (9000, 4),
+    }
