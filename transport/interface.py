@@ -44,11 +44,11 @@ class Request(Protocol):
         """Payload of the query; each access copies it."""
         ...
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         """Send the answer; later calls have no effect.
 
-        `may_drop`: drop an answer that a congested link cannot take, instead of waiting. Use it for large answers that
-        their reader requests again: a frozen reader must not hold up the answers to others.
+        Waits while the link to the sender has no room, at most until that link is closed: 5 s after it last had room,
+        or 2 s after the last sign of life.
         """
         ...
 

@@ -15,7 +15,7 @@ class _MemoryRequest:
         self.key, self.payload, self.size = key, payload, len(payload)
         self._on_answer: Callable[[bytes | None], None] | None = on_answer
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         self._answer(payload)
 
     def __del__(self) -> None:

@@ -24,13 +24,13 @@ class ZenohRequest:
         """See Request."""
         return b"" if self._buffers is None else self._buffers.to_bytes()
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         """See Request."""
         query, self._query = self._query, None
         if query is None:
             return
         try:
-            query.reply(self.key, payload, congestion_control=zenoh.CongestionControl.DROP if may_drop else None)
+            query.reply(self.key, payload)
             query.drop()
         except zenoh.ZError:
             pass  # the sender of the query is gone, or our session is closing: nobody waits for this answer

@@ -12,6 +12,8 @@ Kind = Literal["vectors_discrete", "vectors_continuous", "images", "large_images
 _UNKNOWN: Kind = "vectors_discrete"  # for an environment whose spaces are not known
 _LARGE = 128  # pixels of the longer side
 _RGB = 3  # colours, which environment.grey takes
+_MAX_ROLLOUT_BYTES = 48 << 20  # of observations; service.queue_megabytes is 64
+_SHORT = 16  # rows: before a rollout becomes shorter, an actor gets fewer environments
 _FULL_NOISE = 2  # numbers of an action: if there are more, each is explored less
 
 
@@ -33,9 +35,37 @@ def default_settings(spaces: Spaces | None, leave_out: Sequence[str] = ()) -> di
         settings["training"].pop("entropy_bonus_final", None)
     if kind == "vectors_continuous" and spaces is not None:
         settings["policy"]["initial_std"] = round(settings["policy"]["initial_std"] * _noise_scale(spaces), 2)
+    if spaces is not None:
+        _fit_rollouts(settings, spaces)
     if leave_out:
         settings.setdefault("environment", {})["leave_out"] = list(leave_out)
     return settings
+
+
+def _fit_rollouts(settings: dict[str, Any], spaces: Spaces) -> None:
+    """Make rollouts shorter, and then the environments of an actor fewer, until a message can carry a rollout."""
+    environment = settings.get("environment", {})
+    resized, grey = environment.get("resize"), environment.get("grey", False)
+    row = 0  # bytes of one environment
+    for space in spaces.observations.values():
+        if not isinstance(space, ArraySpace):
+            continue
+        if resized is None or not space.is_image:
+            row += space.observation_bytes
+        else:
+            row += math.prod(resized) * (1 if grey else space.image_shape[0])
+    base, with_memory = settings["collection"], settings["with_memory"]["collection"]
+    for collection in (base, with_memory):
+        while collection["rollout_length"] * collection["envs_per_actor"] * row > _MAX_ROLLOUT_BYTES:
+            if collection["rollout_length"] > _SHORT or collection["envs_per_actor"] == 1:
+                if collection["rollout_length"] == 1:
+                    break
+                collection["rollout_length"] //= 2
+            else:
+                collection["envs_per_actor"] //= 2
+    for each in settings["for_algorithm"].values():  # with either number of environments
+        shortest = min(base["rollout_length"], with_memory["rollout_length"])
+        each["collection"]["rollout_length"] = min(each["collection"]["rollout_length"], shortest)
 
 
 def kind_of(spaces: Spaces) -> Kind:

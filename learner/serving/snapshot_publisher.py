@@ -84,7 +84,7 @@ class SnapshotPublisher:
             self._compact.offer(request, message)
         else:
             answer = self._responses.snapshot(message.held_version)
-            request.reply(answer, may_drop=True)
+            request.reply(answer)
             self._count_answer(message, len(answer))
 
     def offer_program(self, model: bytes) -> None:

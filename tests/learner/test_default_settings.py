@@ -6,8 +6,12 @@ import pytest
 
 from daedalus.learner.run.default_settings import default_settings, kind_of
 from daedalus.learner.run.settings import choose_algorithm, run_spec
+from daedalus.policy.acting.program import export_program
+from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.normalized import normalized_components
 from daedalus.protocol.algorithms import ALGORITHMS
 from daedalus.protocol.spaces import ActionSpace, ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
+from daedalus.protocol.spec import PolicySpec
 
 VECTOR = ArraySpace(shape=(17,), dtype="float32")
 CHOICES, JOINTS = DiscreteSpace(counts=(4,)), ContinuousSpace(low=(-1.0,), high=(1.0,))
@@ -86,6 +90,48 @@ def test_continuous_actions_get_no_entropy_bonus(observation: ArraySpace) -> Non
     training = default_settings(spaces(JOINTS, observation))["training"]
     assert (training["entropy_bonus"], training.get("entropy_bonus_final")) == (0.0, None)
     assert default_settings(spaces(CHOICES, observation))["training"]["entropy_bonus"] > 0
+
+
+def policy_of(where: Spaces) -> PolicySpec:
+    return PolicySpec.model_validate(default_settings(where)["policy"])
+
+
+@pytest.mark.parametrize("size", [96, 210])
+def test_numbers_beside_an_image_are_normalised(size: int) -> None:
+    where = spaces(JOINTS, image(size, size, 3), VECTOR)
+    assert normalized_components(policy_of(where), where.observations) == {"1": VECTOR}
+
+
+def test_images_alone_have_the_program_of_a_policy_that_normalises_nothing() -> None:
+    where = spaces(CHOICES, image(20, 20))
+    policies = policy_of(where), policy_of(where).model_copy(update={"normalize_observations": False})
+    networks = [ActorCritic(policy, where) for policy in policies]
+    names = [list(dict(network.named_parameters())) for network in networks]
+    assert names[0] == names[1]
+    assert export_program(networks[0], where) == export_program(networks[1], where)
+
+
+@pytest.mark.parametrize(
+    ("where", "rows", "environments"),
+    [
+        (spaces(CHOICES, ArraySpace(shape=(64, 64), dtype="float32")), 128, 8),  # 16 MiB
+        (spaces(CHOICES, ArraySpace(shape=(128, 128), dtype="float32")), 64, 8),
+        (spaces(JOINTS, ArraySpace(shape=(1024, 1024), dtype="float32")), 8, 1),  # 4 MiB each
+        (spaces(JOINTS, ArraySpace(shape=(512, 512), dtype="float32")), 16, 2),
+        (spaces(CHOICES, image(128, 128, 3)), 64, 8),
+        (spaces(CHOICES, image(1000, 1000, 3)), 64, 8),  # made small
+        (spaces(CHOICES, image(210, 160, 3), ArraySpace(shape=(200, 200), dtype="float32")), 32, 8),
+        (spaces(CHOICES, ArraySpace(shape=(4000, 4000), dtype="float32")), 1, 1),
+    ],
+)
+def test_a_message_can_carry_a_rollout(where: Spaces, rows: int, environments: int) -> None:
+    settings = default_settings(where)
+    assert settings["collection"]["rollout_length"] == rows
+    assert settings["collection"]["envs_per_actor"] == environments
+    memory = settings["with_memory"]["collection"]
+    assert memory["rollout_length"] * memory["envs_per_actor"] <= 2 * rows * environments
+    for each in settings["for_algorithm"].values():
+        assert each["collection"]["rollout_length"] == min(16, rows)
 
 
 def test_components_to_leave_out_become_a_setting() -> None:

@@ -30,7 +30,7 @@ class Sent:
         self.size = len(self.payload)
         self._sequence, self._answers = sequence, answers
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         message = decode(payload, ACKNOWLEDGEMENT_LIMITS)
         assert isinstance(message, Acknowledgement)
         self._answers.put((self._sequence, message.verdict))

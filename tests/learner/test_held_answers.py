@@ -9,7 +9,7 @@ class Waiting:
 
     key, payload, size = "rollouts/a", b"", 0
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         raise AssertionError("the caller replies")
 
 

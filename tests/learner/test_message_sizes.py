@@ -29,7 +29,7 @@ class UnreadRequest:
     def payload(self) -> bytes:
         raise AssertionError("the payload was copied")
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         self.answers.append(decode(payload, Limits()))
 
 

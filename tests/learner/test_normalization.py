@@ -8,8 +8,8 @@ import torch
 from building import POLICY, identity, join, make_rollout
 from plain import NAME, plain
 
-from daedalus.algorithms import running_returns
-from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments
+from daedalus.algorithms import normalization, running_returns
+from daedalus.algorithms.normalization import ObservationStatistics, RewardNormalizer, RunningMoments, moments_of
 from daedalus.algorithms.running_returns import RunningReturns
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.normalization import ObservationNormalizer
@@ -32,6 +32,21 @@ def test_moments_of_batches_equal_those_of_all_values(offset: float) -> None:
     assert moments.count == 100
     np.testing.assert_allclose(moments.mean, values.mean(0), rtol=1e-12)
     np.testing.assert_allclose(moments.variance, values.var(0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_moments_of_large_values_are_computed_in_parts(monkeypatch: pytest.MonkeyPatch, dtype: type) -> None:
+    values = torch.from_numpy(np.random.default_rng(1).integers(0, 256, (100, 2, 3)).astype(dtype))
+    whole = moments_of(values)
+    monkeypatch.setattr(normalization, "_PART_NUMBERS", 50)
+    parts: list[int] = []
+    merge = RunningMoments.merge
+    monkeypatch.setattr(RunningMoments, "merge", lambda self, each: (parts.append(each.number), merge(self, each)))
+    moments = moments_of(values)
+    assert parts == [8] * 12 + [4]
+    assert moments.number == 100
+    np.testing.assert_allclose(moments.mean, whole.mean, rtol=1e-12)
+    np.testing.assert_allclose(moments.squares, whole.squares, rtol=1e-12)
 
 
 def discounted_sums(rollouts: list[Rollout]) -> list[float]:

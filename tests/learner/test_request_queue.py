@@ -19,7 +19,7 @@ class UnansweredRequest:
     def __init__(self, size: int) -> None:
         self.payload, self.size = bytes(size), size
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         raise AssertionError("the queue must not reply")
 
 

@@ -40,7 +40,7 @@ class LinkRequest:
     def payload(self) -> bytes:
         return self._payload
 
-    def reply(self, payload: bytes, *, may_drop: bool = False) -> None:
+    def reply(self, payload: bytes) -> None:
         server = self.server
         if server.network.kernel.current.killed:
             raise Killed
