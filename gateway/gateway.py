@@ -1,8 +1,10 @@
-"""The clients of a gateway as actors of a run. For the gateway's event loop; the learner link has a thread of its own.
+"""The clients of a gateway as actors of a run. For the gateway's event loop; what may wait has threads of its own.
 
 event loop        clients' messages, actions, rollouts: this file, connection.py, batcher.py, outbox.py
 link thread       finds the learner, loads snapshots: learner_link.py
 join threads      requests to join, which may wait: joining.py
+presence thread   declares which clients are present: presence.py
+sender thread     sends the rollouts: sender.py
 """
 
 import asyncio
@@ -27,11 +29,13 @@ from daedalus.gateway.messages import Act, Hello
 from daedalus.gateway.outbox import Outbox
 from daedalus.gateway.parked_actors import ParkedActors
 from daedalus.gateway.policy_versions import PolicyVersion, PolicyVersions
+from daedalus.gateway.sender import Sender
 from daedalus.protocol.messages import Join, Origin, Welcome
 from daedalus.transport.interface import Transport
 
 MAX_CLIENTS = 1024
 JOIN_SECONDS = 60.0  # for a learner and its first policy to come
+_LINK_SECONDS, _SENDER_SECONDS = 2.0, 1.0  # for the threads to end
 _TICK_SECONDS = 0.05
 _SLOW_SECONDS = 10.0  # where versions need memory, a client that is silent for so long loses its unfinished rollout
 
@@ -61,6 +65,7 @@ class Gateway:
         self._seats: dict[str, Seat] = {}  # by the name towards the learner
         self._batcher = Batcher(lambda: self._versions.current, lambda: len(self._seats), on_failure, self._on_fault)
         self._outbox = Outbox()
+        self._sender = Sender(transport, lambda error: self._post(on_failure, error))
         self._parked = ParkedActors(MAX_CLIENTS)
         self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(target=self._run_link, name="learner-link", daemon=True)
@@ -68,18 +73,27 @@ class Gateway:
     def open(self) -> None:
         """Begin to follow the run."""
         self._thread.start()
+        self._sender.open()
         self._start(self._tick())
 
     async def close(self) -> None:
         """Leave the run. At most about 3 s."""
         self._stop.set()
-        for task in list(self._tasks):
-            task.cancel()
-        for seat in list(self._seats.values()):
-            seat.on_end(ClientError("unavailable", "the gateway stops"))
-        self._joining.close()
-        if self._thread.is_alive():
-            await asyncio.to_thread(self._thread.join, 3.0)
+        try:
+            for task in list(self._tasks):
+                task.cancel()
+            for seat in list(self._seats.values()):
+                seat.on_end(ClientError("unavailable", "the gateway stops"))
+            self._joining.close()
+        finally:
+            await asyncio.to_thread(self._close_threads)
+
+    def _close_threads(self) -> None:
+        try:
+            if self._thread.is_alive():
+                self._thread.join(_LINK_SECONDS)
+        finally:
+            self._sender.close(_SENDER_SECONDS)  # the clients' last rollouts may have come meanwhile
 
     @property
     def newest_policy(self) -> NewestPolicy | None:
@@ -121,7 +135,7 @@ class Gateway:
         if len(self._seats) >= MAX_CLIENTS:
             raise ClientError("unavailable", f"{MAX_CLIENTS} clients are connected already: try again later")
         actor = self._parked.take(name, spaces) or self._new_actor(name, spaces, address)
-        seat = self._seats[name] = Seat(actor, on_end)
+        seat = self._seats[name] = Seat(actor, on_end, self._joining.presence())
         try:
             async with asyncio.timeout(JOIN_SECONDS):
                 await self._enter(seat)
@@ -137,8 +151,9 @@ class Gateway:
     def _new_actor(self, name: str, spaces: ClientSpaces, address: str) -> ClientActor:
         origin = Origin(host=self._origin.host, software=self._origin.software, address=address)
         join = Join(actor=name, incarnation=secrets.randbits(62), origin=origin)
-        uploads = UploadSession(self._transport, name, self._link.presence, self._link.lock)
-        return ClientActor(join, spaces, ClientUploads(join, self._transport, uploads, self._outbox.add))
+        transport = self._sender.transport
+        uploads = UploadSession(transport, name, self._link.presence, self._link.lock)
+        return ClientActor(join, spaces, ClientUploads(join, transport, uploads, self._outbox.add))
 
     async def _enter(self, seat: Seat) -> None:
         """Join the learner, and wait for a policy of it."""
@@ -156,7 +171,7 @@ class Gateway:
             return
         del self._seats[actor.name]
         self._batcher.remove(actor)
-        seat.leave()
+        seat.presence.withdraw()
         actor.cut()
         if actor.epoch >= 0 and not actor.uploads.ended_by[0]:
             self._parked.park(actor)
@@ -231,7 +246,7 @@ class Gateway:
         self.run.begin(session)
         for seat in list(self._seats.values()):
             if other_run:
-                seat.leave()
+                seat.presence.withdraw()
             if not seat.is_joining:
                 self._start(self._joining.rejoin(seat))
 

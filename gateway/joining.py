@@ -12,9 +12,10 @@ from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.followed_run import FollowedRun
 from daedalus.gateway.learner_link import LearnerLink
+from daedalus.gateway.presence import Presence
 from daedalus.protocol import keys
 from daedalus.protocol.messages import Join, Welcome
-from daedalus.transport.interface import Declaration, Transport, TransportError
+from daedalus.transport.interface import Transport, TransportError
 
 _THREADS = 16  # requests at the same time, which may wait
 _RETRY_SECONDS = 0.2  # between requests of one client
@@ -27,19 +28,13 @@ class Seat:
 
     actor: ClientActor
     on_end: Callable[[ClientError | str], None]  # ends its connection, with an error or how the run ended
-    presence: Declaration | None = None
+    presence: Presence
     is_joining: bool = False
     since: float = field(default_factory=time.monotonic)  # when it began to join
 
     def is_in(self, session: Welcome | None) -> bool:
         """Return whether the actor takes part in a session."""
         return session is not None and self.actor.epoch == session.learner_epoch
-
-    def leave(self) -> None:
-        """Stop to be present in the run."""
-        if self.presence is not None:
-            self.presence.close()
-            self.presence = None
 
 
 class Joining:
@@ -48,10 +43,16 @@ class Joining:
     def __init__(self, transport: Transport, link: LearnerLink, run: FollowedRun) -> None:
         self._transport, self._link, self._run = transport, link, run
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="join")
+        self._presence_thread = ThreadPoolExecutor(1, thread_name_prefix="presence")
+
+    def presence(self) -> Presence:
+        """Return the presence of an actor, not declared yet."""
+        return Presence(self._transport, self._presence_thread)
 
     def close(self) -> None:
         """Begin no further requests."""
         self._threads.shutdown(wait=False, cancel_futures=True)
+        self._presence_thread.shutdown(wait=False, cancel_futures=True)
 
     async def join(self, seat: Seat) -> None:
         """Join the newest learner, once there is one. Raises ClientError if the client cannot take part."""
@@ -88,9 +89,7 @@ class Joining:
         began = time.monotonic()
         request = self._link.queries.request_join
         try:
-            if seat.presence is None:
-                key = keys.presence(session.run, join.actor, join.incarnation)
-                seat.presence = self._transport.declare_presence(key)
+            await seat.presence.declare(keys.presence(session.run, join.actor, join.incarnation))
             welcome = await asyncio.get_running_loop().run_in_executor(self._threads, request, session.run, join)
         except NameInUseError as error:
             if began > seat.since + _NAME_IN_USE_SECONDS:

@@ -8,8 +8,8 @@ from daedalus.gateway.client_uploads import ClientUploads
 class Outbox:
     """The clients that have a rollout to send.
 
-    Encoding and sending takes longer than the choice of an action, and clients that began together fill their rollouts
-    together. So each turn of the event loop sends one rollout, and answers clients between them.
+    Encoding takes longer than the choice of an action, and clients that began together fill their rollouts together. So
+    each turn of the event loop encodes one rollout for the sender (sender.py), and answers clients between them.
     """
 
     def __init__(self) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +25,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Acknowledgement, Join, Refusal, RunEnded, Welcome
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import Declaration, TransportError
 from daedalus.transport.memory import MemoryNetwork
 
 Connect = Callable[..., JsonClient]
@@ -334,6 +335,55 @@ def test_request_to_join_is_prepared_once_and_sent_again_until_it_is_answered(
     monkeypatch.setattr(LearnerQueries, "request_join", unanswered_twice)
     assert connect().hello("arm-1")["type"] == "welcome"
     assert (len(prepared), len(asked)) == (1, 3)
+
+
+def test_clients_act_while_the_link_takes_no_rollouts(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport = gateway.gateway._transport
+    query_async, stalled, goes_on = transport.query_async, threading.Event(), threading.Event()
+
+    def congested(*given: Any, **named: Any) -> None:
+        stalled.set()
+        assert goes_on.wait(LIMIT)
+        query_async(*given, **named)
+
+    client = connect()
+    client.hello("arm-1")
+    monkeypatch.setattr(transport, "query_async", congested)
+    try:
+        fill_rollout(client)
+        assert stalled.wait(LIMIT)
+        client.socket.send(json.dumps({"type": "act", "observation": [5.0, 0.0, 0.0, 0.0]}))
+        assert json.loads(client.socket.recv(timeout=LIMIT / 2))["type"] == "action"
+        fill_rollout(client)
+    finally:
+        goes_on.set()
+    assert [learner.receive()[0].identity.sequence for _ in range(2)] == [0, 1]
+
+
+def test_clients_act_while_the_link_takes_no_presence(
+    learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    transport = gateway.gateway._transport
+    declare_presence, stalled, goes_on = transport.declare_presence, threading.Event(), threading.Event()
+
+    def congested(key: str) -> Declaration:
+        stalled.set()
+        assert goes_on.wait(LIMIT)
+        return declare_presence(key)
+
+    client, late = connect(), connect()
+    client.hello("arm-1")
+    monkeypatch.setattr(transport, "declare_presence", congested)
+    try:
+        late.send("hello", version=1, name="arm-2", **CARTPOLE)
+        assert stalled.wait(LIMIT)
+        client.socket.send(json.dumps({"type": "act", "observation": [5.0, 0.0, 0.0, 0.0]}))
+        assert json.loads(client.socket.recv(timeout=LIMIT / 2))["type"] == "action"
+    finally:
+        goes_on.set()
+    assert late.receive()["type"] == "welcome"
 
 
 def test_client_is_told_that_no_learner_came(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
