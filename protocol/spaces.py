@@ -11,6 +11,7 @@ from pydantic import FailFast, Field, StringConstraints, model_validator
 from daedalus.protocol.specification import PositiveInt, Specification
 
 LARGEST_OBSERVATION = 1e15  # of a number in an observation: beyond it squares overflow float32
+LARGEST_REWARD = 1e9  # as learning sees it: the learner (learner/serving/rollout_judge.py) rejects larger ones
 _MAX_OBSERVATION_BYTES = 64 << 20  # actors report their spaces, and the learner allocates batches of that size
 _MAX_CHOICES = 65_536  # of a space over all its variables: the policy has an output for each
 _MAX_COMPONENTS = 64
@@ -133,7 +134,8 @@ class ContinuousSpace(Specification):
     """D continuous actions with optional bounds: gymnasium's Box, flattened.
 
     In messages, an action with both bounds is scaled to [-1, 1]; any other is as the environment has it. Values are
-    float32 [D], and may lie outside the bounds: an actor clips them before the environment receives them.
+    float32 [D], and may lie outside the bounds: an actor clips them before the environment receives them. Two equal
+    bounds are the only value of their action, whatever the message says.
     """
 
     kind: Literal["continuous"] = "continuous"
@@ -147,11 +149,8 @@ class ContinuousSpace(Specification):
         for low, high in zip(self.low, self.high, strict=True):
             if not all(bound is None or math.isfinite(bound) for bound in (low, high)):
                 raise ValueError("a bound is not finite: leave it out")
-            if low is not None and high is not None and not low < high:
-                raise ValueError(
-                    f"the lower bound {low:g} is not below the upper bound {high:g}: "
-                    "leave a number that cannot change out of the action"
-                )
+            if low is not None and high is not None and low > high:
+                raise ValueError(f"the lower bound {low:g} is above the upper bound {high:g}: exchange them")
         return self
 
     @property

@@ -16,6 +16,7 @@ from daedalus.policy.user_modules import file_of, hidden_file
 
 _logger = logging.getLogger(__name__)
 
+_FLATTEN = ", or make one array of them: --wrap gymnasium.wrappers:FlattenObservation"
 OTHER_BACKEND = "or use another backend (--set environment.backend=gymnasium)"
 _MOST_CHARACTERS = 160  # of a space in a message
 _MOST_NAMES = 5  # of environments in a message
@@ -31,6 +32,10 @@ def reason_of(error: ValidationError) -> str:
     first = error.errors()[0]
     if first["type"] == "less_than_equal":  # the count of a discrete variable
         return f"{first['input']:,} choices of one variable: use at most {first.get('ctx', {}).get('le'):,}"
+    if first["type"] == "too_long" and first["loc"] in (("observations",), ("actions",)):
+        part, remedy = ("action", "") if first["loc"] == ("actions",) else ("observation", _FLATTEN)
+        most = first.get("ctx", {}).get("max_length")
+        return f"the {part} has {len(first['input'])} components: use at most {most}{remedy}"
     return first["msg"].removeprefix("Value error, ")
 
 
@@ -93,8 +98,11 @@ def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> 
 
 
 @contextmanager
-def creation_errors(environment: str) -> Iterator[None]:
-    """Raise EnvironmentSetupError for anything that the constructor of an environment raises."""
+def creation_errors(environment: str, hint: str = "") -> Iterator[None]:
+    """Raise EnvironmentSetupError for anything that the constructor of an environment raises; `hint` ends its message.
+
+    An EnvironmentSetupError passes as it is.
+    """
     try:
         yield
     except EnvironmentSetupError:
@@ -107,7 +115,7 @@ def creation_errors(environment: str) -> Iterator[None]:
         ) from None
     except (Exception, SystemExit) as error:  # broad: the constructor of a user's environment may raise anything
         raise EnvironmentSetupError(
-            f"environment {environment} cannot be created: {first_line(error)}{place_of(error)}"
+            f"environment {environment} cannot be created: {first_line(error)}{place_of(error)}{hint}"
         ) from error
 
 

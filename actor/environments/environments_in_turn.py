@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from daedalus.actor.environments.environment_errors import creation_errors
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.masks import MASK_KEY
 
@@ -18,12 +19,20 @@ class EnvironmentsInTurn(SyncVectorEnv):
     To collect all entries of every step takes a tenth of the time of MuJoCo's environments.
     """
 
-    def __init__(self, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
-        """Make the environments. If one cannot be made, close the others: a simulator may outlive this process."""
+    def __init__(self, name: str, makers: Sequence[Callable[[], gymnasium.Env]]) -> None:
+        """Make the environments. If one cannot be made, close the others: a simulator may outlive this process.
+
+        Args:
+          name: id of the environments, for errors.
+          makers: functions, each of which creates one environment.
+
+        Raises EnvironmentSetupError.
+        """
         made: list[gymnasium.Env] = []
 
         def make(maker: Callable[[], gymnasium.Env]) -> gymnasium.Env:
-            made.append(maker())
+            with creation_errors(name, _hint(len(made), len(makers))):
+                made.append(maker())
             return made[-1]
 
         try:
@@ -59,3 +68,13 @@ class EnvironmentsInTurn(SyncVectorEnv):
             return super()._add_info(vector_infos, kept, env_num)
         finally:
             self._collecting = False
+
+
+def _hint(made: int, count: int) -> str:
+    """Return what may be wrong where an environment cannot be made, but `made` others of `count` could."""
+    if not made:
+        return ""
+    return (
+        f" (environment {made + 1} of {count} of this process: if only one can run at a time, use "
+        "--set collection.envs_per_actor=1 --actors 1)"
+    )

@@ -48,7 +48,7 @@ class EnvironmentFactory:
         kwargs = _kwargs(spec)
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
-        if self.render_mode == "rgb_array":
+        if kwargs.get("render_mode") == "rgb_array":  # also from environment.kwargs
             render_without_display()
         late_rendered = registered.entry_point == _CAR_RACING and spec.wrap is None
         if late_rendered:
@@ -211,7 +211,7 @@ def _make_vector(factory: EnvironmentFactory, count: int) -> Any:
             return gymnasium.make_vec(registered, 1, "vector_entry_point", **_kwargs(spec))
     if spec.processes and spec.backend == "gymnasium" and factory.camera is None:
         return EnvironmentProcesses(spec.id, [factory] * count, left_out=spec.leave_out)
-    return EnvironmentsInTurn([factory] * count)
+    return EnvironmentsInTurn(spec.id, [factory] * count)
 
 
 def _kwargs(spec: EnvironmentSpec) -> dict[str, Any]:

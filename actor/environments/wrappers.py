@@ -1,5 +1,6 @@
 """Wrappers of one gymnasium environment: masks in `info`, repeated actions, one episode for each seed."""
 
+import copy
 from collections.abc import Callable
 from typing import Any, SupportsFloat
 
@@ -85,7 +86,9 @@ class RepeatedSteps(gymnasium.Wrapper):
         return observation, total, terminated, truncated, info
 
     def _step_once(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        # A copy where the action is repeated: the environment may change its values in place.
+        given = copy.deepcopy(action) if self._repeat > 1 else action
+        observation, reward, terminated, truncated, info = self.env.step(given)
         self._film()
         return observation, float(reward), terminated, truncated, info
 

@@ -18,7 +18,7 @@ from picture_environment import Picture
 from plain import PlainEnvironments, choices
 from processes import processes_mentioning, until
 
-from daedalus.actor.environments import environment_processes, make
+from daedalus.actor.environments import environment_processes, gymnasium_backend, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium, make_gymnasium
@@ -71,6 +71,40 @@ def test_repeats_sum_rewards_and_stop_at_the_end_of_an_episode(processes: bool) 
         ]
     finally:
         environments.close()
+
+
+class Doubling(gymnasium.Env):
+    """An environment that changes its action in place."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Box(-1, 1, (1,))
+
+    def __init__(self) -> None:
+        self.taken: list[float] = []
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action *= 2.0
+        self.taken.append(float(action[0]))
+        return 0, 0.0, False, False, {}
+
+
+def test_each_repeat_gets_the_action_that_was_chosen() -> None:
+    environment = Doubling()
+    action = np.array([0.25], np.float32)
+    RepeatedSteps(environment, "Any-v0", repeat=3, no_reward_limit=None).step(action)
+    assert environment.taken == [0.5] * 3
+    assert action.tolist() == [0.25]
+
+
+@pytest.mark.parametrize(("mode", "calls"), [("rgb_array", 1), ("human", 0), (None, 0)])
+def test_render_mode_of_the_arguments_prepares_a_host_without_display(
+    monkeypatch: pytest.MonkeyPatch, mode: str | None, calls: int
+) -> None:
+    """An environment may observe its own pictures: --wrap gymnasium.wrappers:AddRenderObservation."""
+    called: list[str] = []
+    monkeypatch.setattr(gymnasium_backend, "render_without_display", lambda: called.append("render_without_display"))
+    monkeypatch.setattr(gymnasium, "make", lambda *_, **kwargs: called.append(kwargs["render_mode"]) or Doubling())
+    EnvironmentFactory(spec=EnvironmentSpec(id="CartPole-v1", kwargs={"render_mode": mode}))()
+    assert called == [*["render_without_display"] * calls, mode], "before the environment is made"
 
 
 def test_episode_limit_counts_the_environments_own_steps() -> None:

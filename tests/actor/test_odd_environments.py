@@ -12,6 +12,7 @@ from plain import PlainPolicy
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
+from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.make import make_environments
 from daedalus.policy.acting.noise import Noise
@@ -129,14 +130,30 @@ class Simulator(gymnasium.Env[Any, Any]):
 def test_environments_are_closed_if_another_cannot_be_made() -> None:
     """Simulators that were started would go on, and occupy the ports of those that the next process starts."""
     closed: list[int] = []
-    with pytest.raises(ConnectionError, match="licences"):
-        EnvironmentsInTurn([partial(Simulator, number, closed, licensed=number != 3) for number in range(1, 5)])
+    makers = [partial(Simulator, number, closed, licensed=number != 3) for number in range(1, 5)]
+    with pytest.raises(EnvironmentSetupError, match="licences"):
+        EnvironmentsInTurn("Simulator-v0", makers)
     assert closed == [1, 2]
+
+
+def test_environment_of_which_only_one_can_run_is_reported_with_the_remedy() -> None:
+    makers = [partial(Simulator, number, [], licensed=number == 1) for number in range(1, 9)]
+    with pytest.raises(EnvironmentSetupError) as caught:
+        EnvironmentsInTurn("Simulator-v0", makers)
+    place, hint = str(caught.value).split(")", 1)[0], str(caught.value).rpartition(" (")[2]
+    assert place.startswith("environment Simulator-v0 cannot be created: ConnectionError: all licences are in use (")
+    assert hint == (
+        "environment 2 of 8 of this process: if only one can run at a time, use --set collection.envs_per_actor=1 "
+        "--actors 1)"
+    )
+    with pytest.raises(EnvironmentSetupError) as caught:
+        EnvironmentsInTurn("Simulator-v0", makers[1:])
+    assert "only one can run" not in str(caught.value), "the first cannot be made, either"
 
 
 def test_all_environments_are_closed_once_though_one_raises() -> None:
     closed: list[int] = []
-    environments = EnvironmentsInTurn([partial(Simulator, number, closed) for number in range(1, 4)])
+    environments = EnvironmentsInTurn("Simulator-v0", [partial(Simulator, number, closed) for number in range(1, 4)])
     with pytest.raises(RuntimeError, match="1 has no connection"):
         environments.close()
     environments.close()

@@ -268,7 +268,7 @@ def test_observations_too_large_for_memory_are_refused(shape: tuple[int, ...], f
     [
         (DiscreteSpace, {"counts": [40_000, 40_000]}, "80,000 choices together"),
         (ContinuousSpace, {"low": [0.0], "high": [1.0, 2.0]}, "1 lower bounds, but 2 upper bounds"),
-        (ContinuousSpace, {"low": [1.0], "high": [1.0]}, "the lower bound 1 is not below the upper bound 1"),
+        (ContinuousSpace, {"low": [1.0], "high": [0.0]}, "the lower bound 1 is above the upper bound 0"),
         (Spaces, {**SPACES, "observations": {str(n): {**ARRAY, "shape": [9 << 20]} for n in range(2)}}, "bytes: use"),
     ],
 )
