@@ -14,6 +14,7 @@ from daedalus.protocol.uploads import Rollout
 
 _LARGEST_REWARD = 10.0  # normalised rewards are clipped to +- this value
 _LARGEST_MEAN = 5.0  # of the scaled returns: that of episodes of a thousand equal rewards, at a discount factor of 0.99
+_PART_NUMBERS = 4 << 20  # numbers whose moments are computed at a time
 _LOADED_COUNT = 100_000  # how many observations loaded statistics stand for: new ones change them slowly
 
 
@@ -27,6 +28,12 @@ class Moments(NamedTuple):
 
 def moments_of(values: Tensor) -> Moments:
     """Return the moments of values [N, *shape]; those of no values are 0."""
+    rows = max(_PART_NUMBERS // max(values[:1].numel(), 1), 1)
+    if len(values) > rows:  # in float64 all of them, such as a batch of images, could take gigabytes
+        merged = RunningMoments(tuple(values.shape[1:]))
+        for part in values.split(rows):
+            merged.add(part)
+        return Moments(len(values), merged.mean, merged.squares)
     values = values.to("cpu", torch.float64)
     mean = values.mean(0) if len(values) else values.new_zeros(values.shape[1:])
     return Moments(len(values), mean, (values - mean).square().sum(0))

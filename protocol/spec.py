@@ -112,8 +112,8 @@ class PolicySpec(Specification):
     activation: Literal["tanh", "relu"] = "tanh"
     """Activation function; the `mlp` encoder only."""
     normalize_observations: bool = False
-    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Images of
-    bytes are left out, and so are all bytes (`uint8`) that an image encoder or your own encoder reads."""
+    """Shift and scale observations to mean 0 and standard deviation 1, by running statistics. Bytes (`uint8`) that
+    an image encoder or your own encoder reads are left out."""
     distribution: Annotated[
         str, Field(pattern=r"^(gaussian|squashed_gaussian|gaussian_mixture|kumaraswamy|[\w.]+:\w+)$", max_length=200)
     ] = "gaussian"

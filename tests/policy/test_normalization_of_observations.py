@@ -59,7 +59,8 @@ IMAGE = ArraySpace(shape=(16, 16, 3), dtype="uint8")
     ("encoder", "spaces", "normalized"),
     [
         ("auto", {"bytes": BYTES}, {"bytes"}),
-        ("mlp", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),
+        ("mlp", {"bytes": BYTES, "image": IMAGE}, {"bytes", "image"}),
+        ("auto", {"bytes": BYTES, "image": IMAGE, "numbers": NUMBERS}, {"bytes", "numbers"}),
         ("impala", {"bytes": BYTES}, set()),  # its first convolution scales bytes itself
         ("impala", {"numbers": NUMBERS}, {"numbers"}),
         ("impala", {"bytes": BYTES, "image": IMAGE}, {"bytes"}),  # the multilayer perceptron reads them
