@@ -50,29 +50,21 @@ def checked_defaults(spec: RunSpec, *, fork: bool = False) -> tuple[Spaces | Non
 
 
 def _checked(spec: RunSpec, fork: bool, *, for_settings: bool = False) -> "EnvironmentReport":
-    from daedalus.actor.checking.report import (
-        EnvironmentReport,
-        float_images,
-        slow_start,
-        slow_steps,
-        uninformative_bounds,
-    )
+    from daedalus.actor.checking.report import EnvironmentReport, advice, slow_start
 
     try:
         modules = UserModules(frozenset(modules_of(spec.user_modules)))
         report = quick_check(spec.environment, modules, fork=fork, for_settings=for_settings)
     except CheckTimeoutError as error:
-        advice = slow_start(spec)
-        _logger.warning("the check of the environment was %s: the run starts without it%s", error, advice)
+        hint = slow_start(spec)
+        _logger.warning("the check of the environment was %s: the run starts without it%s", error, hint)
         return EnvironmentReport()
     if report.problems:
         raise EnvironmentProblemError(with_preset(report.problems[0], spec))
     for warning in report.warnings:
         _logger.warning("%s", warning)
-    slow = slow_steps(report, spec, os.cpu_count() or 1)
-    for advice in (slow, float_images(report, spec), uninformative_bounds(report)):
-        if advice:
-            _logger.info("%s", advice)
+    for text in advice(report, spec, os.cpu_count() or 1):
+        _logger.info("%s", text)
     return report
 
 

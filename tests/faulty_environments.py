@@ -17,12 +17,21 @@ class Faulty(gymnasium.Env[Any, Any]):
     observation_space = Box(-1.0, 1.0, (2,), np.float32)
     action_space = Discrete(2)
 
-    def __init__(self, fault: str = "", never_ends: bool = False) -> None:
-        self._fault, self._never_ends, self._step = fault, never_ends, 0
+    def __init__(self, fault: str = "", never_ends: bool = False, value: int = 0) -> None:
+        self._fault, self._never_ends, self._step, self._value = fault, never_ends, 0, value
+        if fault == "map":  # of numbers, and no fault
+            self.observation_space = Box(0, 255, (20, 20), np.uint8)
+        if fault == "three numbers":
+            self.observation_space = Box(-1.0, 1.0, (3,), np.float32)
         if fault == "constructor":
             raise FileNotFoundError("level.txt")
         if fault == "hang":
             time.sleep(3600)
+
+    def __getattribute__(self, name: str) -> Any:
+        if name.endswith("_space") and super().__getattribute__("__dict__").get("_fault") == f"no {name}":
+            raise AttributeError(f"'Faulty' object has no attribute {name!r}")
+        return super().__getattribute__(name)
 
     def _observe(self) -> Any:
         good = np.full(2, 0.5, np.float32)
@@ -32,6 +41,8 @@ class Faulty(gymnasium.Env[Any, Any]):
             "nan": np.array([0.0, np.nan], np.float32),
             "bounds": np.array([0.0, 731.5], np.float32),
             "none": None,
+            "map": np.full((20, 20), self._value, np.uint8),
+            "three numbers": np.zeros(3, np.float32),
         }
         return faulty.get(self._fault, good)
 
@@ -56,6 +67,7 @@ class Faulty(gymnasium.Env[Any, Any]):
         if self._fault == "error in a function":
             _connect()
         reward: Any = np.nan if self._fault == "reward" and self._step == 3 else 1.0
+        reward = -1e12 if self._fault == "large reward" else reward
         info: Any = _odd_info(self._step) if self._fault == "info" else {}
         result = self._observe(), reward, int(over) if self._fault == "flag" else over, False, info
         return result[:4] if self._fault == "values" else result

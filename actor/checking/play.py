@@ -12,15 +12,22 @@ import numpy as np
 from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.report import EnvironmentReport
 from daedalus.actor.checking.single import make_one
+from daedalus.actor.checking.statistics import unsaved_statistics
 from daedalus.actor.checking.texts import Texts
 from daedalus.actor.checking.vectorized import vectorized_problem
-from daedalus.actor.checking.violations import Violation, reset_violations, step_violations
+from daedalus.actor.checking.violations import (
+    Violation,
+    learned_reward_violations,
+    reset_violations,
+    step_violations,
+)
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.spaces import ArraySpace
 from daedalus.protocol.spec import EnvironmentSpec
 
 
@@ -33,7 +40,8 @@ def check_environment(
 ) -> EnvironmentReport:
     """Make one environment, play it with random actions, and close it; then the same with its vector entry point.
 
-    Texts of the observation that never change are left out, and reported.
+    Where training has arguments of its own, the environment is also made as evaluations play it. Texts of the
+    observation that never change are left out, and reported.
 
     Args:
       spec: the environment and its transforms.
@@ -46,8 +54,23 @@ def check_environment(
     if report.problems or report.spaces is None or seconds == 0.0:
         return report
     left_out = spec.model_copy(update={"leave_out": (*spec.leave_out, *report.constant_texts)})
-    problem = vectorized_problem(left_out, modules, report.spaces, seed)
+    problem = vectorized_problem(left_out, modules, report.spaces, seed) or _evaluated_problem(spec, modules, report)
     return report.model_copy(update={"problems": (problem,)}) if problem else report
+
+
+def _evaluated_problem(spec: EnvironmentSpec, modules: UserModules, trained: EnvironmentReport) -> str:
+    """Return why evaluations cannot play what was trained with `environment.training_kwargs`, or an empty string."""
+    if not spec.training_kwargs:
+        return ""
+    report = _check_one(spec.as_evaluated(), modules, 0.0, 0, 0)
+    if report.problems:
+        return f"{report.problems[0]} (evaluations play it without environment.training_kwargs)"
+    if report.spaces != trained.spaces:
+        return (
+            f"environment {spec.id}: evaluations, which play it without environment.training_kwargs, have "
+            f"{report.spaces}, but training has {trained.spaces}"
+        )
+    return ""
 
 
 def _check_one(
@@ -64,7 +87,7 @@ def _check_one(
         rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
         space = without(environment.observation_space, rest.leave_out)
         transforms = Transforms(rest, environment.observation_space, environment.action_space, mask)
-        play = _Play(spec.id, environment, space, transforms, RandomActions(transforms.spaces.actions, seed), texts)
+        play = _Play(spec, environment, space, transforms, RandomActions(transforms.spaces.actions, seed), texts)
         if seconds > 0.0:
             play.run(seconds, env_steps, seed)
         return play.report()
@@ -90,19 +113,24 @@ class _Play:
 
     def __init__(
         self,
-        name: str,
+        spec: EnvironmentSpec,
         environment: gymnasium.Env,
         observation_space: gymnasium.Space,
         transforms: Transforms,
         random_actions: RandomActions,
         texts: Texts,
     ) -> None:
-        self._name, self._environment, self._texts = name, environment, texts
+        self._name, self._spec, self._environment, self._texts = spec.id, spec, environment, texts
         self._observation_space = observation_space  # without what is left out
         self._transforms, self._random_actions = transforms, random_actions
         self._problems: list[str] = []
         self._masks: dict[str, np.ndarray] = {}  # of the next action
-        self._warnings: dict[str, str] = {}  # the first of each kind
+        self._warnings = {text: text for text in unsaved_statistics(environment)}  # the first of each kind
+        self._pixel_maxima = {  # the largest value seen in each image
+            name: 0
+            for name, each in transforms.spaces.observations.items()
+            if isinstance(each, ArraySpace) and each.is_image
+        }
         self._env_steps, self._resets = 0, 0
         self._step_seconds, self._busy_seconds, self._reset_seconds = 0.0, 0.0, 0.0
         self._lengths: list[int] = []
@@ -138,6 +166,7 @@ class _Play:
             busy_share=min(self._busy_seconds / max(self._step_seconds, 1e-9), 1.0),
             reset_seconds=self._reset_seconds / max(self._resets, 1),
             time_limit=getattr(self._environment.spec, "max_episode_steps", None),
+            pixel_maxima=self._pixel_maxima if self._env_steps else {},
             lengths=tuple(self._lengths),
             returns=tuple(self._returns),
         )
@@ -160,6 +189,7 @@ class _Play:
         self._env_steps += 1
         self._add(step_violations(self._observation_space, result))
         observation, reward, terminated, truncated, info = result
+        self._add(learned_reward_violations(float(reward), self._spec))
         over = bool(terminated or truncated)
         self._observe(observation, info, over=over)
         return float(reward), over
@@ -168,9 +198,12 @@ class _Play:
         """Take the masks of the next action. Raise _ProblemError if the run could not use the observation or them."""
         self._texts.add(observation)
         try:
-            self._masks = self._transforms.observe_one(observation, info.get(MASK_KEY), needed=not over).masks
+            observed = self._transforms.observe_one(observation, info.get(MASK_KEY), needed=not over)
         except ValueError as error:
             raise _ProblemError(str(error)) from None
+        self._masks = observed.masks
+        for name, largest in self._pixel_maxima.items():
+            self._pixel_maxima[name] = max(largest, int(observed.frames[name].max()))
 
     def _call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
         try:

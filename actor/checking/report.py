@@ -8,6 +8,7 @@ from daedalus.protocol.specification import Specification
 
 _SLOW_SECONDS = 0.005  # a step of a few milliseconds costs more than the exchange with another process
 _WIDE = 1e6  # from bound to bound of an action: the policy explores a hundredth of it to the end
+_SMALL_PIXEL = 16  # an image without a larger value is rather a map of numbers, such as the kinds of things in a grid
 _BUSY = 0.2  # share of processor time below which a step mostly waits, even on a busy machine
 
 
@@ -24,6 +25,7 @@ class EnvironmentReport(Specification):
     busy_share: float = 1.0  # processor time of the steps, as a share of their duration
     reset_seconds: float = 0.0  # mean
     time_limit: int | None = None  # at which gymnasium truncates episodes
+    pixel_maxima: dict[str, int] = Field(default_factory=dict)  # largest value seen in each image, by component
     lengths: tuple[int, ...] = ()  # of the episodes that ended
     returns: tuple[float, ...] = ()
 
@@ -35,6 +37,18 @@ class EnvironmentReport(Specification):
                 f"read: --set \"environment.leave_out=['{name}']\", or make numbers of it with --wrap MODULE:FUNCTION"
             )
         return ""
+
+
+def advice(report: EnvironmentReport, spec: RunSpec, processors: int) -> list[str]:
+    """Return advice for the run. See the functions below."""
+    texts = (
+        slow_steps(report, spec, processors),
+        float_images(report, spec),
+        stacked_images(report, spec),
+        small_pixels(report, spec),
+        uninformative_bounds(report),
+    )
+    return [text for text in texts if text]
 
 
 def slow_steps(report: EnvironmentReport, spec: RunSpec, processors: int) -> str:
@@ -79,10 +93,43 @@ def float_images(report: EnvironmentReport, spec: RunSpec) -> str:
     for name, space in report.spaces.observations.items():
         if not isinstance(space, ArraySpace) or space.dtype != "float32" or len(space.shape) != 3:
             continue
-        if space.model_copy(update={"dtype": "uint8"}).is_image:
+        if _is_shape_of_image(space.shape):
             return (
                 f"{name!r} is a {space}, which goes through a multilayer perceptron: if it is an image, "
                 "return bytes from 0 to 255 (Box of uint8), which get convolutions"
+            )
+    return ""
+
+
+def stacked_images(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if an array of four axes has the shape of several images, else an empty string."""
+    if report.spaces is None or spec.policy.encoder != "auto":
+        return ""
+    for name, space in report.spaces.observations.items():
+        if isinstance(space, ArraySpace) and len(space.shape) == 4 and _is_shape_of_image(space.shape[1:]):
+            return (
+                f"{name!r} is a {space}, which goes through a multilayer perceptron: one image has two or three axes; "
+                "return one, of uint8, and stack frames with environment.frame_stack"
+            )
+    return ""
+
+
+def _is_shape_of_image(shape: tuple[int, ...]) -> bool:
+    return ArraySpace(shape=shape, dtype="uint8").is_image
+
+
+def small_pixels(report: EnvironmentReport, spec: RunSpec) -> str:
+    """Return advice if an image has only small values, which the division by 255 makes nearly equal; else nothing."""
+    policy = spec.policy
+    if ":" in policy.encoder or (policy.encoder == "mlp" and policy.normalize_observations):
+        return ""
+    for name, largest in report.pixel_maxima.items():
+        if 0 < largest < _SMALL_PIXEL:
+            encoder = "" if policy.encoder == "mlp" else " --set policy.encoder=mlp"
+            normalized = "" if policy.normalize_observations else " --set policy.normalize_observations=true"
+            return (
+                f"{name!r} has no value above {largest}, and the encoder divides bytes by 255: if it is a map of small "
+                f"numbers, multiply it in a wrapper (--wrap), or use{encoder}{normalized}"
             )
     return ""
 

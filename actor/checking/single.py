@@ -1,5 +1,6 @@
 """One environment of any backend behind gymnasium's interface of a single environment."""
 
+from contextlib import suppress
 from typing import Any
 
 import gymnasium
@@ -10,6 +11,7 @@ from daedalus.actor.environments.gymnasium_backend import make_single
 from daedalus.actor.environments.interface import BackendEnvironments
 from daedalus.actor.environments.make import make_bare
 from daedalus.actor.environments.masks import MASK_KEY, only_of_masks
+from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModuleError, UserModules
 from daedalus.protocol.spec import EnvironmentSpec
 
@@ -59,6 +61,20 @@ def make_one(spec: EnvironmentSpec, modules: UserModules) -> tuple[gymnasium.Env
         raise EnvironmentSetupError(str(error)) from None
     single = make_single(spec, modules) if spec.backend in ("gymnasium", "fast") else None
     if single is not None:
+        _check_spaces(single, spec.id)
         return single, spec
     environments, rest = make_bare(spec.model_copy(update={"processes": False}), 1, modules)
     return OneOfVector(environments), rest
+
+
+def _check_spaces(environment: gymnasium.Env, name: str) -> None:
+    """Close an environment whose spaces cannot be read, and raise EnvironmentSetupError."""
+    for attribute in ("observation_space", "action_space"):
+        try:
+            getattr(environment, attribute)
+        except (Exception, SystemExit) as error:  # of the user's code
+            with suppress(Exception, SystemExit):
+                environment.close()
+            raise EnvironmentSetupError(
+                f"environment {name} has no {attribute} ({first_line(error)}): set it in the constructor"
+            ) from None

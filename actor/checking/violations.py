@@ -11,7 +11,8 @@ import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.leaves import LeftOut
-from daedalus.protocol.spaces import LARGEST_OBSERVATION
+from daedalus.protocol.spaces import LARGEST_OBSERVATION, LARGEST_REWARD
+from daedalus.protocol.spec import EnvironmentSpec
 
 Violation = tuple[str, str]  # "problem" or "warning", and the text
 
@@ -118,8 +119,18 @@ def _reward_violations(reward: Any) -> Iterator[Violation]:
     except (TypeError, ValueError):
         yield "problem", f"step returns the reward {_shown(reward)}: it must be a number"
         return
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
     if not math.isfinite(number):
         yield "problem", f"step returns the reward {number}: it must be finite"
+
+
+def learned_reward_violations(reward: float, spec: EnvironmentSpec) -> Iterator[Violation]:
+    """Yield what is wrong with a finite reward after the clipping and scaling of the run: the learner rejects it."""
+    clipped = abs(reward) if spec.reward_clip is None else min(abs(reward), spec.reward_clip)
+    if clipped * spec.reward_scale > LARGEST_REWARD:
+        limit = f"learning takes rewards within +-{LARGEST_REWARD:g}"
+        yield "problem", f"step returns the reward {reward:g}, but {limit}: set environment.reward_scale"
 
 
 def _structure(result: Any) -> str:

@@ -9,13 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from daedalus.actor.checking.report import (
-    EnvironmentReport,
-    float_images,
-    never_ends,
-    slow_steps,
-    uninformative_bounds,
-)
+from daedalus.actor.checking.report import EnvironmentReport, advice, never_ends
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.check_process import CheckTimeoutError, EnvironmentCheck, check_in_process
 from daedalus.cli.logs import print_error
@@ -159,9 +153,8 @@ def _choices(spec: RunSpec, network: str) -> Iterator[tuple[str, str]]:
 def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
     if report.problems:
         return []
-    slow = slow_steps(report, spec, os.cpu_count() or 1)
-    advice = (never_ends(report, spec), slow, float_images(report, spec), uninformative_bounds(report))
-    return [text for text in advice if text]
+    endless = never_ends(report, spec)
+    return [*([endless] if endless else []), *advice(report, spec, os.cpu_count() or 1)]
 
 
 def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:

@@ -8,14 +8,25 @@ import pytest
 from allowed_modules import TEST_MODULES
 from building import run_spec
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from gymnasium.wrappers import NormalizeObservation
 from plain import plain_spaces
 
 from daedalus.actor.checking.checker import gymnasium_notes
 from daedalus.actor.checking.play import check_environment
-from daedalus.actor.checking.report import EnvironmentReport, float_images, never_ends, slow_steps, uninformative_bounds
+from daedalus.actor.checking.report import (
+    EnvironmentReport,
+    advice,
+    float_images,
+    never_ends,
+    slow_steps,
+    stacked_images,
+    uninformative_bounds,
+)
+from daedalus.actor.checking.statistics import unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
+from daedalus.learner.serving import rollout_judge
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
+from daedalus.protocol.spaces import LARGEST_REWARD, ArraySpace, ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -149,6 +160,67 @@ def test_reward_that_is_no_number_is_a_problem(reward: object) -> None:
     assert text.endswith("it must be a number")
 
 
+def test_integer_that_no_float_holds_is_no_finite_reward() -> None:
+    ((kind, text),) = step_violations(Box(-1, 1, (2,)), (np.zeros(2, np.float32), 10**400, False, False, {}))
+    assert (kind, text) == ("problem", "step returns the reward inf: it must be finite")
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_problem"),
+    [({}, True), ({"reward_scale": 1e-4}, False), ({"reward_clip": 1.0}, False), ({"reward_scale": 0.1}, True)],
+)
+def test_reward_that_the_learner_rejects_is_a_problem(settings: dict[str, float], is_problem: bool) -> None:
+    report = check("large reward", **settings)
+    text = "step returns the reward -1e+12, but learning takes rewards within +-1e+09: set environment.reward_scale"
+    assert report.problems == ((f"environment {FAULTY}: {text} (after 1 env_steps)",) if is_problem else ())
+
+
+def test_largest_reward_is_that_of_the_learner() -> None:
+    assert rollout_judge._LARGEST["rewards"] == LARGEST_REWARD
+
+
+@pytest.mark.parametrize("attribute", ["observation_space", "action_space"])
+def test_environment_without_a_space_is_one_problem(attribute: str) -> None:
+    (problem,) = check(f"no {attribute}").problems
+    assert problem.startswith(f"environment {FAULTY} has no {attribute} (AttributeError: ")
+    assert problem.endswith("): set it in the constructor")
+    assert "\n" not in problem
+
+
+def test_space_of_evaluations_must_be_that_of_training() -> None:
+    """Else only the evaluation after the whole training would fail."""
+    (problem,) = check("", training_kwargs={"fault": "three numbers"}).problems
+    assert problem == (
+        f"environment {FAULTY}: evaluations, which play it without environment.training_kwargs, have observation: "
+        "float32 array of shape (2,); action: 2 choices, but training has observation: float32 array of shape (3,); "
+        "action: 2 choices"
+    )
+    (problem,) = check("constructor", training_kwargs={"fault": ""}).problems
+    assert problem.startswith(f"environment {FAULTY} cannot be created: FileNotFoundError: level.txt (")
+    assert problem.endswith(" (evaluations play it without environment.training_kwargs)")
+    assert check("", training_kwargs={"never_ends": True}).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "setting"),
+    [("NormalizeObservation", "policy.normalize_observations"), ("NormalizeReward", "training.normalize_rewards")],
+)
+@pytest.mark.parametrize("play", [True, False])
+def test_wrapper_with_statistics_that_are_not_saved_is_a_warning(wrapper: str, setting: str, play: bool) -> None:
+    spec = EnvironmentSpec(id="Pendulum-v1", wrap=f"gymnasium.wrappers:{wrapper}", action_repeat=2)
+    modules = UserModules(frozenset({"gymnasium.wrappers"}))
+    (warning,) = check_environment(spec, modules, seconds=60.0 if play else 0.0, env_steps=5).warnings
+    assert f"wrapper {wrapper} has statistics of its own in each environment, which are not saved: " in warning
+    assert f"use --set {setting}=true in its place" in warning
+
+
+def test_statistics_that_do_not_change_are_no_warning() -> None:
+    environment = NormalizeObservation(gymnasium.make("Pendulum-v1"))
+    assert len(unsaved_statistics(environment)) == 1
+    environment.update_running_mean = False  # loaded by the user
+    assert unsaved_statistics(environment) == ()
+
+
 def mission(*missions: str, leave_out: tuple[str, ...] = (), seconds: float = 60.0) -> EnvironmentReport:
     spec = EnvironmentSpec(
         id="mission_environment:Mission-v0", kwargs={"missions": list(missions)}, leave_out=leave_out
@@ -232,9 +304,50 @@ def test_an_environment_without_an_end_is_noted() -> None:
 )
 def test_an_image_of_floats_is_noted(shape: tuple[int, ...], dtype: Literal["float32", "uint8"], noted: bool) -> None:
     report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype=dtype), 2))
+    assert bool(advice(report, spec(), processors=2)) is noted
     assert ("if it is an image, return bytes from 0 to 255" in float_images(report, spec())) is noted
     chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "nature"})})
     assert not float_images(report, chosen)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint8"])
+@pytest.mark.parametrize(
+    ("shape", "noted"), [((4, 96, 96, 3), True), ((4, 1, 84, 84), True), ((4, 9, 9, 3), False), ((96, 96, 3), False)]
+)
+def test_several_images_in_one_array_are_noted(
+    shape: tuple[int, ...], dtype: Literal["float32", "uint8"], noted: bool
+) -> None:
+    report = EnvironmentReport(spaces=plain_spaces(ArraySpace(shape=shape, dtype=dtype), 2))
+    found = [text for text in advice(report, spec(), processors=2) if "environment.frame_stack" in text]
+    assert bool(found) is noted
+    chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update={"encoder": "mlp"})})
+    assert not stacked_images(report, chosen)
+
+
+@pytest.mark.parametrize(
+    ("value", "policy", "remedy"),
+    [
+        (3, {"normalize_observations": True}, "--set policy.encoder=mlp"),
+        (3, {}, "--set policy.encoder=mlp --set policy.normalize_observations=true"),
+        (3, {"encoder": "mlp"}, "--set policy.normalize_observations=true"),
+        (3, {"encoder": "mlp", "normalize_observations": True}, ""),
+        (3, {"encoder": "module:Own"}, ""),
+        (0, {}, ""),  # nothing is shown yet
+        (200, {}, ""),
+    ],
+)
+def test_image_of_small_values_is_noted(value: int, policy: dict[str, object], remedy: str) -> None:
+    """Its numbers are not normalised, and nearly equal after the division by 255."""
+    report = check("map", kwargs={"fault": "map", "value": value})
+    assert report.problems == ()
+    assert report.pixel_maxima == {"observation": value}
+    chosen = spec().model_copy(update={"policy": spec().policy.model_copy(update=policy)})
+    notes = [text for text in advice(report, chosen, processors=2) if "divides bytes by 255" in text]
+    expected = (
+        "'observation' has no value above 3, and the encoder divides bytes by 255: if it is a map of small numbers, "
+        f"multiply it in a wrapper (--wrap), or use {remedy}"
+    )
+    assert notes == ([expected] if remedy else [])
 
 
 @pytest.mark.parametrize(
