@@ -1,4 +1,4 @@
-"""Limit on the open queries of a client, by number and bytes. State with a lock, no threads."""
+"""Limits on the open queries of one client, by number and bytes, and of all together. State with a lock, no threads."""
 
 import threading
 from collections.abc import Callable
@@ -6,6 +6,23 @@ from collections.abc import Callable
 _HEARTBEAT_SECONDS = 0.2  # between checks of whether the client has disconnected
 _MAX_QUERIES = 64
 _MAX_BYTES = 64 << 20
+# Each open query has a thread. A client always has a few, and the rest is for those that come first: with 64 clients
+# (clients.py), there are at most 512 threads, and a client that takes all it can get leaves the others their own.
+_OWN_QUERIES = 4
+_SHARED_QUERIES = 256
+
+
+class QueryPool:
+    """The open queries of all clients, beyond those that each client always may have."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()  # guards the pool and its budgets
+        self.taken = 0
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more query may be open. With the lock held."""
+        return self.taken < _SHARED_QUERIES
 
 
 class QueryBudget:
@@ -14,8 +31,8 @@ class QueryBudget:
     The thread that reads the client's packets waits here, so TCP's flow control then makes the client wait.
     """
 
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
+    def __init__(self, pool: QueryPool) -> None:
+        self._pool, self._changed = pool, pool.changed
         self._queries = self._bytes = 0
         self._closed = False
 
@@ -29,19 +46,23 @@ class QueryBudget:
                 self._changed.wait(_HEARTBEAT_SECONDS)
                 if has_gone():
                     return False
+            self._pool.taken += self._queries >= _OWN_QUERIES
             self._queries += 1
             self._bytes += size
             return not self._closed
 
     def _has_room(self, size: int) -> bool:
+        if not self._queries:
+            return True
         fits = self._queries < _MAX_QUERIES and self._bytes + size <= _MAX_BYTES
-        return fits or not self._queries
+        return fits and (self._queries < _OWN_QUERIES or self._pool.has_room)
 
     def give_back(self, size: int) -> None:
-        """Release the bytes of a query that ended."""
+        """Release a query that ended, and its bytes."""
         with self._changed:
             self._queries -= 1
             self._bytes -= size
+            self._pool.taken -= self._queries >= _OWN_QUERIES
             self._changed.notify_all()
 
     def close(self) -> None:

@@ -1,9 +1,11 @@
-"""Limits on the number of clients and on the bytes held for them. State with a lock, no threads."""
+"""Limits on the number of clients, and on the bytes and queries of all. State with a lock, no threads."""
 
 import threading
 import time
 from dataclasses import dataclass
 from typing import Protocol
+
+from daedalus.gateway.raw.budget import QueryPool
 
 MAX_RAW_CLIENTS = 64  # that have sent a packet
 _MAX_NEW_CONNECTIONS = 64  # that have not sent a packet yet
@@ -32,6 +34,7 @@ class ClientTable:
     """Decides which clients a gateway serves, and drops the client that takes too much."""
 
     def __init__(self) -> None:
+        self.queries = QueryPool()
         self._lock = threading.Lock()
         self._usage: dict[Client, _Usage] = {}  # oldest first
 

@@ -17,6 +17,7 @@ from daedalus.gateway.raw.budget import QueryBudget
 from daedalus.gateway.raw.clients import MAX_RAW_CLIENTS, ClientTable
 from daedalus.gateway.raw.packet_socket import PacketSocket
 from daedalus.gateway.raw.packets import MAX_ANSWER_BYTES, Kind, Packet, PacketError, fits_packet, is_own_key
+from daedalus.gateway.raw.thread_errors import thread_errors
 from daedalus.transport.interface import Inbox, Transport, TransportError
 
 _MAX_DECLARATIONS = 64  # of FOLLOW, WATCH and ANNOUNCE by one client
@@ -40,7 +41,7 @@ class RawConnection:
         self._open_transport = open_transport
         self._clients = clients
         self._transport: Transport | None = None
-        self._budget = QueryBudget()
+        self._budget = QueryBudget(clients.queries)
         self._changed = threading.Condition()  # guards the next six attributes
         self._closed = False
         self._reason = ""  # why the gateway ended the connection
@@ -102,10 +103,12 @@ class RawConnection:
     def _serve(self) -> None:
         if not self._clients.admit(self):
             raise PacketError(f"{MAX_RAW_CLIENTS} clients are connected already: try again later")
-        transport = self._open_transport()
+        with thread_errors():
+            transport = self._open_transport()  # it connects on a thread of its own
         if not self._keep(transport):
             return
-        threading.Thread(target=self._send_news, name="raw-news", daemon=True).start()
+        with thread_errors():
+            threading.Thread(target=self._send_news, name="raw-news", daemon=True).start()
         while (packet := self._socket.next(lambda size: self._clients.hold(self, size))) is not None:
             self._clients.heard(self)
             self._perform(transport, packet)
@@ -114,9 +117,7 @@ class RawConnection:
         if self._only is not None and not is_own_key(packet.key, self._only):
             raise PacketError(f"this client may act as {self._only} only, not use the key {packet.key}")
         if packet.kind == Kind.QUERY:
-            if not self._budget.take(len(packet.payload), self._socket.has_gone):
-                raise ConnectionAbortedError
-            threading.Thread(target=self._run_query, args=(transport, packet), name="raw-query", daemon=True).start()
+            self._start_query(transport, packet)
             return
         self._declared += 1
         if self._declared > _MAX_DECLARATIONS:
@@ -134,6 +135,17 @@ class RawConnection:
                 self._inboxes[number] = packet.key, inbox
             self._on_news(number)  # values that arrived before the inbox had its number
 
+    def _start_query(self, transport: Transport, packet: Packet) -> None:
+        if not self._budget.take(len(packet.payload), self._socket.has_gone):
+            raise ConnectionAbortedError
+        try:
+            with thread_errors():
+                run, arguments = self._run_query, (transport, packet)
+                threading.Thread(target=run, args=arguments, name="raw-query", daemon=True).start()
+        except PacketError:
+            self._end_query(packet, len(packet.payload))
+            raise
+
     # ---------------------------------------------------------------------------------------- query threads
 
     def _run_query(self, transport: Transport, packet: Packet) -> None:
@@ -150,8 +162,11 @@ class RawConnection:
         except (OSError, TransportError):
             self.close()  # the connection or the transport has failed
         finally:
-            self._clients.release(self, held)
-            self._budget.give_back(len(packet.payload))
+            self._end_query(packet, held)
+
+    def _end_query(self, packet: Packet, held: int) -> None:
+        self._clients.release(self, held)
+        self._budget.give_back(len(packet.payload))
 
     # ------------------------------------------------------------------ callbacks on the transport's threads
 

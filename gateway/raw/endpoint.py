@@ -16,6 +16,8 @@ from daedalus.gateway.channel import channel_of
 from daedalus.gateway.errors import ClientError
 from daedalus.gateway.raw.clients import ClientTable
 from daedalus.gateway.raw.connection import RawConnection
+from daedalus.gateway.raw.packets import PacketError
+from daedalus.gateway.raw.thread_errors import thread_errors
 from daedalus.gateway.security import Guard
 from daedalus.transport.interface import Transport
 
@@ -40,7 +42,7 @@ class RawEndpoint:
         """
         self._open_transport, self._guard, self._actor_name = open_transport, guard, actor_name
         self._table = ClientTable()
-        self._clients: set[RawConnection] = set()
+        self._clients: set[RawConnection] = set()  # whose threads have not ended
 
     async def serve(self, scope: Any, receive: Any, send: Any) -> None:
         """Serve one client until one side ends the connection."""
@@ -48,32 +50,36 @@ class RawEndpoint:
         await send({"type": "websocket.accept"})
         try:
             name = await self._greet(receive)
+            if name is None:
+                return
+            client, ours = self._begin(name)
         except ClientError as error:
             await send({"type": "websocket.send", "text": messages.encode(messages.error(error), as_text=True)})
-            await send({"type": "websocket.close", "code": 1008})
+            await send({"type": "websocket.close", "code": 1013 if error.code == "unavailable" else 1008})
             return
-        if name is None:
-            return
-        channel_of(scope).become_stream(MAX_CHUNK_BYTES)
+        try:
+            channel_of(scope).become_stream(MAX_CHUNK_BYTES)
+            await _carry(ours, receive, send)
+        finally:
+            client.drop("")  # its thread closes the transport, for which it may have to wait
+
+    def _begin(self, name: str) -> tuple[RawConnection, socket.socket]:
+        """Return a client with its thread, and our end of its socket. Raises ClientError."""
         ours, theirs = socket.socketpair()
         only = name if self._guard.tokens is not None else None
         client = RawConnection(theirs, self._open_transport, self._table, only)
         self._table.connect(client)
         self._clients.add(client)
-        threading.Thread(target=self._run, args=(client, name), name="raw-client", daemon=True).start()
-        reader, writer = await asyncio.open_connection(sock=ours)
-        up = asyncio.create_task(_pass_up(receive, writer))
         try:
-            while data := await reader.read(_READ_BYTES):
-                await send({"type": "websocket.send", "bytes": data})
-            await send({"type": "websocket.close", "code": 1000})
-        except OSError:
-            pass  # the client disconnected
-        finally:
-            up.cancel()
-            client.close()
-            writer.close()
+            with thread_errors():
+                threading.Thread(target=self._run, args=(client, name), name="raw-client", daemon=True).start()
+        except PacketError as error:
+            ours.close()
+            theirs.close()
+            self._table.remove(client)
             self._clients.discard(client)
+            raise ClientError("unavailable", str(error)) from None
+        return client, ours
 
     async def _greet(self, receive: Any) -> str | None:
         """Return the name of a client that may connect; None if it disconnected."""
@@ -90,7 +96,10 @@ class RawEndpoint:
 
     def _run(self, client: RawConnection, name: str) -> None:
         _logger.info("%s exchanges messages of the wire", name)
-        reason = client.run()
+        try:
+            reason = client.run()
+        finally:
+            self._clients.discard(client)
         if reason:
             _logger.warning("%s was disconnected: %s", name, reason)
         else:
@@ -103,6 +112,21 @@ class RawEndpoint:
         deadline = asyncio.get_running_loop().time() + _END_SECONDS
         while self._clients and asyncio.get_running_loop().time() < deadline:
             await asyncio.sleep(0.01)
+
+
+async def _carry(ours: socket.socket, receive: Any, send: Any) -> None:
+    """Move bytes between a WebSocket and the socket of the client's thread, until one of them ends."""
+    reader, writer = await asyncio.open_connection(sock=ours)
+    up = asyncio.create_task(_pass_up(receive, writer))
+    try:
+        while data := await reader.read(_READ_BYTES):
+            await send({"type": "websocket.send", "bytes": data})
+        await send({"type": "websocket.close", "code": 1000})
+    except OSError:
+        pass  # the client disconnected
+    finally:
+        up.cancel()
+        writer.close()
 
 
 async def _pass_up(receive: Any, writer: asyncio.StreamWriter) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import ssl
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from daedalus.cli.commands.certs import certs
+from daedalus.gateway.raw.connection import RawConnection
 from daedalus.gateway.raw.packets import GREETING, Kind, Packet, encode_packet, is_own_key
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
@@ -91,6 +93,50 @@ def test_client_that_does_not_greet_is_told_why(
     assert json.loads(client.socket.recv(timeout=LIMIT))["type"] == "error"
     with pytest.raises(ConnectionClosed):
         client.socket.recv(timeout=LIMIT)
+
+
+def test_client_for_which_no_thread_can_be_started_may_try_again(
+    gateway: RunningGateway, stack: contextlib.ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = threading.Thread.start
+
+    def refuse(self: threading.Thread) -> None:
+        if self.name == "raw-client":
+            raise RuntimeError("can't start new thread")
+        start(self)
+
+    with monkeypatch.context() as full:
+        full.setattr(threading.Thread, "start", refuse)
+        client = RawClient(stack, gateway.port)
+        client.socket.send(json.dumps(HELLO))
+        error = json.loads(client.socket.recv(timeout=LIMIT))
+        assert (error["code"], "too many threads" in error["reason"]) == ("unavailable", True)
+        with pytest.raises(ConnectionClosed) as closed:
+            client.socket.recv(timeout=LIMIT)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1013
+    RawClient(stack, gateway.port).begin()
+
+
+def test_transport_of_a_client_is_closed_on_its_own_thread(
+    gateway: RunningGateway, stack: contextlib.ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A congested link makes it wait, and the event loop serves all clients."""
+    threads: set[str] = set()
+    dropped = threading.Event()
+    close, drop = MemoryTransport.close, RawConnection.drop
+    monkeypatch.setattr(
+        MemoryTransport, "close", lambda self: threads.add(threading.current_thread().name) or close(self)
+    )
+    monkeypatch.setattr(RawConnection, "drop", lambda self, reason: drop(self, reason) or dropped.set())
+    client = RawClient(stack, gateway.port)
+    client.begin()
+    client.send(Kind.QUERY, 1, "daedalus/r/status")
+    client.expect(Packet(Kind.END, 1))
+    client.socket.close()
+    assert dropped.wait(LIMIT), "the event loop has done its part"
+    until(lambda: threads)
+    assert threads == {"raw-client"}
 
 
 def test_broken_packet_ends_the_connection_with_the_reason(
