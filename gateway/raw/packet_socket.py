@@ -20,7 +20,7 @@ from daedalus.gateway.raw.packets import (
 HANDSHAKE_SECONDS = 10.0  # from the connection to the first packet
 STALL_SECONDS = 30.0  # a client that stalls for longer, or stops within a packet, is disconnected
 _SLOWEST_RATE = 64 << 10  # bytes a second: a payload has so much more time
-_CHUNK_BYTES = 64 << 10  # allocate memory for bytes received, not for bytes declared
+_CHUNK_BYTES = 64 << 10  # of one call: memory is allocated for bytes received, not for bytes declared
 
 
 class PacketSocket:
@@ -33,7 +33,7 @@ class PacketSocket:
     def greet(self) -> bool:
         """Exchange greetings, and wait for the first packet; return False if the client disconnected instead."""
         deadline = time.monotonic() + HANDSHAKE_SECONDS
-        self._connection.settimeout(STALL_SECONDS)  # of `sendall`, for one packet
+        self._connection.settimeout(STALL_SECONDS)  # of each `sendall`
         self._connection.sendall(GREETING)
         late = f"the client sent no packet within {HANDSHAKE_SECONDS:g} s"
         if self._read(len(GREETING), deadline, late) != GREETING:
@@ -79,14 +79,16 @@ class PacketSocket:
         return bool(poll.poll(None if deadline is None else max(deadline - time.monotonic(), 0.0) * 1000))
 
     def send(self, packet: Packet) -> None:
-        """Send a packet, after those of other threads."""
+        """Send a packet, after those of other threads. The client has `STALL_SECONDS` to read each 64 KiB."""
         head = encode_head(packet)
         with self._sending:
             if len(packet.payload) < _CHUNK_BYTES:
                 self._connection.sendall(head + packet.payload)
             else:  # without a copy of the payload
                 self._connection.sendall(head)
-                self._connection.sendall(packet.payload)
+                payload = memoryview(packet.payload)
+                for first in range(0, len(payload), _CHUNK_BYTES):
+                    self._connection.sendall(payload[first : first + _CHUNK_BYTES])
 
     def has_gone(self) -> bool:
         """Return whether the client closed its end, even if bytes that it sent before are still unread."""

@@ -6,16 +6,19 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any, ClassVar
 
 import pytest
 from log_lines import LINES
 from processes import LIMIT, until
 
-from daedalus.gateway.raw import clients, packet_socket
+from daedalus.gateway.raw import budget, clients, packet_socket
 from daedalus.gateway.raw.clients import ClientTable
 from daedalus.gateway.raw.connection import RawConnection
+from daedalus.gateway.raw.packet_socket import PacketSocket
 from daedalus.gateway.raw.packets import GREETING, HEADER_BYTES, MAX_QUERY_BYTES, Kind, Packet, encode_packet
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.gateway.raw.thread_errors import thread_errors
+from daedalus.transport.interface import Request, Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
 
 HEADER = struct.Struct("<IBBHI")  # written out again, independent of the code
@@ -63,7 +66,7 @@ class Scene:
         self.open: Callable[[], Transport] = lambda: MemoryTransport(self.network)
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        self._table = ClientTable()
+        self.table = ClientTable()
         self._clients: list[tuple[RawConnection, threading.Thread]] = []
         self._accepting = threading.Thread(target=self._accept, daemon=True)
         self._accepting.start()
@@ -73,8 +76,8 @@ class Scene:
         with contextlib.suppress(OSError):  # the listener was shut down
             while True:
                 connection, _ = self._listener.accept()
-                client = RawConnection(connection, lambda: self.open(), self._table)
-                self._table.connect(client)
+                client = RawConnection(connection, lambda: self.open(), self.table)
+                self.table.connect(client)
                 thread = threading.Thread(target=self._run, args=(client,), daemon=True)
                 self._clients.append((client, thread))
                 thread.start()
@@ -237,6 +240,24 @@ def test_client_that_stalls_within_a_packet_is_disconnected(scene: Scene, monkey
     assert caller.ended()
 
 
+def test_each_part_of_a_large_answer_has_a_time_limit_of_its_own() -> None:
+    """`sendall` has one time limit for all that it is given, however steadily the client reads."""
+
+    class Recorder(socket.socket):
+        """A socket that only records what it sends."""
+
+        parts: ClassVar[list[bytes]] = []
+
+        def sendall(self, data: Any, flags: int = 0) -> None:
+            self.parts.append(bytes(data))
+
+    packet = Packet(Kind.ANSWER, 1, payload=bytes(range(256)) * 1000)
+    with Recorder() as connection:
+        PacketSocket(connection).send(packet)
+    assert b"".join(Recorder.parts) == encode_packet(packet)
+    assert max(map(len, Recorder.parts)) == 64 << 10
+
+
 def test_queries_beyond_the_budget_wait_in_the_connection(scene: Scene) -> None:
     held = []
     scene.end.serve("daedalus/r/rollouts/*", held.append)
@@ -263,6 +284,61 @@ def test_disconnection_is_noticed_while_the_budget_is_full(scene: Scene) -> None
     caller.socket.close()
     until(lambda: len(scene.network.ends) == 1)
     held.clear()
+
+
+def test_client_that_takes_all_queries_leaves_others_their_own(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "_OWN_QUERIES", 2)
+    monkeypatch.setattr(budget, "_SHARED_QUERIES", 3)
+    held: list[Request] = []
+    scene.end.serve("daedalus/r/rollouts/*", held.append)
+
+    def of(name: str) -> list[Request]:
+        return [request for request in list(held) if request.key.endswith(name)]
+
+    greedy, other = scene.call(), scene.call()
+    for number in range(9):
+        greedy.send(Kind.QUERY, number, "daedalus/r/rollouts/greedy")
+    until(lambda: len(of("greedy")) == 5)
+    for number in range(3):
+        other.send(Kind.QUERY, number, "daedalus/r/rollouts/other")
+    until(lambda: len(of("other")) == 2)
+    assert not threading.Event().wait(0.2)
+    assert (len(of("greedy")), len(of("other"))) == (5, 2)
+    greedy.socket.close()
+    until(lambda: len(scene.network.ends) == 2)
+    for request in of("greedy"):
+        request.reply(b"late")  # their threads end
+    until(lambda: len(of("other")) == 3)
+    for request in of("other"):
+        request.reply(b"accepted")
+    assert sorted(other.next()[0] for _ in range(6)) == [Kind.ANSWER] * 3 + [Kind.END] * 3
+    until(lambda: scene.table.queries.taken == 0)
+
+
+@pytest.mark.parametrize("thread", ["raw-query", "raw-news"])
+def test_client_for_which_no_thread_can_be_started_is_disconnected(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, thread: str
+) -> None:
+    start = threading.Thread.start
+
+    def refuse(self: threading.Thread) -> None:
+        if self.name == thread:
+            raise RuntimeError("can't start new thread")
+        start(self)
+
+    with monkeypatch.context() as full:
+        full.setattr(threading.Thread, "start", refuse)
+        caller = scene.call()
+        caller.send(Kind.QUERY, 1, "daedalus/r/status")
+        assert caller.next() == (Kind.ERROR, 0, "", b"the gateway has too many threads: try again later")
+        assert caller.ended()
+        until(lambda: len(scene.network.ends) == 1)
+    use(scene, scene.call())
+
+
+def test_other_errors_at_the_start_of_a_thread_are_ours() -> None:
+    with pytest.raises(RuntimeError, match="a fault of ours"), thread_errors():
+        raise RuntimeError("a fault of ours")
 
 
 def test_number_of_followed_keys_is_limited(scene: Scene) -> None:
