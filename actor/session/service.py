@@ -247,6 +247,7 @@ def _check_size(payload: bytes, spec: RunSpec) -> None:
     if len(payload) > spec.service.queue_bytes:
         raise ActorError(
             f"a rollout of this actor has {len(payload) / 2**20:.1f} MiB, and the learner takes at most "
-            f"{spec.service.queue_megabytes:g} MiB: use fewer environments (--envs), or raise service.queue_megabytes "
-            "of the run"
+            f"{spec.service.queue_megabytes:g} MiB: set fewer environments (collection.envs_per_actor, "
+            "or --envs of daedalus actor) or shorter rollouts (collection.rollout_length), or raise "
+            "service.queue_megabytes of the run"
         )

@@ -143,7 +143,8 @@ def test_actor_whose_rollouts_the_learner_cannot_take_ends_with_the_setting_to_r
     learner.publish(0)
     actor.join()
     assert isinstance(actor.error, ActorError)
-    assert "fewer environments (--envs), or raise service.queue_megabytes" in str(actor.error)
+    for setting in ("collection.envs_per_actor", "collection.rollout_length", "service.queue_megabytes"):
+        assert setting in str(actor.error)
     assert learner.rollouts.empty()
 
 
