@@ -35,7 +35,7 @@ from daedalus.transport.interface import Transport, TransportError
 
 _logger = logging.getLogger("daedalus.cli")
 
-_HEARTBEAT_SECONDS = 0.2
+_POLL_SECONDS = 0.2
 _FORBIDDEN = (
     "this gateway connects with the certificate of an actor, which may not read the status of the run: start it with "
     "--operator certs/operator too"
@@ -124,7 +124,7 @@ class GatewayService:
 
     async def _await_stop(self) -> None:
         while not self._stop.is_set():
-            await asyncio.sleep(_HEARTBEAT_SECONDS)
+            await asyncio.sleep(_POLL_SECONDS)
         self._ended.set()
 
     async def _reach_network(self) -> None:

@@ -9,10 +9,15 @@ from daedalus.policy.user_modules import shown_path
 _NOT_OF_USERS = {"daedalus", "gymnasium", "numpy", "torch", *sys.stdlib_module_names}  # packages
 
 
+def message_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its type if it has none."""
+    lines = str(error).strip().splitlines()
+    return lines[0].strip() if lines else type(error).__name__
+
+
 def first_line(error: BaseException) -> str:
     """Return the type of an error and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
+    return f"{type(error).__name__}: {message_line(error)}" if str(error).strip() else type(error).__name__
 
 
 def frames_of(error: BaseException | None) -> Iterator[TracebackType]:

@@ -26,7 +26,7 @@ from daedalus.transport.interface import Transport
 _logger = logging.getLogger(__name__)
 
 _DEFAULT_SECONDS = 60.0  # between evaluations, unless the run says otherwise
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices the end of the run
+_POLL_SECONDS = 0.2  # how soon a wait notices the end of the run
 
 
 class Evaluator:
@@ -81,7 +81,7 @@ class Evaluator:
             due = time.monotonic() + interval
             for number in itertools.count():
                 while (now := time.monotonic()) < due:
-                    self._end.wait(min(due - now, _HEARTBEAT_SECONDS))
+                    self._end.wait(min(due - now, _POLL_SECONDS))
                 due = time.monotonic() + interval
                 # An actor's seed is made of other numbers: no episode of training is evaluated here.
                 seed = int(np.random.SeedSequence([welcome.seed, spec.training.seed, number]).generate_state(1)[0])

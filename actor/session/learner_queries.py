@@ -33,7 +33,7 @@ _logger = logging.getLogger(__name__)
 _ANSWER_SECONDS = 5.0  # for a query that is answered at once
 _UPDATE_SECONDS = 60.0  # for a query that is answered between two updates, which may be slow
 _REPORT_SECONDS, _MAX_FAILURE = 2.0, 300  # for the report of a failure, and its length in characters
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
+_POLL_SECONDS = 0.2  # how soon a wait notices `stop`
 _FIRST_RETRY_SECONDS, _MAX_RETRY_SECONDS = 0.02, 1.0
 _NAME_IN_USE_SECONDS = 10.0  # until the network notices that an earlier incarnation of this actor is dead
 _LOOK_AROUND_SECONDS, _MAX_RUNS = 10.0, 10  # between looks for other runs, and how many are named
@@ -210,7 +210,7 @@ class LearnerQueries:
         while True:
             end.check()
             with contextlib.suppress(queue.Empty):
-                answer = answers.get(timeout=_HEARTBEAT_SECONDS)
+                answer = answers.get(timeout=_POLL_SECONDS)
                 return None if answer is None else self.decode(answer)
 
     def _ask(self, key: str, payload: bytes = b"") -> list[Message]:

@@ -23,8 +23,8 @@ from daedalus.actor.session.session_monitor import SessionMonitor
 from daedalus.actor.session.snapshot_feed import SnapshotFeed
 from daedalus.actor.session.snapshot_source import SnapshotSource
 from daedalus.actor.session.state_lock import StateLock
+from daedalus.actor.session.upload_maker import RolloutUploadMaker, UploadMaker, make_upload_maker
 from daedalus.actor.session.upload_session import UploadSession
-from daedalus.actor.session.uploads import RolloutUploads, Uploads, make_uploads
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
@@ -70,16 +70,16 @@ class ActorService:
         self._lock = StateLock()
         self._queries = LearnerQueries(transport)
         self._presence = LearnerPresence(self._lock)
-        self._uploads = UploadSession(transport, config.name, self._presence, self._lock)
+        self._upload_session = UploadSession(transport, config.name, self._presence, self._lock)
         self._end = RunEndWatch(transport, stop, self._lock.announce_change)
         self._monitor = SessionMonitor(
-            self._uploads, self._presence, self._queries, self._join, self._lock, self._end, self._on_heartbeat
+            self._upload_session, self._presence, self._queries, self._join, self._lock, self._end, self._on_poll
         )
         self._feed = SnapshotFeed(transport, self._queries, self._end, config.name, self._presence.heard)
-        self._snapshots = SnapshotSource(self._feed, self._monitor, self._uploads)
+        self._snapshots = SnapshotSource(self._feed, self._monitor, self._upload_session)
         self._runtimes = RuntimeMaker(config, self._queries, self._feed, self._monitor, self._end, stop)
         self._reports = None if report is None else ClientReports(transport, report)
-        self._contents: Uploads = RolloutUploads()  # what is uploaded of the rollouts
+        self._upload_maker: UploadMaker = RolloutUploadMaker()  # what is uploaded of the rollouts
         self._runs: set[str] = set()  # in which this actor's presence is declared
         self._learner_epoch = -1
         self._sequence = 0  # of the next rollout in this learner epoch
@@ -140,16 +140,16 @@ class ActorService:
         if confirmed.learner_epoch != welcome.learner_epoch:
             raise LearnerLostError
         if welcome.learner_epoch == self._learner_epoch:  # the network failed, not the learner
-            self._uploads.resume()
+            self._upload_session.resume()
         else:
-            self._uploads.begin(welcome.run, welcome.spec.collection.window)
+            self._upload_session.begin(welcome.run, welcome.spec.collection.window)
             self._learner_epoch, self._sequence = welcome.learner_epoch, 0
         if self._config.link == "wan" and not welcome.spec.algorithm.synchronous:
             self._feed.use_compact_snapshots()
         _logger.info("joined run %r as %r: %d x %s", welcome.run, self._config.name, count, welcome.spec.environment.id)
         runtime = self._runtimes.make(confirmed, spaces, count)
         self._collector.begin(runtime, confirmed.spec, confirmed.seed, confirmed.epsilon)
-        self._contents = make_uploads(confirmed.spec, spaces, self._config.modules)
+        self._upload_maker = make_upload_maker(confirmed.spec, spaces, self._config.modules)
         if confirmed.spec.algorithm.synchronous:
             self._feed.subscribe()
         self._collect_and_upload(confirmed)
@@ -174,13 +174,13 @@ class ActorService:
             self._warn_of_rejections()
             self._load(snapshot if synchronous else self._snapshots.newest(waited))
             began = time.monotonic()
-            payload = encode(self._contents.compute(self._collect(welcome.learner_epoch)))
+            payload = encode(self._upload_maker.compute(self._collect(welcome.learner_epoch)))
             if self._config.link == "auto" and self._snapshots.rollouts_are_slow:
                 self._feed.use_differences()
             if self._feed.is_slow:
-                self._uploads.size_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
+                self._upload_session.size_window(time.monotonic() - began, window, max(window, _SLOW_LINK_WINDOW))
             _check_size(payload, welcome.spec)
-            self._uploads.send(self._sequence, payload)
+            self._upload_session.send(self._sequence, payload)
             self._sequence += 1
             if synchronous:
                 snapshot = self._snapshots.await_newer(self._loaded_version)
@@ -194,11 +194,11 @@ class ActorService:
     def _load(self, snapshot: Snapshot) -> None:
         if snapshot.policy_version != self._loaded_version:
             self._collector.load(snapshot)
-            self._contents.load(snapshot.weights)
+            self._upload_maker.load(snapshot.weights)
             self._loaded_version = snapshot.policy_version
         self._collector.confirm(self._feed.confirmed_at)
 
-    def _on_heartbeat(self) -> None:
+    def _on_poll(self) -> None:
         """Report, and keep the policy from growing too old, in every wait: its learner may be busy for long."""
         if self._reports is not None:
             self._reports.send_if_due(self._end.run)
@@ -231,7 +231,7 @@ class ActorService:
 
     def _warn_of_rejections(self) -> None:
         """Warn once that the learner rejects every rollout; it quarantines senders of unfit rollouts much earlier."""
-        count, reason = self._uploads.rejections
+        count, reason = self._upload_session.rejections
         if count >= _MANY_REJECTIONS and not self._warned_of_rejections:
             self._warned_of_rejections = True
             _logger.warning(

@@ -11,7 +11,7 @@ from daedalus.actor.session.state_lock import StateLock
 from daedalus.actor.session.upload_session import UploadSession
 from daedalus.protocol.messages import Join
 
-_HEARTBEAT_SECONDS = 0.2  # how soon a wait notices `stop`
+_POLL_SECONDS = 0.2  # how soon a wait notices `stop`
 _SILENCE_SECONDS = 10.0  # without a message for so long, the actor asks whether the learner is there
 
 
@@ -26,17 +26,17 @@ class SessionMonitor:
         join: Join,
         lock: StateLock,
         end: RunEndWatch,
-        on_heartbeat: Callable[[], None],
+        on_poll: Callable[[], None],
     ) -> None:
         """Construct the monitor.
 
         Args:
           uploads, presence, queries, lock, end: of the session.
           join: the request that asks whether the learner is there.
-          on_heartbeat: called in every wait, at least five times a second. It may raise as `check` does.
+          on_poll: called in every wait, at least five times a second. It may raise as `check` does.
         """
-        self._uploads, self._presence, self._queries, self._join = uploads, presence, queries, join
-        self._lock, self._end, self._on_heartbeat = lock, end, on_heartbeat
+        self._upload_session, self._presence, self._queries, self._join = uploads, presence, queries, join
+        self._lock, self._end, self._on_poll = lock, end, on_poll
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> bool:
         """Wait until `ready` returns True; return False if `timeout` seconds pass first. Raises as `check` does.
@@ -46,9 +46,9 @@ class SessionMonitor:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
-            self._uploads.send_due()
+            self._upload_session.send_due()
             self._probe_if_silent()
-            self._on_heartbeat()
+            self._on_poll()
             changes = self._lock.changes
             self.check()
             if ready():
@@ -58,13 +58,13 @@ class SessionMonitor:
             if deadline is not None and now >= deadline:
                 return False
             with self._lock:
-                due = self._uploads.in_flight.next_due()
-            until = min(moment for moment in (deadline, due, now + _HEARTBEAT_SECONDS) if moment is not None)
+                due = self._upload_session.in_flight.next_due()
+            until = min(moment for moment in (deadline, due, now + _POLL_SECONDS) if moment is not None)
             self._lock.wait_for_change(changes, max(until - now, 0.0))
 
     def wait_for_room(self) -> None:
         """Wait until one more rollout may be collected and sent. Raises as `check` does."""
-        self.wait(lambda: self._uploads.in_flight.has_room)
+        self.wait(lambda: self._upload_session.in_flight.has_room)
 
     def wait_for_message(self, timeout: float) -> None:
         """Wait for any message of the learner, at most `timeout` seconds. Raises as `check` does."""
@@ -82,7 +82,7 @@ class SessionMonitor:
         self.check_over()  # after the presence was read: a learner that finished says so before it leaves
         if self._end.learner_stopped:
             raise LearnerLostError("the learner was stopped; waiting for it to return")
-        if left or self._uploads.in_flight.ended_by == "fenced":
+        if left or self._upload_session.in_flight.ended_by == "fenced":
             raise LearnerLostError
 
     def check_over(self) -> None:
@@ -92,7 +92,7 @@ class SessionMonitor:
         """
         self._end.check()
         with self._lock:
-            ended_by, reason = self._uploads.in_flight.ended_by, self._uploads.in_flight.reason
+            ended_by, reason = self._upload_session.in_flight.ended_by, self._upload_session.in_flight.reason
         if ended_by == "quarantined":
             raise ActorRefusedError(
                 f"the learner quarantined this actor: {reason}; fix the cause and restart the actor"
@@ -109,6 +109,6 @@ class SessionMonitor:
         """
         if time.monotonic() > self._presence.heard_at + _SILENCE_SECONDS:
             self._end.check()  # a request may take 5 s
-            if not self._queries.learner_responds(self._uploads.run, self._join):
+            if not self._queries.learner_responds(self._upload_session.run, self._join):
                 raise LearnerLostError
             self._presence.heard()

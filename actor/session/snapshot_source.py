@@ -17,7 +17,7 @@ class SnapshotSource:
     """The choice of snapshots in one session with a learner."""
 
     def __init__(self, feed: SnapshotFeed, monitor: SessionMonitor, uploads: UploadSession) -> None:
-        self._feed, self._monitor, self._uploads = feed, monitor, uploads
+        self._feed, self._monitor, self._upload_session = feed, monitor, uploads
         self._schedule = FetchSchedule()
         self._slow_rollouts = 0  # in a row
 
@@ -37,7 +37,7 @@ class SnapshotSource:
 
     def fetch_if_due(self) -> None:
         """Request the snapshot of the next rollout, if this one is about to end and the next can begin at once."""
-        if self._schedule.is_due(time.monotonic()) and self._uploads.in_flight.has_room_for(2):
+        if self._schedule.is_due(time.monotonic()) and self._upload_session.in_flight.has_room_for(2):
             self._feed.fetch()
 
     def await_newer(self, version: int) -> Snapshot:
@@ -50,7 +50,7 @@ class SnapshotSource:
 
         def ready() -> bool:
             self._feed.read()
-            newest, in_flight = self._feed.newest, self._uploads.in_flight
+            newest, in_flight = self._feed.newest, self._upload_session.in_flight
             if newest is not None and newest.policy_version > version:
                 return True
             return in_flight.last_was_rejected and not first and in_flight.newest_version <= version
@@ -59,7 +59,7 @@ class SnapshotSource:
         while not self._monitor.wait(ready, pause):
             pause = min(2 * pause, MISSED_PUSH_SECONDS)
             self._feed.request_newest()
-        self._uploads.clear_rejection()
+        self._upload_session.clear_rejection()
         return self._newest()
 
     def newest(self, waited: float) -> Snapshot:
@@ -80,7 +80,7 @@ class SnapshotSource:
 
     def _read(self) -> Snapshot:
         self._feed.read()
-        self._feed.request_compact_if_behind(self._uploads.in_flight.newest_version)
+        self._feed.request_compact_if_behind(self._upload_session.in_flight.newest_version)
         return self._newest()
 
     def _newest(self) -> Snapshot:

@@ -19,6 +19,7 @@ from daedalus.learner.ranks.parts import bounds_of
 from daedalus.learner.run.settings import SettingsError
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_code import message_line
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import Spaces
 
@@ -81,8 +82,7 @@ class Follower:
 
     def _refused(self, error: Exception) -> RanksDisagreeError:
         """Report an error to rank 0, and return it with the name of this rank."""
-        first_line = next(iter(str(error).splitlines()), "")
-        text = f"rank {self._group.rank} on {socket.gethostname()}: {first_line}"
+        text = f"rank {self._group.rank} on {socket.gethostname()}: {message_line(error)}"
         self._group.report(text)
         return RanksDisagreeError(text)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from daedalus.learner.ranks.errors import RankLostError
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.user_code import message_line
 
 if TYPE_CHECKING:
     from torch._C._distributed_c10d import Store
@@ -147,7 +148,7 @@ class Group:
         try:
             yield
         except RuntimeError as error:  # torch has no narrower error for a closed connection or a time limit
-            raise RankLostError(next(iter(str(error).splitlines()), "")) from None
+            raise RankLostError(message_line(error)) from None
         finally:
             self.waiting_since = None
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daedalus.learner.run.settings import SettingsError
+from daedalus.policy.user_code import message_line
 
 if TYPE_CHECKING:
     from torch._C._distributed_c10d import Store
@@ -54,7 +55,7 @@ class Meeting:
                     raise RankLostError(f"not all {self.number} processes have started within {_MEET_SECONDS:g} s")
                 time.sleep(_POLL_SECONDS)
         except RuntimeError as error:  # of torch, which has no narrower one
-            first_line = next(iter(str(error).splitlines()), "")
+            first_line = message_line(error)
             raise RankLostError(f"no connection to the meeting point of the processes: {first_line}") from None
         return Group(store, self.rank, self.number, on_this_machine=self.on_this_machine)
 

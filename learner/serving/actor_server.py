@@ -23,12 +23,13 @@ from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
 from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import QueryResponses
-from daedalus.learner.serving.rollout_intake import HEARTBEAT_SECONDS, RolloutIntake
+from daedalus.learner.serving.requests import read_request
+from daedalus.learner.serving.rollout_intake import POLL_SECONDS, RolloutIntake
 from daedalus.learner.serving.session_watchdog import SessionWatchdog
 from daedalus.learner.serving.snapshot_publisher import SnapshotPublisher
 from daedalus.learner.serving.status_responses import StatusResponses
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import (
     CLIENT_REPORT_LIMITS,
     EVALUATION_LIMITS,
@@ -176,7 +177,7 @@ class ActorServer:
         repeat_at = self._ended_at + _REPEAT_SECONDS
         while self._expects_actors(time.monotonic()) and not stop.is_set():
             with self.lock:
-                self.lock.wait(HEARTBEAT_SECONDS)
+                self.lock.wait(POLL_SECONDS)
             if time.monotonic() >= repeat_at:
                 self._publish_end()
                 repeat_at += _REPEAT_SECONDS
@@ -198,7 +199,7 @@ class ActorServer:
         with self.lock:
             while not self.fleet.has_had_actors and not stop.is_set():
                 on_wait()
-                self.lock.wait(HEARTBEAT_SECONDS)
+                self.lock.wait(POLL_SECONDS)
                 if time.monotonic() > hint_at and hinted != self._responses.preparing:
                     hinted = self._responses.preparing
                     doing = f"{hinted} makes its environments" if hinted else f"start one with {_START}"
@@ -239,13 +240,9 @@ class ActorServer:
         request.reply(encode(refusal or Acknowledgement(verdict="accepted")))
 
     def _on_order(self, request: Request) -> None:
-        try:
-            message = decode(request.payload, STATUS_REQUEST_LIMITS)
-        except ProtocolError as error:
-            request.reply(encode(Refusal(code="malformed", reason=str(error))))
-            return
-        if not isinstance(message, OrderRequest):
-            request.reply(encode(Refusal(code="malformed", reason="expected an OrderRequest message")))
+        message = read_request(request.payload, STATUS_REQUEST_LIMITS, OrderRequest)
+        if isinstance(message, Refusal):
+            request.reply(encode(message))
             return
         _logger.info("an operator orders: %s", message.order)
         self._orders.give(message.order)

@@ -19,7 +19,7 @@ class Actor:
 
     name: str
     epsilon: float = 0.0  # final one, with which it explores
-    lives_before: int = 0  # a number that is different after an actor of this name was forgotten
+    forgotten_before: int = 0  # a number that is different after an actor of this name was forgotten
     incarnation: int = -1  # the newest; -1 before the first Join
     incarnations: int = 0  # number of incarnations that joined
     origin: Origin = UNKNOWN  # of the newest incarnation
@@ -48,9 +48,9 @@ class Actor:
     client: ClientReport | None = None  # of the newest incarnation, if it is a client that reports
 
     @property
-    def lives(self) -> int:
+    def incarnation_number(self) -> int:
         """Number that is different for each incarnation of this name."""
-        return self.incarnations + (self.lives_before << 32)
+        return self.incarnations + (self.forgotten_before << 32)
 
     @property
     def missed(self) -> int:

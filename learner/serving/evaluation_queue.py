@@ -3,8 +3,9 @@
 import threading
 from typing import TypeVar
 
+from daedalus.learner.serving.requests import read_request
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import EVALUATION_LIMITS
 from daedalus.protocol.messages import EvaluationReport, EvaluationRequest, Refusal
 from daedalus.transport.interface import Request
@@ -42,15 +43,12 @@ class EvaluationQueue:
 
     def offer(self, request: Request) -> None:
         """Queue a message of an evaluator, or refuse it. Does not block."""
-        try:
-            message = decode(request.payload, EVALUATION_LIMITS)
-        except ProtocolError as error:
-            request.reply(encode(Refusal(code="malformed", reason=str(error))))
-            return
         sender = keys.last_chunk(request.key)
-        if not isinstance(message, EvaluationRequest | EvaluationReport) or message.evaluator != sender:
-            reason = f"expected an EvaluationRequest or EvaluationReport of evaluator {sender[:64]!r}"
-            request.reply(encode(Refusal(code="malformed", reason=reason)))
+        message = read_request(request.payload, EVALUATION_LIMITS, EvaluationRequest, EvaluationReport)
+        if not isinstance(message, Refusal) and message.evaluator != sender:
+            message = Refusal(code="malformed", reason=f"the message is not from evaluator {sender[:64]!r}")
+        if isinstance(message, Refusal):
+            request.reply(encode(message))
             return
         with self._lock:
             if self._ending is not None:

@@ -88,7 +88,7 @@ class Fleet:
             if reason:
                 return Refusal(code="full", reason=reason)
             epsilon = self.epsilon_for(join.actor)
-            self.actors[join.actor] = Actor(join.actor, lives_before=self.forgotten, epsilon=epsilon)
+            self.actors[join.actor] = Actor(join.actor, forgotten_before=self.forgotten, epsilon=epsilon)
             self._of_owner[keys.owner(join.actor)] += 1
         self.spaces = join.spaces
         self.refused_joins.joined(join.actor)
@@ -159,16 +159,16 @@ class Fleet:
         self._forget(min(absent, key=lambda actor: actor.last_seen))
         return ""
 
-    def lives(self, name: str) -> int:
+    def incarnation_number(self, name: str) -> int:
         """Return a number that is different for each incarnation that joins under a name."""
-        return self.actors[name].lives if name in self.actors else 0
+        return self.actors[name].incarnation_number if name in self.actors else 0
 
     def seed_for(self, name: str, start_version: int) -> int:
         """Return the seed of an actor's environments and samples.
 
         It differs by name, by incarnation and by `start_version`, the policy version that the run continued from.
         """
-        entropy = [self._seed, zlib.crc32(name.encode()), self.lives(name), start_version]
+        entropy = [self._seed, zlib.crc32(name.encode()), self.incarnation_number(name), start_version]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def epsilon_for(self, name: str) -> float:

@@ -9,6 +9,7 @@ import threading
 
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
+from daedalus.learner.serving.requests import read_request
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import ProtocolError, decode, encode, origin_of
 from daedalus.protocol.limits import CLIENT_REPORT_LIMITS, JOIN_LIMITS
@@ -60,7 +61,7 @@ class QueryResponses:
             return encode(self._ending)
         origin = message.origin if isinstance(message, Join) else origin_of(data, JOIN_LIMITS)
         with self._lock:
-            lives = self._fleet.lives(name)
+            before = self._fleet.incarnation_number(name)
             refusal = message if isinstance(message, Refusal) else self._fleet.join(message, now)
             if refusal is None:
                 self._lock.notify_all()
@@ -68,7 +69,7 @@ class QueryResponses:
                 self._fleet.refused_joins.add(name, origin, refusal.reason, now)
                 self.postponed_at = now if refusal.code == "name_taken" else self.postponed_at
             seed, epsilon = self._fleet.seed_for(name, self._start_version), self._fleet.epsilon_for(name)
-            is_new = self._fleet.lives(name) != lives
+            is_new = self._fleet.incarnation_number(name) != before
         if refusal is not None:
             self.preparing = "" if self.preparing == name else self.preparing
             self._add_refusal(name, origin, refusal)
@@ -82,12 +83,9 @@ class QueryResponses:
 
     def report(self, name: str, data: bytes) -> bytes:
         """Return the answer to the encoded ClientReport of an actor. `name` is that in the key of the query."""
-        try:
-            message = decode(data, CLIENT_REPORT_LIMITS)
-        except ProtocolError as error:
-            return encode(Refusal(code="malformed", reason=str(error)))
-        if not isinstance(message, ClientReport):
-            return encode(Refusal(code="malformed", reason="expected a ClientReport message"))
+        message = read_request(data, CLIENT_REPORT_LIMITS, ClientReport)
+        if isinstance(message, Refusal):
+            return encode(message)
         with self._lock:
             refusal = self._fleet.report(name, message)
         return encode(refusal or Acknowledgement(verdict="accepted"))

@@ -36,7 +36,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Upload
 from daedalus.transport.interface import Request
 
-HEARTBEAT_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
+POLL_SECONDS = 0.2  # longest time until a waiting thread notices the end of the run
 # Largest batch of a synchronous run in memory, whichever is larger: bytes, or the rollouts of so many fleets as large
 # as the run expects.
 _MOST_BATCH_BYTES, _MOST_FLEETS = 1 << 30, 8
@@ -153,7 +153,7 @@ class RolloutIntake:
     # ------------------------------------------------------------------------------------ the learner's thread
 
     def take_batch(self, version: int) -> list[Upload]:
-        """Return the rollouts of the next batch, or an empty list if no batch is complete within a heartbeat.
+        """Return the rollouts of the next batch, or an empty list if no batch is complete within POLL_SECONDS.
 
         The rollouts are counted as trained. From now on the policy lag is relative to the version after this batch,
         because actors may have its snapshot before the next batch is complete.
@@ -166,7 +166,7 @@ class RolloutIntake:
             self._requests.wake()  # the intake thread answers: a congested link must not stop the learner
             taken = self._take(version)
             if not taken.rollouts and not taken.stale:
-                self._lock.wait(HEARTBEAT_SECONDS)
+                self._lock.wait(POLL_SECONDS)
                 taken = self._take(version)
             self._count(taken, version)
             if taken.rollouts:
@@ -233,7 +233,7 @@ class RolloutIntake:
         while True:
             self._answer_held()
             try:
-                taken = self._requests.take(HEARTBEAT_SECONDS)
+                taken = self._requests.take(POLL_SECONDS)
             except queue.Empty:
                 continue
             if taken is None:
@@ -265,7 +265,7 @@ class RolloutIntake:
             with self._lock:
                 if self._has_room_for(content):
                     return True
-                self._lock.wait(HEARTBEAT_SECONDS)
+                self._lock.wait(POLL_SECONDS)
             self._answer_held()
             for late in self._requests.take_late():
                 self._answer_busy(late)

@@ -10,9 +10,10 @@ from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.compact_snapshot_server import CompactSnapshotServer
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.query_responses import QueryResponses
+from daedalus.learner.serving.requests import read_request
 from daedalus.policy.acting.runtime import program_hash
 from daedalus.protocol import keys
-from daedalus.protocol.codec import ProtocolError, decode, encode
+from daedalus.protocol.codec import encode
 from daedalus.protocol.limits import SNAPSHOT_REQUEST_LIMITS
 from daedalus.protocol.messages import Program, Refusal, Snapshot, SnapshotRequest
 from daedalus.protocol.spec import RunSpec
@@ -73,13 +74,9 @@ class SnapshotPublisher:
         if not request.size:
             request.reply(self._responses.snapshot())
             return
-        try:
-            message = decode(request.payload, SNAPSHOT_REQUEST_LIMITS)
-        except ProtocolError as error:
-            request.reply(encode(Refusal(code="malformed", reason=str(error))))
-            return
-        if not isinstance(message, SnapshotRequest):
-            request.reply(encode(Refusal(code="malformed", reason="expected a SnapshotRequest")))
+        message = read_request(request.payload, SNAPSHOT_REQUEST_LIMITS, SnapshotRequest)
+        if isinstance(message, Refusal):
+            request.reply(encode(message))
         elif message.compact:
             self._compact.offer(request, message)
         else:

@@ -11,7 +11,7 @@ from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page
-from daedalus.protocol.codec import ProtocolError, decode
+from daedalus.learner.serving.requests import read_request
 from daedalus.protocol.limits import STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (
     ActorsReport,
@@ -49,10 +49,7 @@ class StatusResponses:
         if not request.size:
             with self._lock:
                 return StatusReport(status=self._status())
-        try:
-            message = decode(request.payload, STATUS_REQUEST_LIMITS)
-        except ProtocolError as error:
-            return Refusal(code="malformed", reason=str(error))
+        message = read_request(request.payload, STATUS_REQUEST_LIMITS, ActorsRequest, EventsRequest, MetricsRequest)
         match message:
             case ActorsRequest():
                 with self._lock:
@@ -63,6 +60,5 @@ class StatusResponses:
                 return EventsReport(page=EventsPage(run=self._run, learner_epoch=self._epoch, events=events))
             case MetricsRequest():
                 return self._history.page(self._run, self._epoch, message.first)
-            case _:
-                reason = "expected an ActorsRequest, EventsRequest or MetricsRequest message"
-                return Refusal(code="malformed", reason=reason)
+            case Refusal():
+                return message

@@ -29,6 +29,7 @@ from daedalus.policy.acting.runtime import (
 )
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_code import first_line
 from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
 
 _OPSET = 17
@@ -74,8 +75,7 @@ def export_program(network: ActorCritic, spaces: Spaces) -> bytes:
     except PolicyError as error:
         raise NetworkError(f"actors cannot run the program of the policy: {error}") from None
     except Exception as error:  # the exporter calls code of the user, which may raise anything
-        first_line = next(iter(str(error).strip().splitlines()), "")
-        raise NetworkError(f"the policy cannot be exported to ONNX: {type(error).__name__}: {first_line}") from error
+        raise NetworkError(f"the policy cannot be exported to ONNX: {first_line(error)}") from error
     return program
 
 

@@ -10,6 +10,7 @@ import onnxruntime
 
 from daedalus.policy.acting.call_watchdog import CallWatchdog
 from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.user_code import message_line
 
 MAX_MEMORY_BYTES = 1 << 30  # of all tensors that the programs of this process compute
 # onnxruntime computes constants when it loads a program, in memory that the limit above does not cover.
@@ -73,4 +74,4 @@ def _bound_memory() -> None:
 
 
 def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
+    return message_line(error)[:200]

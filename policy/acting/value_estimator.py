@@ -7,6 +7,7 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.network.actor_critic import ActorCritic
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.saving.saved_policy import SavedPolicy
+from daedalus.policy.user_code import message_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import DiscreteSpace
 
@@ -23,7 +24,7 @@ class ValueEstimator:
             given = {name: torch.from_numpy(values.copy()) for name, values in policy.weights.items()}
             network.load_state_dict(given, strict=False)
         except (NetworkError, RuntimeError) as error:
-            raise PolicyError(str(error).splitlines()[0]) from None
+            raise PolicyError(message_line(error)) from None
         missing = dict(network.named_parameters()).keys() - given.keys()
         if missing:
             raise PolicyError(f"the checkpoint lacks the parameters {min(missing)!r}")

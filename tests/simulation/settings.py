@@ -47,7 +47,7 @@ class Settings:
     checkpoint_seconds: float
     ends_by: str  # finish or stop
     real_codec: bool  # whether messages are encoded
-    heartbeat_seconds: float  # how soon a waiting thread notices what nobody tells it
+    poll_seconds: float  # how soon a waiting thread notices what nobody tells it
     patience_seconds: float  # after which a synchronous batch no longer waits for an actor
     fine: bool  # whether threads are interrupted at any line
 
@@ -71,7 +71,7 @@ def draw(seed: int) -> Settings:
         checkpoint_seconds=random.choice((0.1, 0.1, 60.0)),
         ends_by=random.choice(("finish", "stop")),
         real_codec=real_codec,
-        heartbeat_seconds=random.choice((0.2, 2.0, 2.0, 2.0)),  # a long one shows a thread that should have been told
+        poll_seconds=random.choice((0.2, 2.0, 2.0, 2.0)),  # a long one shows a thread that should have been told
         patience_seconds=random.choice((60.0, 3.0)),
         fine=random.random() < 0.03,
     )

@@ -84,8 +84,8 @@ def _fine_files() -> frozenset[str]:
 def _patched(kernel: Kernel, settings: Settings) -> Iterator[None]:
     """Give the services the kernel's threads and time, and a policy that is never run."""
     constants = {
-        "_HEARTBEAT_SECONDS": settings.heartbeat_seconds,
-        "HEARTBEAT_SECONDS": settings.heartbeat_seconds,
+        "_POLL_SECONDS": settings.poll_seconds,
+        "POLL_SECONDS": settings.poll_seconds,
         "_PATIENCE_SECONDS": settings.patience_seconds,
         "PART_BYTES": 64,  # so that a compact snapshot has several parts
     }
@@ -143,7 +143,7 @@ def _require_no_loss(world: World) -> None:
     """Check that the learner has decided about each rollout of the present sessions, unless it is in flight."""
     learner = world.learner
     for actor in world.running:
-        uploads = actor.service._uploads.in_flight.rollouts
+        uploads = actor.service._upload_session.in_flight.rollouts
         for identity in world.ledger.collected:
             if (identity.incarnation, identity.learner_epoch) == (actor.incarnation, learner.epoch):
                 is_waiting = identity.sequence in uploads or identity.sequence >= actor.service._sequence
@@ -168,7 +168,7 @@ def _end(world: World) -> None:
     while world.running:
         kernel.sleep(0.1)
     learner.stop.set()
-    end = kernel.now + 5.0 + world.settings.heartbeat_seconds
+    end = kernel.now + 5.0 + world.settings.poll_seconds
     while not learner.done:
         world.ledger.require(kernel.now < end, "the learner does not end")
         kernel.sleep(0.1)

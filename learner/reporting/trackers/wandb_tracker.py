@@ -7,6 +7,7 @@ from typing import Any
 
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, TrackedRun, tagged
+from daedalus.policy.user_code import message_line
 
 _INIT_SECONDS = 30.0  # for the server to answer
 
@@ -39,7 +40,7 @@ class WandbTracker:
         try:
             self._run = begin(None)  # WANDB_MODE, or online
         except Error as error:
-            fault = f"{str(error).splitlines()[0].rstrip('.')}; "
+            fault = f"{message_line(error).rstrip('.')}; "
             self._run = begin("offline")
         if self._run.offline:
             self.place = f"{fault}recorded offline; upload the run with: wandb sync {self._run.settings.sync_dir}"

@@ -11,6 +11,7 @@ from daedalus.policy.network.distributions.greedy import Greedy
 from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
 from daedalus.policy.network.distributions.mixture import GaussianMixture
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
@@ -136,6 +137,5 @@ def _custom(reference: str, name: str, space: ContinuousSpace, modules: UserModu
     except NetworkError as error:
         raise NetworkError(f"policy.distribution={reference}, for {name!r}: {error}") from error.__cause__
     except Exception as error:  # the user's code may raise anything
-        first_line = next(iter(str(error).strip().splitlines()), "")
-        raise NetworkError(f"policy.distribution={reference}: {type(error).__name__}: {first_line}") from error
+        raise NetworkError(f"policy.distribution={reference}: {first_line(error)}{place_of(error)}") from error
     return distribution

@@ -11,7 +11,7 @@ from scripted_learner import POLICY, SPACES, SPEC, RunningActor, ScriptedLearner
 
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.uploads import RolloutUploads, make_uploads
+from daedalus.actor.session.upload_maker import RolloutUploadMaker, make_upload_maker
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
 from daedalus.policy.user_modules import NO_MODULES, UserModules
@@ -53,7 +53,7 @@ def test_an_actor_that_uploads_rollouts_never_imports_torch() -> None:
 import sys
 sys.modules["torch"] = None  # as if it were not installed
 from daedalus.actor.errors import ActorError
-from daedalus.actor.session.uploads import make_uploads
+from daedalus.actor.session.upload_maker import make_upload_maker
 from daedalus.policy.user_modules import NO_MODULES
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
@@ -64,13 +64,13 @@ spaces = Spaces.model_validate({
 for upload in ("rollouts", "gradients"):
     spec = {"environment": {"id": "A-v0"}, "training": {"algorithm": "a3c"}, "collection": {"upload": upload}}
     try:
-        print(type(make_uploads(RunSpec.model_validate(spec), spaces, NO_MODULES)).__name__)
+        print(type(make_upload_maker(RunSpec.model_validate(spec), spaces, NO_MODULES)).__name__)
     except ActorError as error:
         print(error)
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert ended.stdout.splitlines() == [
-        "RolloutUploads",
+        "RolloutUploadMaker",
         "this run takes gradients (collection.upload), which an actor computes with torch: install it with "
         "pip install 'daedalus-rl[learner]', or set collection.upload=rollouts",
     ]
@@ -87,16 +87,16 @@ def test_an_actor_imports_modules_for_gradients_only_if_its_command_line_allows_
     spec: RunSpec, reason: str
 ) -> None:
     with pytest.raises(ActorError, match=reason):
-        make_uploads(spec, SPACES, UserModules(frozenset({"other"}), "the learner"))
+        make_upload_maker(spec, SPACES, UserModules(frozenset({"other"}), "the learner"))
     rollouts = spec.model_copy(update={"collection": spec.collection.model_copy(update={"upload": "rollouts"})})
-    assert isinstance(make_uploads(rollouts, SPACES, NO_MODULES), RolloutUploads)
+    assert isinstance(make_upload_maker(rollouts, SPACES, NO_MODULES), RolloutUploadMaker)
     assert rollouts.actor_modules == {}
     assert spec.actor_modules == spec.learner_modules
 
 
 def test_a_network_that_cannot_be_constructed_is_reported_in_one_line() -> None:
     with pytest.raises(ActorError, match="absent_module"):
-        make_uploads(spec_of(encoder="absent_module:Net"), SPACES, UserModules(frozenset({"absent_module"})))
+        make_upload_maker(spec_of(encoder="absent_module:Net"), SPACES, UserModules(frozenset({"absent_module"})))
 
 
 def test_a_client_refuses_a_run_that_takes_gradients() -> None:

@@ -11,7 +11,7 @@ from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.uploads import Rollout, Upload
 
 
-class Uploads(Protocol):
+class UploadMaker(Protocol):
     """Maker of the messages that an actor uploads in one session."""
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
@@ -23,25 +23,25 @@ class Uploads(Protocol):
         ...
 
 
-class RolloutUploads:
-    """Uploads of the rollouts themselves."""
+class RolloutUploadMaker:
+    """UploadMaker of the rollouts themselves."""
 
     def load(self, weights: dict[str, np.ndarray]) -> None:
-        """See Uploads. Rollouts need no weights."""
+        """See UploadMaker. Rollouts need no weights."""
 
     def compute(self, rollout: Rollout) -> Upload:
-        """See Uploads."""
+        """See UploadMaker."""
         return rollout
 
 
-def make_uploads(spec: RunSpec, spaces: Spaces, modules: UserModules) -> Uploads:
+def make_upload_maker(spec: RunSpec, spaces: Spaces, modules: UserModules) -> UploadMaker:
     """Return what makes the uploads that a run asks for. Only gradients import torch.
 
     `modules` may be imported for the network and the algorithm. Raises ActorError if the actor cannot compute
     gradients.
     """
     if not spec.uploads_gradients:
-        return RolloutUploads()
+        return RolloutUploadMaker()
     try:
         modules.check(spec.learner_modules)
         from daedalus.algorithms.errors import AlgorithmError
