@@ -29,7 +29,7 @@ _STOP_SECONDS = 2  # for connections to end after a stop
 _KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _MAX_FRAGMENTS = 4096  # of one message: the limit on its bytes does not count empty ones
-_REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer
+_REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer; and for a handshake
 
 
 class _Newcomers:
@@ -248,6 +248,23 @@ class Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Capture none."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen, as uvicorn's own method does, with a time limit for TLS handshakes: asyncio's is 60 s."""
+        loop, config = asyncio.get_running_loop(), self.config
+        limit = None if config.ssl is None else _REQUEST_SECONDS
+        await self.lifespan.startup()
+        self.servers = [
+            await loop.create_server(
+                lambda: PromptHttp(config, self.server_state, {}),
+                sock=listener,
+                ssl=config.ssl,
+                ssl_handshake_timeout=limit,
+                backlog=config.backlog,
+            )
+            for listener in sockets or []
+        ]
+        self.started = True
 
     async def run_until(
         self, stop: asyncio.Event, listener: socket.socket, on_stop: Callable[[], Awaitable[None]]

@@ -198,6 +198,22 @@ def test_connection_without_a_request_is_closed(
         assert silent.recv(1) == b""
 
 
+def test_connection_without_a_tls_handshake_is_closed(
+    network: MemoryNetwork, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "_REQUEST_SECONDS", 0.3)
+    running = RunningGateway(network, folder / "gateway", follows=False)
+    try:
+        address = ("127.0.0.1", running.port)
+        with (
+            socket.create_connection(address, LIMIT / 4) as silent,  # asyncio's own limit is 60 s
+            contextlib.suppress(ConnectionResetError),
+        ):
+            assert silent.recv(1) == b""
+    finally:
+        running.close()
+
+
 def test_large_first_messages_that_do_not_end_are_limited_and_the_oldest_ends(
     learner: ScriptedLearner, gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
