@@ -21,6 +21,7 @@ _logger = logging.getLogger(__name__)
 HELLO_SECONDS = 10.0  # from the connection to the hello
 _SEND_SECONDS = 5.0  # for the last message
 _MAX_UNANSWERED = 8  # messages of one client; then reading pauses
+_MAX_EARLY = 2  # messages of one client that are read before it is admitted
 _MAX_FAULTS = 10  # of one client; then it is disconnected
 _OK, _FAULT, _TRY_LATER = 1000, 1008, 1013  # codes of RFC 6455
 
@@ -82,8 +83,12 @@ class ClientConnection:
         assert isinstance(hello, Hello)
         self._guard.check_token(hello.name, hello.token)
         address = self._address()
-        gateway = await self._reach()
-        actor = await gateway.admit(hello, address, self.end)
+        reading = asyncio.create_task(self._read_early())
+        try:
+            gateway = await self._reach()
+            actor = await gateway.admit(hello, address, self.end)
+        finally:
+            reading.cancel()
         try:
             self._channel.limit(actor.spaces.max_message_bytes)
             session = gateway.run.session
@@ -92,12 +97,26 @@ class ClientConnection:
             _logger.info("client %s connected from %s", actor.name, address)
             self._state, self._seat = "ready", (gateway, actor)
             self._channel.divert(self._on_message, self._go_on)
+            self._go_on()  # with messages that came early
             while (await self._receive_event())["type"] != "websocket.disconnect":
                 pass
         finally:
             self._seat = None
             gateway.leave(actor)
             _logger.info("client %s disconnected", actor.name)
+
+    async def _read_early(self) -> None:
+        """Keep messages that come before the answer to hello; end the connection if the client disconnects.
+
+        The server keeps those beyond `_MAX_EARLY`: it bounds their memory, but does not notice the end behind them.
+        """
+        while len(self._unanswered) < _MAX_EARLY:
+            event = await self._receive_event()
+            if event["type"] == "websocket.disconnect":
+                self.end(ClientError("unavailable", "the client disconnected"))
+                return
+            text = event.get("text")
+            self._unanswered.append(event["bytes"] if text is None else text)
 
     async def _reach(self) -> Gateway:
         try:

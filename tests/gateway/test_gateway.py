@@ -320,6 +320,36 @@ def test_client_waits_for_a_learner(network: MemoryNetwork, connect: Connect) ->
         learner.transport.close()
 
 
+def test_client_that_disconnects_while_it_waits_for_a_learner_leaves_its_name(
+    gateway: RunningGateway, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gateway_module, "JOIN_SECONDS", 1e6)
+    client = connect()
+    client.send("hello", version=1, name="early", **CARTPOLE)
+    client.send("act", observation=[0.0, 0.0, 0.0, 0.0])
+    until(lambda: gateway.call(lambda: "early" in gateway.gateway._seats))
+    client.close()
+    until(lambda: gateway.call(lambda: not gateway.gateway._seats))
+
+
+def test_messages_that_come_before_the_answer_to_hello_are_answered_in_turn(
+    network: MemoryNetwork, gateway: RunningGateway, connect: Connect
+) -> None:
+    client = connect()
+    client.send("hello", version=1, name="early", **CARTPOLE)
+    for step in range(ROWS + 1):
+        client.send("act", observation=[float(step), 0.0, 0.0, 0.0])
+    until(lambda: gateway.call(lambda: "early" in gateway.gateway._seats))
+    learner = ScriptedLearner(network)
+    learner.publish(0)
+    try:
+        assert [client.receive()["type"] for _ in range(ROWS + 2)] == ["welcome", *["action"] * (ROWS + 1)]
+        rollout, _ = learner.receive()
+        assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    finally:
+        learner.transport.close()
+
+
 def test_request_to_join_is_prepared_once_and_sent_again_until_it_is_answered(
     learner: ScriptedLearner, connect: Connect, monkeypatch: pytest.MonkeyPatch
 ) -> None:

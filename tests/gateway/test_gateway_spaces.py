@@ -315,9 +315,7 @@ def test_image_that_is_too_large_for_the_transforms_is_refused_at_once(shape: li
     actor = ClientActor(Join(actor="a", incarnation=1), spaces, None)  # type: ignore[arg-type] - it sends nothing
     tracemalloc.start()
     try:
-        with pytest.raises(
-            ClientError, match=r"observation is an image .* at most 8,192 pixels a side"
-        ):
+        with pytest.raises(ClientError, match=r"observation is an image .* at most 8,192 pixels a side"):
             actor.prepare(run_spec(resize=(84, 84)))
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
