@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RecordedRun
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RecordedRun, not_repeated
 from daedalus.cli.comparing.statistics import interquartile_interval, interquartile_mean
 
 _POINTS = 200
@@ -35,8 +35,7 @@ def points(run: RecordedRun, column: str, by: str) -> tuple[np.ndarray, np.ndarr
     y = run.metrics[column]
     known = ~np.isnan(y) & ~np.isnan(x)
     x, y = x[known], y[known]
-    least_later = np.append(np.minimum.accumulate(x[::-1])[::-1][1:], np.inf)
-    newest = x < least_later
+    newest = not_repeated(x)
     return x[newest], y[newest]
 
 
@@ -61,3 +60,15 @@ def group_curve(runs: Sequence[RecordedRun], column: str, by: str) -> Curve | No
     values = np.stack([np.interp(grid, x, y) for x, y in lines])  # [runs, points]
     interval = interquartile_interval([values])
     return Curve(x=grid, mean=interquartile_mean(values, 0), low=interval.low, high=interval.high)
+
+
+def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the evaluations of a run lie, [evaluations], and their mean returns, [evaluations]."""
+    at, returns = run.metrics.get("evaluation_env_steps"), run.metrics.get("evaluation_return_mean")
+    if at is None or returns is None:
+        return np.zeros(0), np.zeros(0)
+    by_env_steps = {env_steps: value for env_steps, value in zip(at, returns, strict=True) if not np.isnan(env_steps)}
+    x, y = np.array(list(by_env_steps)), np.array(list(by_env_steps.values()))
+    if by != ENV_STEPS and len(x):
+        x = np.interp(x, *points(run, "wall_seconds", ENV_STEPS)) / 60.0
+    return x, y

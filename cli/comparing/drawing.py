@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daedalus.cli.comparing.comparison import final_returns
-from daedalus.cli.comparing.curves import group_curve, points
+from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.grouping import Group
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, RETURN, RecordedRun, RunDataError
+from daedalus.cli.comparing.recorded_run import RETURN, RunDataError
 from daedalus.cli.comparing.statistics import performance_profile, profile_interval
 from daedalus.policy.saving.replacing import replacing
 
@@ -119,15 +119,3 @@ def _draw_run(axis: "Axes", group: Group, column: str, by: str) -> None:
         std = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))
         axis.fill_between(x, y - std, y + std, color=line.get_color(), alpha=0.15, linewidth=0)
         axis.plot(*evaluations(run, by), "o--", color=line.get_color(), linewidth=1, markersize=4)
-
-
-def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the evaluations of a run lie, [evaluations], and their mean returns, [evaluations]."""
-    at, returns = run.metrics.get("evaluation_env_steps"), run.metrics.get("evaluation_return_mean")
-    if at is None or returns is None:
-        return np.zeros(0), np.zeros(0)
-    by_env_steps = {env_steps: value for env_steps, value in zip(at, returns, strict=True) if not np.isnan(env_steps)}
-    x, y = np.array(list(by_env_steps)), np.array(list(by_env_steps.values()))
-    if by != ENV_STEPS and len(x):
-        x = np.interp(x, *points(run, "wall_seconds", ENV_STEPS)) / 60.0
-    return x, y

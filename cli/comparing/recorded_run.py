@@ -146,9 +146,14 @@ def read_metrics(directory: str | Path) -> dict[str, np.ndarray]:
     Raises RunDataError if the directory has no metrics.
     """
     metrics = read_run(one_run(Path(directory))).metrics
-    steps = metrics[ENV_STEPS]
-    least_later = np.append(np.minimum.accumulate(steps[::-1])[::-1][1:], np.inf)
-    return {name: column[steps < least_later] for name, column in metrics.items()}
+    newest = not_repeated(metrics[ENV_STEPS])
+    return {name: column[newest] for name, column in metrics.items()}
+
+
+def not_repeated(x: np.ndarray) -> np.ndarray:
+    """Return which rows a resumed run did not repeat, [rows] bool: after them x, [rows], is always larger."""
+    least_later = np.append(np.minimum.accumulate(x[::-1])[::-1][1:], np.inf)
+    return x < least_later
 
 
 def _settings(path: Path) -> dict[str, Any]:

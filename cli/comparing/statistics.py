@@ -6,7 +6,9 @@ Scores are strata: one array for each task, whose first axis is the runs of that
 stratum. A score may be infinite, such as the time to a threshold of a run that never reached it.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ Strata = Sequence[np.ndarray]  # one array [runs of the task, ...] for each task
 Statistic = Callable[[Sequence[np.ndarray]], np.ndarray]  # of strata with repetitions before the runs
 
 _REPETITIONS = 2000
+_CONFIDENCE = 0.95  # share of cases that an interval is to contain
 
 
 class Interval(NamedTuple):
@@ -43,7 +46,6 @@ def stratified_bootstrap(
     strata: Strata,
     statistic: Statistic,
     *,
-    confidence: float = 0.95,
     repetitions: int = _REPETITIONS,
     seed: int = 0,
 ) -> Interval:
@@ -56,7 +58,6 @@ def stratified_bootstrap(
     Args:
       strata: the scores, [runs of the task, ...] for each task.
       statistic: maps resampled strata, [repetitions, runs of the task, ...], to values [repetitions, ...].
-      confidence: share of cases that the interval is to contain.
       repetitions: number of bootstrap samples.
       seed: of the samples.
     """
@@ -69,17 +70,15 @@ def stratified_bootstrap(
     if any(len(scores) < 2 for scores in strata):
         unknown = np.full(values.shape[1:], np.nan)
         return Interval(unknown, unknown)
-    outside = (1.0 - confidence) / 2.0
+    outside = (1.0 - _CONFIDENCE) / 2.0
     # Samples themselves, without interpolation: infinite scores have no values between them.
     low, high = np.quantile(values, [outside, 1.0 - outside], axis=0, method="inverted_cdf")
     return Interval(low, high)
 
 
-def interquartile_interval(strata: Strata, *, confidence: float = 0.95, seed: int = 0) -> Interval:
+def interquartile_interval(strata: Strata, *, seed: int = 0) -> Interval:
     """Return the interval of the interquartile mean of the runs of all tasks together. See stratified_bootstrap."""
-    return stratified_bootstrap(
-        strata, lambda samples: interquartile_mean(np.concatenate(samples, 1), 1), confidence=confidence, seed=seed
-    )
+    return stratified_bootstrap(strata, lambda samples: interquartile_mean(np.concatenate(samples, 1), 1), seed=seed)
 
 
 def performance_profile(strata: Strata, thresholds: np.ndarray) -> np.ndarray:
@@ -98,11 +97,9 @@ def performance_profile(strata: Strata, thresholds: np.ndarray) -> np.ndarray:
     return _shares_above([scores[None] for scores in strata], thresholds)[0]
 
 
-def profile_interval(strata: Strata, thresholds: np.ndarray, *, confidence: float = 0.95, seed: int = 0) -> Interval:
+def profile_interval(strata: Strata, thresholds: np.ndarray, *, seed: int = 0) -> Interval:
     """Return the pointwise interval of a performance profile, [thresholds]. See stratified_bootstrap."""
-    return stratified_bootstrap(
-        strata, lambda samples: _shares_above(samples, thresholds), confidence=confidence, seed=seed
-    )
+    return stratified_bootstrap(strata, lambda samples: _shares_above(samples, thresholds), seed=seed)
 
 
 def _shares_above(samples: Strata, thresholds: np.ndarray) -> np.ndarray:
@@ -124,9 +121,9 @@ def probability_of_improvement(first: Strata, second: Strata) -> float:
     return float(_improvements([*(x[None] for x in first), *(y[None] for y in second)])[0])
 
 
-def improvement_interval(first: Strata, second: Strata, *, confidence: float = 0.95, seed: int = 0) -> Interval:
+def improvement_interval(first: Strata, second: Strata, *, seed: int = 0) -> Interval:
     """Return the interval of the probability of improvement; the runs of both are resampled."""
-    return stratified_bootstrap([*first, *second], _improvements, confidence=confidence, seed=seed)
+    return stratified_bootstrap([*first, *second], _improvements, seed=seed)
 
 
 def _improvements(samples: Strata) -> np.ndarray:
@@ -138,3 +135,36 @@ def _improvements(samples: Strata) -> np.ndarray:
 
 def _better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return (x > y) + 0.5 * (x == y)
+
+
+def mean_interval(mean: float, std: float, count: int) -> tuple[float, float] | None:
+    """Return the 95 % interval of a mean over `count` values, or None for a single value.
+
+        mean +- t s / sqrt(n),  s^2 = n / (n - 1) std^2
+
+    with the 97.5 % quantile t of Student's distribution, n - 1 degrees of freedom.
+
+    Args:
+      mean, std: of the values; std is that of the values themselves, with n in the denominator.
+    """
+    if count < 2:
+        return None
+    error = _t_quantile(count - 1) * std / math.sqrt(count - 1)
+    return mean - error, mean + error
+
+
+def _t_quantile(freedom: int) -> float:
+    """Return the 97.5 % quantile of Student's t. Exact for 1 and 2 degrees of freedom, within 0.5 % for more.
+
+    Abramowitz & Stegun (1964), equation 26.7.5.
+    """
+    if freedom <= 2:
+        return (12.7062, 4.3027)[freedom - 1]
+    z = NormalDist().inv_cdf(0.975)
+    terms = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+    )
+    return sum(term / freedom**power for power, term in enumerate(terms))

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from daedalus.cli.comparing.curves import group_curve, points
-from daedalus.cli.comparing.drawing import evaluations
+from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.grouping import Group
 from daedalus.cli.comparing.recorded_run import RETURN, RecordedRun
 from daedalus.cli.reports.charts import Series, line_chart

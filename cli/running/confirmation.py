@@ -5,13 +5,12 @@ the policy changed. So their mean is too high on average, and the policy of that
 New episodes with that policy show what it can do. They are played while the learner waits.
 """
 
-import math
 import subprocess
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any
 
 from daedalus.cli.child_output import ChildOutput
+from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.cli.evaluation_processes import EvaluationFailedError, EvaluationProcess, without_episodes
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.policy.saving.saved_policy import checkpoint_path
@@ -89,36 +88,3 @@ class Confirmations:
         if self._playing is not None:
             self._playing.close()
             self._playing = None
-
-
-def mean_interval(mean: float, std: float, count: int) -> tuple[float, float] | None:
-    """Return the 95 % interval of a mean over `count` values, or None for a single value.
-
-        mean +- t s / sqrt(n),  s^2 = n / (n - 1) std^2
-
-    with the 97.5 % quantile t of Student's distribution, n - 1 degrees of freedom.
-
-    Args:
-      mean, std: of the values; std is that of the values themselves, with n in the denominator.
-    """
-    if count < 2:
-        return None
-    error = _t_quantile(count - 1) * std / math.sqrt(count - 1)
-    return mean - error, mean + error
-
-
-def _t_quantile(freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's t. Exact for 1 and 2 degrees of freedom, within 0.5 % for more.
-
-    Abramowitz & Stegun (1964), equation 26.7.5.
-    """
-    if freedom <= 2:
-        return (12.7062, 4.3027)[freedom - 1]
-    z = NormalDist().inv_cdf(0.975)
-    terms = (
-        z,
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-    )
-    return sum(term / freedom**power for power, term in enumerate(terms))

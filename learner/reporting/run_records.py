@@ -3,7 +3,6 @@
 import logging
 from typing import TYPE_CHECKING, Any
 
-from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.reporting.metrics_file import read_rows
 from daedalus.learner.reporting.recorder import Recorder
 from daedalus.learner.reporting.run_reporter import RunReporter
@@ -11,6 +10,7 @@ from daedalus.learner.run.event_file import EventFile
 from daedalus.learner.run.run_directory import METRICS, SUMMARY, write_json
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.events import EventLog
+from daedalus.learner.serving.metrics_history import MetricsHistory
 
 if TYPE_CHECKING:
     from daedalus.learner.training.learner import Learner

@@ -4,9 +4,11 @@ import math
 import threading
 from typing import TYPE_CHECKING, Any
 
+from daedalus.learner.reporting.episode_hint import EpisodeHint
 from daedalus.learner.reporting.learning_hint import LearningHint
 from daedalus.learner.reporting.metrics import Details
-from daedalus.learner.reporting.report import EpisodeHint, RateMeter, metrics_row, run_status, summary
+from daedalus.learner.reporting.rates import RateMeter
+from daedalus.learner.reporting.report import metrics_row, run_status, summary
 from daedalus.learner.reporting.user_metrics import UserMetrics
 from daedalus.learner.run.run_state import RunState
 from daedalus.learner.serving.fleet import Fleet

@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable
 from types import MappingProxyType
 
-from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.serving.evaluation_queue import EvaluationQueue
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.gradient_checks import Shapes
+from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.learner.serving.orders import Orders
 from daedalus.learner.serving.query_responses import QueryResponses
 from daedalus.learner.serving.requests import read_request

@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 
-from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.serving.events import EventLog
 from daedalus.learner.serving.fleet import Fleet
 from daedalus.learner.serving.fleet_status import page
+from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.learner.serving.requests import read_request
 from daedalus.protocol.limits import STATUS_REQUEST_LIMITS
 from daedalus.protocol.messages import (

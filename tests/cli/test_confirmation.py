@@ -9,8 +9,9 @@ import pytest
 
 from daedalus.cli.child_output import ChildOutput
 from daedalus.cli.commands.evaluate_arguments import parser
+from daedalus.cli.comparing.statistics import mean_interval
 from daedalus.cli.running import confirmation as module
-from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments, mean_interval
+from daedalus.cli.running.confirmation import Confirmations, confirmation, confirmation_arguments
 from daedalus.learner.run.confirmation_file import ConfirmationFile
 from daedalus.protocol.spec import EnvironmentSpec, EvaluationSpec, RunSpec, TrainingSpec
 

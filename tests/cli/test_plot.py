@@ -8,7 +8,8 @@ import pytest
 from recorded_runs import record
 
 from daedalus.cli.commands.plot import plot
-from daedalus.cli.comparing.drawing import COLUMNS, evaluations
+from daedalus.cli.comparing.curves import evaluations
+from daedalus.cli.comparing.drawing import COLUMNS
 from daedalus.cli.comparing.recorded_run import read_run
 
 EVALUATED = """\

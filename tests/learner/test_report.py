@@ -11,10 +11,10 @@ import pytest
 from building import EPOCH, POLICY, SPACES, joined_fleet, make_rollout, run_spec
 
 from daedalus.algorithms.diagnostics import VALUE_ERROR_QUANTILES
+from daedalus.learner.reporting.episode_hint import EpisodeHint
 from daedalus.learner.reporting.metrics import COLUMNS
+from daedalus.learner.reporting.rates import RateMeter
 from daedalus.learner.reporting.report import (
-    EpisodeHint,
-    RateMeter,
     episode_statistics,
     metrics_row,
     run_status,

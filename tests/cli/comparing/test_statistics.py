@@ -59,11 +59,10 @@ class TestBootstrap:
         low, high = stratified_bootstrap(
             [first, second],
             lambda samples: np.mean([sample.mean(1) for sample in samples], axis=0),
-            confidence=0.8,
             repetitions=50_000,
         )
-        assert low == means[math.ceil(0.1 * len(means)) - 1]
-        assert high == means[math.ceil(0.9 * len(means)) - 1]
+        assert low == means[math.ceil(0.025 * len(means)) - 1]
+        assert high == means[math.ceil(0.975 * len(means)) - 1]
 
     def test_tasks_are_resampled_alone(self) -> None:
         """Runs of one task always have the same score: samples that mixed the tasks would vary."""

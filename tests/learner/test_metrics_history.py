@@ -1,15 +1,15 @@
-"""learner/reporting/history.py and metrics_file.py: the metrics of a whole run, bounded, and read from its file."""
+"""learner/serving/metrics_history.py and metrics_file.py: the metrics of a run, bounded, and read from its file."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from daedalus.learner.reporting import history as history_module
 from daedalus.learner.reporting.csv_writer import CsvWriter
-from daedalus.learner.reporting.history import MetricsHistory
 from daedalus.learner.reporting.metrics import Details
 from daedalus.learner.reporting.metrics_file import read_rows
+from daedalus.learner.serving import metrics_history
+from daedalus.learner.serving.metrics_history import MetricsHistory
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.limits import METRICS_LIMITS
 from daedalus.protocol.metrics import MAX_PAGE_VALUES, MetricsReport
@@ -44,7 +44,7 @@ def test_rows_have_a_value_for_each_column_that_any_of_them_has() -> None:
 
 
 def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(history_module, "MAX_ROWS", 8)
+    monkeypatch.setattr(metrics_history, "MAX_ROWS", 8)
     history, steps = MetricsHistory(), list[float]()
     for step in range(1000):
         history.add({"env_steps": step})
@@ -56,7 +56,7 @@ def test_a_long_run_is_thinned_over_its_whole_length_and_keeps_the_newest_row(mo
 
 
 def test_an_evaluation_survives_the_row_that_it_came_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(history_module, "MAX_ROWS", 4)
+    monkeypatch.setattr(metrics_history, "MAX_ROWS", 4)
     history = MetricsHistory()
     for step in range(33):
         evaluation = {"evaluation_return_mean": float(step), "evaluation_env_steps": step} if step % 16 == 3 else {}
