@@ -9,16 +9,10 @@ import torch
 from torch import Tensor
 
 from daedalus.algorithms.ranks import ONE_RANK, RankPart, Ranks
+from daedalus.policy.network.components import Components, map_components
 from daedalus.protocol.frames import stack_rows
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.uploads import Rollout
-
-Components = dict[str, Tensor]
-
-
-def each(components: Components, function: Callable[[Tensor], Tensor]) -> Components:
-    """Return the map with `function` applied to each component."""
-    return {name: function(values) for name, values in components.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +53,7 @@ class Batch:
         for part in fields(self):
             values = getattr(self, part.name)
             if isinstance(values, dict):
-                mapped[part.name] = each(values, function)
+                mapped[part.name] = map_components(values, function)
             elif isinstance(values, Tensor):
                 mapped[part.name] = function(values)
         return replace(self, **mapped)

@@ -6,9 +6,9 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Components
 from daedalus.algorithms.flat_parameters import FlatParameters
 from daedalus.policy.network.actor_critic import ActorCritic
+from daedalus.policy.network.components import Components
 
 
 class Forward:

@@ -8,8 +8,9 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from daedalus.algorithms.batch import Batch, Components, each
+from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
+from daedalus.policy.network.components import Components, map_components
 
 _LARGE_BYTES = 4096  # of one row of a component, from which on it is not copied for a whole pass
 
@@ -80,11 +81,11 @@ def _by_environment(
         valid = batch.valid[:, part] if len(part) else torch.zeros_like(batch.valid[:, :1])
         part = part if len(part) else part.new_zeros(1)
         yield Minibatch(
-            observations=each(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
+            observations=map_components(batch.observations, partial(_columns, part=part, rows=len(batch.rewards))),
             initial_state=batch.initial_state[part],
             starts=batch.starts[:-1, part],
-            actions=each(batch.actions, partial(_columns, part=part)),
-            masks=each(batch.masks, partial(_columns, part=part)),
+            actions=map_components(batch.actions, partial(_columns, part=part)),
+            masks=map_components(batch.masks, partial(_columns, part=part)),
             log_probs=log_probs[:, part],
             targets=targets[:, part],
             factors=factors[:, part],
@@ -123,7 +124,7 @@ def _by_row(batch: Batch, log_probs: Tensor, targets: Tensor, factors: Tensor, c
     arrays = [parts_of(values) for values in (batch.starts, log_probs, targets, factors)]
     for index, part in enumerate(own):
         starts, own_log_probs, own_targets, own_factors = (parts[index] for parts in arrays)
-        gathered = each(large, partial(_rows, rows=part))
+        gathered = map_components(large, partial(_rows, rows=part))
         yield Minibatch(
             observations={name: parts[index] for name, parts in small.items()} | gathered,
             initial_state=states[sizes[index]],

@@ -6,8 +6,9 @@ from typing import Any
 import torch
 
 from daedalus.algorithms.algorithm import Algorithm
-from daedalus.algorithms.batch import Batch, BatchAssembler, each
+from daedalus.algorithms.batch import Batch, BatchAssembler
 from daedalus.algorithms.errors import AlgorithmError
+from daedalus.policy.network.components import map_components
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
@@ -65,7 +66,7 @@ def check_updates(
     Raises AlgorithmError.
     """
     batch = BatchAssembler(spaces, torch.device("cpu")).allocate(_ROWS, _ENVIRONMENTS, state_size)
-    each(batch.masks, lambda mask: mask.fill_(True))
+    map_components(batch.masks, lambda mask: mask.fill_(True))
     batch.valid.fill_(1.0)
     expected = spec.updates_from(_ENVIRONMENTS if state_size else _ROWS * _ENVIRONMENTS)
     try:

@@ -1,10 +1,10 @@
 """Which components of the observations a policy normalises. No torch: the learner checks gradients with it."""
 
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spaces import ArraySpace, ObservationSpaces
 from daedalus.protocol.spec import PolicySpec
 
 
-def normalized_components(policy: PolicySpec, spaces: dict[str, ArraySpace | DiscreteSpace]) -> dict[str, ArraySpace]:
+def normalized_components(policy: PolicySpec, spaces: ObservationSpaces) -> dict[str, ArraySpace]:
     """Return the arrays that `normalize_observations` normalises: all but the bytes of an encoder for bytes.
 
     The encoders for images and those of users take `uint8` as it is. Only the multilayer perceptron reads bytes as

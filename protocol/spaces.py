@@ -179,6 +179,7 @@ class ContinuousSpace(Specification):
 
 
 ObservationSpace = Annotated[ArraySpace | DiscreteSpace, Field(discriminator="kind")]
+ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]  # by component
 ActionSpace = Annotated[DiscreteSpace | ContinuousSpace, Field(discriminator="kind")]
 
 

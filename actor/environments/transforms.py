@@ -19,10 +19,8 @@ from daedalus.actor.environments.interface import BackendEnvironments, Observed,
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, Masks, ObservedMasks, mask_of_one
 from daedalus.actor.environments.pixels import Pixels
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, Spaces
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces, Spaces
 from daedalus.protocol.spec import EnvironmentSpec
-
-ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 
 
 class Transforms:

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.components import Components
 from daedalus.policy.network.distributions.joint import ActionDistribution
 from daedalus.policy.network.encoders import build_encoder
 from daedalus.policy.network.exploration import Exploration
@@ -17,8 +18,6 @@ from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
 
 _POLICY_GAIN = 0.01  # the initial policy is nearly uniform for every observation
-
-Components = dict[str, Tensor]
 
 
 class ActorCritic(nn.Module):

@@ -11,15 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.custom_module import find_class
-from daedalus.policy.network.encoder_trial import Tensors, check_recording
+from daedalus.policy.network.encoder_trial import PositionalEncoder, check_recording
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.normalized import normalized_components
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModuleError, UserModules
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
 from daedalus.protocol.spec import PolicySpec
-
-ObservationSpaces = dict[str, ArraySpace | DiscreteSpace]
 
 
 class CustomEncoder(nn.Module):
@@ -38,7 +36,7 @@ class CustomEncoder(nn.Module):
             self.module = encoder(shapes if self._only is None else shapes[self._only])
             zeros = _zeros(spaces)
             self.features = _checked_features(self.module, self._inputs(zeros))
-            check_recording(Tensors(self.module, self.forward, tuple(zeros)), tuple(zeros.values()), spaces)
+            check_recording(PositionalEncoder(self.module, self.forward, tuple(zeros)), tuple(zeros.values()), spaces)
         except UserModuleError as error:
             raise NetworkError(str(error)) from error.__cause__
         except NetworkError as error:

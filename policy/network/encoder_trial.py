@@ -8,15 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.errors import NetworkError
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
 
 _ROWS = 3  # not the number of rows of the recording
 _TOLERANCE = 1e-3
 
-Spaces = dict[str, ArraySpace | DiscreteSpace]
 
-
-class Tensors(nn.Module):
+class PositionalEncoder(nn.Module):
     """A module that takes the tensors of its components one by one, in the order of their names."""
 
     def __init__(self, module: nn.Module, call: Callable[[dict[str, Tensor]], Tensor], names: tuple[str, ...]) -> None:
@@ -28,7 +26,7 @@ class Tensors(nn.Module):
         return self._call(dict(zip(self._names, tensors, strict=True)))
 
 
-def check_recording(encoder: Tensors, example: tuple[Tensor, ...], spaces: Spaces) -> None:
+def check_recording(encoder: PositionalEncoder, example: tuple[Tensor, ...], spaces: ObservationSpaces) -> None:
     """Raise NetworkError if the features of some observations are others in a recording of the call with an example.
 
     Torch records the operations of one call for the program of the actors: Python code that depends on values is not
@@ -53,7 +51,7 @@ def check_recording(encoder: Tensors, example: tuple[Tensor, ...], spaces: Space
             module.training = mode
 
 
-def _compare(encoder: Tensors, recorded: Callable[..., Tensor], tensors: tuple[Tensor, ...]) -> None:
+def _compare(encoder: PositionalEncoder, recorded: Callable[..., Tensor], tensors: tuple[Tensor, ...]) -> None:
     features = encoder(*tensors)
     if not _equal(features, encoder(*tensors)):
         raise NetworkError(
@@ -88,7 +86,7 @@ def _equal(first: Tensor, second: Tensor) -> bool:
     return torch.allclose(first, second, rtol=_TOLERANCE, atol=limit, equal_nan=True)
 
 
-def _observations(spaces: Spaces) -> Iterator[tuple[Tensor, ...]]:
+def _observations(spaces: ObservationSpaces) -> Iterator[tuple[Tensor, ...]]:
     """Yield random observations: of small whole numbers, then of larger ones of one sign, then of both."""
     generator = torch.Generator().manual_seed(0)
 

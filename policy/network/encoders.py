@@ -11,17 +11,16 @@ import torch
 from torch import Tensor, nn
 
 from daedalus.policy.network.choices import variables_and_values
+from daedalus.policy.network.components import Components
 from daedalus.policy.network.convolutional import ArticleEncoder, ImageEncoder, impala, nature, small
-from daedalus.policy.network.custom_encoder import CustomEncoder, ObservationSpaces
+from daedalus.policy.network.custom_encoder import CustomEncoder
 from daedalus.policy.network.errors import NetworkError
 from daedalus.policy.network.perceptron import Perceptron
 from daedalus.policy.user_modules import NO_MODULES, UserModules
-from daedalus.protocol.spaces import ArraySpace, DiscreteSpace
+from daedalus.protocol.spaces import ArraySpace, DiscreteSpace, ObservationSpaces
 from daedalus.protocol.spec import PolicySpec
 
 _SMALLEST_FOR_NATURE = 36  # pixels of the shorter side
-
-Observations = dict[str, Tensor]
 
 
 class FlatEncoder(nn.Module):
@@ -43,7 +42,7 @@ class FlatEncoder(nn.Module):
             if isinstance(space, DiscreteSpace)
         }
 
-    def forward(self, observations: Observations) -> Tensor:
+    def forward(self, observations: Components) -> Tensor:
         """Encode observations."""
         if self._first_columns is not None:
             choices = torch.cat([observations[name] for name in self._spaces], -1)
@@ -76,7 +75,7 @@ class ArrayEncoder(nn.Module):
         for child_name, child in encoder.named_children():
             self.add_module(child_name, child)
 
-    def forward(self, observations: Observations) -> Tensor:
+    def forward(self, observations: Components) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
         return self._encoder[0](observations[self._name])
 
@@ -93,7 +92,7 @@ class CompositeEncoder(nn.Module):
         self.features = sum(encoder.features for encoder in encoders)
         self.features += self.others.features if self.others is not None else 0
 
-    def forward(self, observations: Observations) -> Tensor:
+    def forward(self, observations: Components) -> Tensor:
         """Encode observations: {name: [N, *stacked_shape]} -> [N, features]."""
         parts = [encoder(observations[name]) for name, encoder in zip(self._names, self.images, strict=True)]
         if self.others is not None:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.components import Components
 from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
 from daedalus.policy.network.distributions.distribution import Distribution
 from daedalus.policy.network.distributions.joint import ActionDistribution
@@ -16,8 +17,6 @@ ANNEALING = "exploration.annealing"  # name of the parameter in a network
 
 _NEVER = -1e30  # logarithm of the weight of a part that is never chosen from
 _SMALLEST = 1e-30  # argument of a logarithm
-
-Components = dict[str, Tensor]
 
 
 class Exploration(nn.Module):

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from daedalus.policy.network.components import Components
 from daedalus.policy.network.custom_module import find_class
 from daedalus.policy.network.distributions.categorical import Categorical, without_illegal
 from daedalus.policy.network.distributions.distribution import Distribution
@@ -15,8 +16,6 @@ from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
 from daedalus.protocol.spaces import ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec, TrainingSpec
-
-Components = dict[str, Tensor]
 
 
 class ActionDistribution(nn.Module):
