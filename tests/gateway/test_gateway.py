@@ -332,18 +332,21 @@ def test_client_that_disconnects_while_it_waits_for_a_learner_leaves_its_name(
     until(lambda: gateway.call(lambda: not gateway.gateway._seats))
 
 
+@pytest.mark.parametrize("early", [1, ROWS + 1])
 def test_messages_that_come_before_the_answer_to_hello_are_answered_in_turn(
-    network: MemoryNetwork, gateway: RunningGateway, connect: Connect
+    network: MemoryNetwork, gateway: RunningGateway, connect: Connect, early: int
 ) -> None:
     client = connect()
     client.send("hello", version=1, name="early", **CARTPOLE)
-    for step in range(ROWS + 1):
+    for step in range(early):
         client.send("act", observation=[float(step), 0.0, 0.0, 0.0])
     until(lambda: gateway.call(lambda: "early" in gateway.gateway._seats))
     learner = ScriptedLearner(network)
     learner.publish(0)
     try:
-        assert [client.receive()["type"] for _ in range(ROWS + 2)] == ["welcome", *["action"] * (ROWS + 1)]
+        assert [client.receive()["type"] for _ in range(1 + early)] == ["welcome", *["action"] * early]
+        for step in range(early, ROWS + 1):
+            client.act([float(step), 0.0, 0.0, 0.0])
         rollout, _ = learner.receive()
         assert rollout.frames["observation"][:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     finally:
