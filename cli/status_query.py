@@ -44,15 +44,10 @@ def ask_events(transport: Transport, status: RunStatus) -> EventsPage | None:
     return None
 
 
-def fleet_size(status: RunStatus) -> int:
-    """Return the number of actors of a run, on whatever page they are."""
-    return status.actors_alive + status.actors_quarantined + status.actors_gone
-
-
 def _with_actors(transport: Transport, status: RunStatus, max_actors: int | None) -> RunStatus:
     """Return the status with the actors of the further pages, as far as the learner answers in time."""
     actors, deadline = list(status.actors), time.monotonic() + _PAGES_SECONDS
-    wanted = fleet_size(status) if max_actors is None else min(fleet_size(status), max_actors)
+    wanted = status.fleet_size if max_actors is None else min(status.fleet_size, max_actors)
     while actors and len(actors) < wanted and time.monotonic() < deadline:
         more = _page(transport, status, actors[-1].actor)
         if not more:

@@ -111,3 +111,8 @@ class RunStatus(Specification):
     actors_gone: int  # absent for less than a minute; later they are forgotten, and only the totals above include them
     refused_joins: tuple[RefusedJoin, ...]  # of the last hour, the newest last
     actors: tuple[ActorStatus, ...]  # sorted by name
+
+    @property
+    def fleet_size(self) -> int:
+        """Number of actors of the run, on whatever page they are."""
+        return self.actors_alive + self.actors_quarantined + self.actors_gone

@@ -293,7 +293,7 @@ def evaluated(directory: Path, seed: int) -> tuple[float, int]:
     saved = find_policy(directory)
     runtime = OnnxRuntime(saved.program)
     runtime.load(saved.weights)
-    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1, for_evaluation=True)
+    environments = make_environments(saved.spec.environment.as_evaluated("gymnasium"), 1, one_episode=True)
     try:
         evaluation = play_episodes(runtime, environments, 1, seed, sampled=False)
     finally:

@@ -31,7 +31,7 @@ def check_listening(endpoints: list[str], *, tls: bool, insecure: bool) -> None:
             _check_folder(endpoint, os.path.dirname(host))
         if protocol == "tls" and not tls:
             raise AddressError(f"{endpoint} needs certificates: --tls DIR (create them with daedalus certs)")
-        if protocol == "tcp" and not insecure and not _is_loopback(host):
+        if protocol == "tcp" and not insecure and not is_loopback(host):
             secure = f"listen on tls/{endpoint.partition('/')[2]}" if tls else "use certificates (--tls DIR)"
             raise AddressError(
                 f"{endpoint} is unencrypted and open to every host that can reach it: {secure}, "
@@ -96,7 +96,8 @@ def _check_folder(endpoint: str, folder: str) -> None:
         raise AddressError(f"{endpoint} is open to other users of this machine: its folder must be yours and mode 700")
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address is that of this host alone."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

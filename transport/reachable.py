@@ -5,6 +5,8 @@ import socket
 from collections.abc import Sequence
 from contextlib import suppress
 
+from daedalus.transport.addresses import is_loopback
+
 # Of the documentation's network (RFC 5737): a UDP socket that is connected to it sends nothing.
 _ELSEWHERE = ("192.0.2.1", 9)
 
@@ -30,7 +32,7 @@ def reachable(endpoints: Sequence[str], certificate_hosts: Sequence[str] = ()) -
 
 
 def _hosts(certificate_hosts: Sequence[str]) -> list[str]:
-    elsewhere = [host for host in certificate_hosts if not _is_loopback(host)]
+    elsewhere = [host for host in certificate_hosts if not is_loopback(host)]
     return elsewhere or list(certificate_hosts) or [socket.gethostname(), *_own_address()]
 
 
@@ -46,12 +48,6 @@ def _is_unspecified(host: str) -> bool:
     with suppress(ValueError):
         return ipaddress.ip_address(host).is_unspecified
     return False
-
-
-def _is_loopback(host: str) -> bool:
-    with suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
 
 
 def _bracketed(host: str) -> str:

@@ -102,7 +102,7 @@ def make_gymnasium(
 ) -> GymnasiumEnvironments:
     """Return `count` environments: by their own vector entry point if possible, else stepped in turn or in processes.
 
-    See make_environments for the arguments; `one_episode` is its `for_evaluation`. Raises EnvironmentSetupError.
+    See make_environments for the arguments. Raises EnvironmentSetupError.
     """
     if camera is not None and (count != 1 or render_mode != "rgb_array"):
         raise ValueError(f"a camera needs one environment in render_mode 'rgb_array', not {count} in {render_mode!r}")

@@ -18,7 +18,7 @@ def make_environments(
     modules: UserModules = NO_MODULES,
     render_mode: str | None = None,
     camera: Callable[[np.ndarray], None] | None = None,
-    for_evaluation: bool = False,
+    one_episode: bool = False,
 ) -> VectorEnvironment:
     """Return `count` environments of one kind, created by the backend that the specification names.
 
@@ -29,9 +29,9 @@ def make_environments(
       render_mode: gymnasium's; "human" opens a window, and a camera needs "rgb_array".
       camera: called with the rendered image [H, W, 3] uint8 after each reset and after every step, repeated ones
         included. Requires count 1.
-      for_evaluation: environment e of `reset(seed)` plays an episode that its seed, `seed` + e, determines, however
-        many environments there are. It need not play another. Environments that share one random generator, because
-        gymnasium registers them with a vector entry point only, are reduced to one environment.
+      one_episode: for evaluations: environment e of `reset(seed)` plays an episode that its seed, `seed` + e,
+        determines, however many environments there are. It need not play another. Environments that share one random
+        generator, because gymnasium registers them with a vector entry point only, are reduced to one environment.
 
     Only the gymnasium backend supports a wrapper, `render_mode` and `camera`.
 
@@ -43,9 +43,9 @@ def make_environments(
         raise EnvironmentSetupError(str(error)) from None
     if spec.backend != "gymnasium":
         _refuse_gymnasium_options(spec, {"wrap": spec.wrap, "render_mode": render_mode, "camera": camera})
-    bare, rest = make_bare(spec, count, modules, render_mode, camera, for_evaluation)
+    bare, rest = make_bare(spec, count, modules, render_mode, camera, one_episode)
     try:
-        return TransformedEnvironment(bare, rest, for_evaluation=for_evaluation)
+        return TransformedEnvironment(bare, rest, one_episode=one_episode)
     except EnvironmentSetupError:
         bare.close()
         raise
@@ -57,7 +57,7 @@ def make_bare(
     modules: UserModules,
     render_mode: str | None = None,
     camera: Callable[[np.ndarray], None] | None = None,
-    for_evaluation: bool = False,
+    one_episode: bool = False,
 ) -> tuple[BackendEnvironments, EnvironmentSpec]:
     """Return the backend's environments, and the specification without the transforms that the backend does itself.
 
@@ -77,7 +77,7 @@ def make_bare(
             from daedalus.actor.environments.gymnasium_backend import make_gymnasium
 
             environments = make_gymnasium(
-                spec, count, modules=modules, render_mode=render_mode, camera=camera, one_episode=for_evaluation
+                spec, count, modules=modules, render_mode=render_mode, camera=camera, one_episode=one_episode
             )
             return environments, spec
 

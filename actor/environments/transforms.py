@@ -121,15 +121,13 @@ class Transforms:
 class TransformedEnvironment:
     """A VectorEnvironment: a backend's environments with the specification's transforms."""
 
-    def __init__(
-        self, environments: BackendEnvironments, spec: EnvironmentSpec, *, for_evaluation: bool = False
-    ) -> None:
+    def __init__(self, environments: BackendEnvironments, spec: EnvironmentSpec, *, one_episode: bool = False) -> None:
         """Raises EnvironmentSetupError if the specification does not fit the environments.
 
-        For `for_evaluation` see make_environments.
+        For `one_episode` see make_environments.
         """
         self._environments = environments
-        self._one_episode = for_evaluation
+        self._one_episode = one_episode
         self._over = np.zeros(environments.count, np.bool_)  # [E] whether the only episode of each has ended
         self._transforms = Transforms(
             spec, environments.observation_space, environments.action_space, environments.action_mask

@@ -54,7 +54,7 @@ class EpisodeCamera:
         environment = as_on_gymnasium(spec.environment).model_copy(update={"processes": False})
         self._picture = np.zeros((1, 1, 3), np.uint8)
         self._environments = make_environments(
-            environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, for_evaluation=True
+            environment, 1, modules=modules, render_mode="rgb_array", camera=self._film, one_episode=True
         )
         self._longest = spec.evaluation.max_episode_env_steps
         self._random = np.random.default_rng()

@@ -76,7 +76,7 @@ class Evaluator:
         )
         environment = spec.environment.as_evaluated()
         count = environments_for(episodes, environment, spec.collection)
-        environments = make_environments(environment, count, modules=self._config.modules, for_evaluation=True)
+        environments = make_environments(environment, count, modules=self._config.modules, one_episode=True)
         try:
             due = time.monotonic() + interval
             for number in itertools.count():

@@ -167,7 +167,7 @@ def _play(
         modules=modules,
         render_mode="rgb_array" if video is not None else "human" if arguments.render else None,
         camera=None if video is None else video.add,
-        for_evaluation=True,
+        one_episode=True,
     )
     try:
         if video is not None:

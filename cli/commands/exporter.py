@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.cli.processes import stop_on_signals
-from daedalus.cli.status_query import ask, fleet_size
+from daedalus.cli.status_query import ask
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import RunStatus
 from daedalus.transport.connecting import connect_with_retry
@@ -87,12 +87,12 @@ class StatusCollector:
     def _warn_of_large_fleet(self, statuses: list[RunStatus]) -> None:
         """Warn once if not all actors have series of their own."""
         for status in statuses:
-            if fleet_size(status) > len(status.actors) and not self._warned:
+            if status.fleet_size > len(status.actors) and not self._warned:
                 self._warned = True
                 _logger.warning(
                     "run %r has %d actors: %d of them have metrics of their own; those of the run are over all",
                     status.run,
-                    fleet_size(status),
+                    status.fleet_size,
                     len(status.actors),
                 )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from daedalus.cli.arguments import add_connect, add_tls, command_parser
 from daedalus.cli.logs import one_line, print_error, printable
-from daedalus.cli.status_query import ask, ask_events, fleet_size, no_answer
+from daedalus.cli.status_query import ask, ask_events, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
 from daedalus.learner.run.heartbeat import silence
@@ -217,7 +217,7 @@ def _expiry(days: float | None) -> list[str]:
 
 
 def _missing_actors(status: RunStatus) -> list[str]:
-    missing = fleet_size(status) - len(status.actors)
+    missing = status.fleet_size - len(status.actors)
     return [f"  ... and {missing:,} more, which the learner did not report in time"] if missing > 0 else []
 
 

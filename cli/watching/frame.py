@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from daedalus.cli.logs import one_line
-from daedalus.cli.status_query import fleet_size
 from daedalus.cli.watching.sparkline import ASCII, BLOCKS, sparkline
 from daedalus.cli.watching.watched_run import WatchedRun
 from daedalus.learner.reporting.progress import duration
@@ -51,7 +50,7 @@ def _run(run: WatchedRun, width: int, lines: int, ascii_only: bool) -> list[Rend
     problems = [_line([f"PROBLEM: {problem}"], width, "yellow") for problem in status.problems[:_SHOWN_PROBLEMS]]
     lines = max(lines - len(problems), 0)
     shown = status.actors[:lines]
-    more = fleet_size(status) - len(shown)
+    more = status.fleet_size - len(shown)
     parts: list[RenderableType] = [*_head(run, width, ascii_only), *problems]
     if shown:
         parts.append(_actors(shown, width))

@@ -91,7 +91,7 @@ class RunMonitor:
         seen = self._seen
         if seen.status is not None and seen.status.learner_epoch != status.learner_epoch:
             seen = Observation(generation=seen.generation + 1)
-        if has_all or len(status.actors) >= _size(status):
+        if has_all or len(status.actors) >= status.fleet_size:
             seen = replace(seen, actors=_unless_equal(seen.actors, status.actors))
             self._actors_due = time.monotonic() + len(status.actors) / _ACTORS_PER_SECOND
         page = self._source.events(status)
@@ -115,10 +115,6 @@ class RunMonitor:
                 row = {name: value for name, value in zip(names, values, strict=True) if value == value}
                 rows.append((number, row))
         return seen if len(rows) == len(seen.rows) else replace(seen, rows=tuple(rows))
-
-
-def _size(status: RunStatus) -> int:
-    return status.actors_alive + status.actors_quarantined + status.actors_gone
 
 
 def _unless_equal(old: tuple[ActorStatus, ...], new: tuple[ActorStatus, ...]) -> tuple[ActorStatus, ...]:

@@ -16,7 +16,7 @@ from daedalus.learner.serving.gradient_checks import Shapes, gradient_limits, gr
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import Limits
 from daedalus.protocol.messages import Acknowledgement
-from daedalus.protocol.spaces import DiscreteSpace, Spaces
+from daedalus.protocol.spaces import LARGEST_REWARD, DiscreteSpace, Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Gradient, Rollout, Upload
@@ -34,7 +34,7 @@ _MAX_ROLLOUT_BYTES, _MAX_ROLLOUTS = 64 << 20, 8
 _LARGEST = {
     "initial_state": 1.001,
     "behaviour_log_probs": 1e6,
-    "rewards": 1e9,
+    "rewards": LARGEST_REWARD,
     "episode_returns": math.inf,
 }
 _REMEDIES = {
@@ -83,7 +83,7 @@ class RolloutJudge:
         if size > queue:
             reason = (
                 f"the rollout has {size:,} bytes, and service.queue_megabytes allows {queue:,}: raise that setting, or "
-                "use fewer environments per actor (--envs)"
+                "use fewer environments per actor (collection.envs_per_actor, or --envs of daedalus actor)"
             )
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         return None
@@ -110,7 +110,7 @@ class RolloutJudge:
         if limits.max_bytes > most:
             reason = (
                 f"a rollout of {actor.environments} environments has {limits.max_bytes:,} bytes, at most {most:,} are "
-                "allowed: use fewer environments per actor (--envs)"
+                "allowed: use fewer environments per actor (collection.envs_per_actor, or --envs of daedalus actor)"
             )
             return Rejected(verdict="rejected", cause="unfit", reason=reason)
         try:

@@ -24,9 +24,8 @@ from daedalus.actor.checking.report import (
 )
 from daedalus.actor.checking.statistics import unsaved_statistics
 from daedalus.actor.checking.violations import observation_violations, step_violations
-from daedalus.learner.serving import rollout_judge
 from daedalus.policy.user_modules import UserModules
-from daedalus.protocol.spaces import LARGEST_REWARD, ArraySpace, ContinuousSpace
+from daedalus.protocol.spaces import ArraySpace, ContinuousSpace
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
 
 FAULTY = "faulty_environments:Faulty-v0"
@@ -173,10 +172,6 @@ def test_reward_that_the_learner_rejects_is_a_problem(settings: dict[str, float]
     report = check("large reward", **settings)
     text = "step returns the reward -1e+12, but learning takes rewards within +-1e+09: set environment.reward_scale"
     assert report.problems == ((f"environment {FAULTY}: {text} (after 1 env_steps)",) if is_problem else ())
-
-
-def test_largest_reward_is_that_of_the_learner() -> None:
-    assert rollout_judge._LARGEST["rewards"] == LARGEST_REWARD
 
 
 @pytest.mark.parametrize("attribute", ["observation_space", "action_space"])

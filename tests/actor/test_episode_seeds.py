@@ -38,7 +38,7 @@ def runtime(spaces: Spaces, **policy: Any) -> OnnxRuntime:
 def played(
     spec: EnvironmentSpec, count: int, *, sampled: bool = True, episodes: int = EPISODES, seed: int = 1, **policy: Any
 ) -> Evaluation:
-    environments = make_environments(spec, count, modules=TEST_MODULES, for_evaluation=True)
+    environments = make_environments(spec, count, modules=TEST_MODULES, one_episode=True)
     try:
         return play_episodes(runtime(environments.spaces, **policy), environments, episodes, seed, sampled=sampled)
     finally:
@@ -95,7 +95,7 @@ def test_environment_with_a_vector_entry_point_only_plays_one_episode_at_a_time(
     gymnasium.register("VectorCartPole-v0", vector_entry_point=gymnasium.spec("CartPole-v1").vector_entry_point)
     try:
         spec = EnvironmentSpec(id="VectorCartPole-v0")
-        environments = make_environments(spec, 8, for_evaluation=True)
+        environments = make_environments(spec, 8, one_episode=True)
         assert environments.count == 1
         environments.close()
         assert_same([played(spec, count) for count in (1, 8)], differing=4)
@@ -136,7 +136,7 @@ def test_environment_stands_still_after_its_episode() -> None:
     gymnasium.register("Steps-v0", Steps)
     try:
         environments: VectorEnvironment = make_environments(
-            EnvironmentSpec(id="Steps-v0", kwargs={"ends": [2, 7]}), 3, for_evaluation=True
+            EnvironmentSpec(id="Steps-v0", kwargs={"ends": [2, 7]}), 3, one_episode=True
         )
         Steps.steps = Steps.resets = 0
         evaluation = play_episodes(runtime(environments.spaces), environments, 4, 1, sampled=False)
@@ -163,7 +163,7 @@ class SmallestBatch(PlainPolicy):
 
 def test_single_environment_is_computed_as_a_batch_of_two() -> None:
     """A batch of one row is rounded differently, which may change a greedy action."""
-    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 1, for_evaluation=True)
+    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 1, one_episode=True)
     policy = SmallestBatch()
     play_episodes(policy, environments, 1, 1, sampled=True)
     assert policy.rows == 2

@@ -69,7 +69,7 @@ def one_by_one(episodes: int) -> list[tuple[float, int]]:
 
 
 def counting(count: int, **fields: Any) -> VectorEnvironment:
-    return make_environments(COUNTING.model_copy(update=fields), count, modules=TEST_MODULES, for_evaluation=True)
+    return make_environments(COUNTING.model_copy(update=fields), count, modules=TEST_MODULES, one_episode=True)
 
 
 def test_each_environment_plays_one_episode_of_each_round() -> None:
@@ -90,7 +90,7 @@ def test_stacks_and_memory_equal_those_of_episodes_played_one_by_one() -> None:
 
 def test_short_episodes_are_not_favoured() -> None:
     """Counting whichever episodes end first would count more short ones."""
-    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 50, for_evaluation=True)
+    environments = make_environments(EnvironmentSpec(id="CartPole-v1"), 50, one_episode=True)
     few = play_episodes(AlwaysZero(), environments, 50, 1, sampled=False)
     many = play_episodes(AlwaysZero(), environments, 2000, 1, sampled=False)
     assert len(few.returns) == 50
@@ -141,7 +141,7 @@ def test_progress_may_end_the_evaluation() -> None:
 def test_a_reward_that_is_not_finite_ends_the_evaluation() -> None:
     spec = EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": "reward"})
     modules = UserModules(frozenset({"faulty_environments"}))
-    environments = make_environments(spec, 2, modules=modules, for_evaluation=True)
+    environments = make_environments(spec, 2, modules=modules, one_episode=True)
     with pytest.raises(EnvironmentSetupError, match="gave the reward nan in episode 1 of the evaluation"):
         play_episodes(AlwaysZero(), environments, 2, 1, sampled=False)
 

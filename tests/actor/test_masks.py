@@ -203,11 +203,11 @@ def test_none_in_place_of_a_mask_is_none(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("convention", ["none in reset", "null in reset"])
-@pytest.mark.parametrize("for_evaluation", [False, True])
-def test_masks_that_come_only_with_steps_are_refused(convention: str, for_evaluation: bool) -> None:
+@pytest.mark.parametrize("one_episode", [False, True])
+def test_masks_that_come_only_with_steps_are_refused(convention: str, one_episode: bool) -> None:
     """Only the first reset shows whether there are masks: these would be ignored, and illegal actions be played."""
     spec = EnvironmentSpec(id="Narrowing-v0", kwargs={"convention": convention})
-    environments = make_environments(spec, 2, for_evaluation=for_evaluation)
+    environments = make_environments(spec, 2, one_episode=one_episode)
     environments.reset(1)
     with pytest.raises(EnvironmentSetupError, match="info has an action_mask after a step, but reset gave none: give"):
         environments.step(first_actions(environments.spaces))
@@ -358,7 +358,7 @@ def test_masks_of_an_environment_may_be_lists(monkeypatch: pytest.MonkeyPatch, m
 @pytest.mark.parametrize("convention", ["info", "method", "observation", "list"])
 def test_environments_that_have_ended_need_no_legal_choice_in_an_evaluation(convention: str) -> None:
     spec = EnvironmentSpec(id="Uneven-v0", kwargs={"convention": convention})
-    environments = make_environments(spec, 8, for_evaluation=True)
+    environments = make_environments(spec, 8, one_episode=True)
     try:
         evaluation = play_episodes(LegalPolicy(), environments, 20, seed=1, sampled=False)
     finally:

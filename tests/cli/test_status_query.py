@@ -11,7 +11,7 @@ from statuses import actor_status, run_status
 
 from daedalus.cli.commands.exporter import StatusCollector
 from daedalus.cli.commands.status import status as status_command
-from daedalus.cli.status_query import ask, ask_events, fleet_size
+from daedalus.cli.status_query import ask, ask_events
 from daedalus.learner.reporting import report
 from daedalus.learner.run import heartbeat
 from daedalus.learner.run.counters import RunCounters
@@ -78,7 +78,7 @@ def test_status_contains_every_actor_of_a_large_fleet(server: ActorServer, opera
     (status,) = ask(operator)
     assert [actor.actor for actor in status.actors] == sorted(server.fleet.actors)
     assert (status.actors_alive, status.actors_quarantined, status.actors_gone) == (452, 1, 452)
-    assert fleet_size(status) == MANY
+    assert status.fleet_size == MANY
 
 
 def test_number_of_fetched_actors_can_be_limited(server: ActorServer, operator: MemoryTransport) -> None:

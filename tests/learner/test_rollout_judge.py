@@ -385,7 +385,7 @@ def test_rollouts_of_too_many_environments_are_refused_before_they_are_decoded(
     verdict = judge.read("a", b"no message")
     assert isinstance(verdict, Rejected)
     assert (verdict.verdict, verdict.cause) == ("rejected", "unfit" if refused else "malformed")
-    assert ("use fewer environments per actor (--envs)" in verdict.reason) == refused
+    assert ("use fewer environments per actor (collection.envs_per_actor" in verdict.reason) == refused
 
 
 @given(st.data())
