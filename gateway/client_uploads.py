@@ -10,7 +10,7 @@ from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.uploads import Rollout, RolloutIdentity
-from daedalus.transport.interface import Transport
+from daedalus.transport.interface import QuerySender
 
 _MAX_FULL_ROLLOUTS = 8  # that wait for room in the window; beyond that the oldest is dropped
 
@@ -19,18 +19,18 @@ class ClientUploads:
     """What one client sends, to one learner epoch after the other."""
 
     def __init__(
-        self, join: Join, transport: Transport, uploads: UploadSession, on_rollout: Callable[["ClientUploads"], None]
+        self, join: Join, sender: QuerySender, uploads: UploadSession, on_rollout: Callable[["ClientUploads"], None]
     ) -> None:
         """Construct the uploads.
 
         Args:
           join: names the actor and its incarnation.
-          transport: the network.
+          sender: sends the reports.
           uploads: sends the rollouts, until they are acknowledged.
           on_rollout: called when a rollout can be sent, by `send_one`.
         """
         self._join, self._uploads, self._on_rollout = join, uploads, on_rollout
-        self._reports = ClientReports(transport, self._report)
+        self._reports = ClientReports(sender, self._report)
         self._session: Welcome | None = None
         self._full: deque[Rollout] = deque(maxlen=_MAX_FULL_ROLLOUTS)
         self._sequence = 0  # of the next rollout

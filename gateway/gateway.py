@@ -151,9 +151,8 @@ class Gateway:
     def _new_actor(self, name: str, spaces: ClientSpaces, address: str) -> ClientActor:
         origin = Origin(host=self._origin.host, software=self._origin.software, address=address)
         join = Join(actor=name, incarnation=secrets.randbits(62), origin=origin)
-        transport = self._sender.transport
-        uploads = UploadSession(transport, name, self._link.presence, self._link.lock)
-        return ClientActor(join, spaces, ClientUploads(join, transport, uploads, self._outbox.add))
+        uploads = UploadSession(self._sender, name, self._link.presence, self._link.lock)
+        return ClientActor(join, spaces, ClientUploads(join, self._sender, uploads, self._outbox.add))
 
     async def _enter(self, seat: Seat) -> None:
         """Join the learner, and wait for a policy of it."""

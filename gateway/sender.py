@@ -4,12 +4,12 @@ import contextlib
 import queue
 import threading
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from daedalus.transport.interface import OnAnswer, Transport, TransportError
 
 _MAX_QUERIES = 1 << 17  # that wait for the thread: the windows of 2,048 clients, with 64 rollouts each
-_HEARTBEAT_SECONDS = 0.2  # how soon the thread notices `close` if the queue was full
+_POLL_SECONDS = 0.2  # how soon the thread notices `close` if the queue was full
 
 
 class _Query(NamedTuple):
@@ -22,7 +22,7 @@ class _Query(NamedTuple):
 
 
 class Sender:
-    """Queue of queries, which the thread sends in the order of the calls."""
+    """A QuerySender: a queue of queries, which the thread sends in the order of the calls."""
 
     def __init__(self, transport: Transport, on_failure: Callable[[Exception], None]) -> None:
         """Construct the sender.
@@ -48,13 +48,8 @@ class Sender:
         if self._thread.is_alive():
             self._thread.join(timeout)
 
-    @property
-    def transport(self) -> Transport:
-        """The sender in place of a transport, for services that use nothing but `query_async`."""
-        return cast(Transport, self)
-
     def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """See Transport. `timeout` begins when the thread sends the query."""
+        """See QuerySender. `timeout` begins when the thread sends the query."""
         if self._closed.is_set():
             raise TransportError("the gateway stops")
         try:
@@ -66,7 +61,7 @@ class Sender:
         try:
             while not (self._closed.is_set() and self._queue.empty()):
                 with contextlib.suppress(queue.Empty):
-                    self._send(self._queue.get(timeout=_HEARTBEAT_SECONDS))
+                    self._send(self._queue.get(timeout=_POLL_SECONDS))
         except Exception as error:  # broad: any error of ours ends the gateway
             self._on_failure(error)
 

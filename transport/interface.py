@@ -73,7 +73,19 @@ class Declaration(Protocol):
         ...
 
 
-class Transport(Protocol):
+class QuerySender(Protocol):
+    """What sends queries whose answers come later."""
+
+    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
+        """Send a query without waiting for its answer.
+
+        `on_answer` is called exactly once: with the first answer, or with None after `timeout` seconds. It is not
+        called if this method raises TransportError.
+        """
+        ...
+
+
+class Transport(QuerySender, Protocol):
     """Connection of one process to the network. Safe to use from several threads.
 
     Methods raise TransportError if the connection was closed or refuses the operation.
@@ -90,14 +102,6 @@ class Transport(Protocol):
 
     def query(self, key: str, payload: bytes = b"", *, timeout: float) -> list[bytes]:
         """Return all answers that arrive within `timeout` seconds; an empty list if no process serves the key."""
-        ...
-
-    def query_async(self, key: str, payload: bytes, *, timeout: float, on_answer: OnAnswer) -> None:
-        """Send a query without waiting.
-
-        `on_answer` is called exactly once: with the first answer, or with None after `timeout` seconds. It is not
-        called if this method raises.
-        """
         ...
 
     def publish(self, key: str, payload: bytes) -> None:

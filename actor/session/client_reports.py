@@ -6,7 +6,7 @@ from collections.abc import Callable
 from daedalus.protocol import keys
 from daedalus.protocol.client_report import ClientReport
 from daedalus.protocol.codec import encode
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import QuerySender, TransportError
 
 _PAUSE_SECONDS = 2.0  # between two reports
 _ANSWER_SECONDS = 5.0
@@ -15,9 +15,9 @@ _ANSWER_SECONDS = 5.0
 class ClientReports:
     """The reports of one client to one learner after the other."""
 
-    def __init__(self, transport: Transport, report: Callable[[], ClientReport]) -> None:
+    def __init__(self, sender: QuerySender, report: Callable[[], ClientReport]) -> None:
         """`report` returns the counts so far."""
-        self._transport, self._report = transport, report
+        self._sender, self._report = sender, report
         self._sent: ClientReport | None = None
         self._next_at = 0.0
 
@@ -39,7 +39,7 @@ class ClientReports:
         """Send a report. One that is lost is sent again later."""
         self._sent = report
         try:
-            self._transport.query_async(
+            self._sender.query_async(
                 keys.reports(run, report.actor),
                 encode(report),
                 timeout=_ANSWER_SECONDS,

@@ -9,7 +9,7 @@ from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError, decode
 from daedalus.protocol.limits import ACKNOWLEDGEMENT_LIMITS
 from daedalus.protocol.messages import Acknowledgement
-from daedalus.transport.interface import Transport, TransportError
+from daedalus.transport.interface import QuerySender, TransportError
 
 _ACKNOWLEDGEMENT_SECONDS = 30.0  # a saturated learner answers late
 
@@ -20,8 +20,8 @@ class UploadSession:
     The lock guards `in_flight`. Its methods are for the actor's thread.
     """
 
-    def __init__(self, transport: Transport, actor: str, presence: LearnerPresence, lock: StateLock) -> None:
-        self._transport, self._actor, self._presence, self._lock = transport, actor, presence, lock
+    def __init__(self, sender: QuerySender, actor: str, presence: LearnerPresence, lock: StateLock) -> None:
+        self._sender, self._actor, self._presence, self._lock = sender, actor, presence, lock
         self.run = ""  # the name of the learner's run
         self.in_flight = InFlightRollouts(window=1)
 
@@ -53,7 +53,7 @@ class UploadSession:
             due = in_flight.take_due(time.monotonic())
         for sequence, payload in due:
             try:
-                self._transport.query_async(
+                self._sender.query_async(
                     keys.rollouts(self.run, self._actor),
                     payload,
                     timeout=_ACKNOWLEDGEMENT_SECONDS,

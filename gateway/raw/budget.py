@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-_HEARTBEAT_SECONDS = 0.2  # between checks of whether the client has disconnected
+_POLL_SECONDS = 0.2  # between checks of whether the client has disconnected
 _MAX_QUERIES = 64
 _MAX_BYTES = 64 << 20
 # Each open query has a thread. A client always has a few, and the rest is for those that come first: with 64 clients
@@ -43,7 +43,7 @@ class QueryBudget:
         """
         with self._changed:
             while not self._closed and not self._has_room(size):
-                self._changed.wait(_HEARTBEAT_SECONDS)
+                self._changed.wait(_POLL_SECONDS)
                 if has_gone():
                     return False
             self._pool.taken += self._queries >= _OWN_QUERIES

@@ -41,7 +41,7 @@ def link() -> Iterator[Link]:
 
 
 def send(sender: Sender, payload: bytes, on_answer: OnAnswer = lambda answer: None) -> None:
-    sender.transport.query_async("daedalus/r/rollouts/a", payload, timeout=30.0, on_answer=on_answer)
+    sender.query_async("daedalus/r/rollouts/a", payload, timeout=30.0, on_answer=on_answer)
 
 
 def unexpected(error: Exception) -> None:
