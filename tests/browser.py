@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import LIMIT
 
 AXE = Path(__file__).parent / "gateway" / "node_modules" / "axe-core" / "axe.min.js"
 _REFUSED = "ERR_CONNECTION_REFUSED"  # the browser's own line: no page can prevent it
@@ -39,6 +40,7 @@ class Visit:
         self.strange_requests: list[str] = []
         self._origin = address.split("/")[2]
         self._context = browser.new_context(**options)
+        self._context.set_default_timeout(1000 * LIMIT)
         self.page = self._context.new_page()
         self.page.on("console", self._on_console)
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))

@@ -108,6 +108,7 @@ class LearnerProcess(Worker):
                 "policy": {"hidden": [8]},
                 "collection": {"actors": 1, "envs_per_actor": 2, "rollout_length": 4},
                 "training": {"env_steps": env_steps, "batch_rollouts": 1, **training},
+                "service": {"checkpoint_seconds": 1e6},  # none within the time limit of a test, unless it is ordered
             }
         )
         super().__init__(self._learn)

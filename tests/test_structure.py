@@ -22,6 +22,12 @@ ALLOWED = {
 }
 EXECUTING = {"pickle", "cloudpickle", "dill", "marshal", "shelve", "msgpack_numpy"}
 
+EXECUTING_FUNCTIONS = {
+    *("eval", "exec", "compile", "__import__", "builtins.eval", "builtins.exec", "os.system", "os.popen"),
+    *("torch.load", "torch.jit.load", "torch.hub.load", "torch.serialization.load", "yaml.load", "numpy.load"),
+    *("runpy.run_path", "runpy.run_module", "pandas.read_pickle", "joblib.load"),
+}
+
 
 @functools.cache
 def sources(package: str) -> list[tuple[Path, ast.Module]]:
@@ -36,15 +42,31 @@ def imported(tree: ast.Module) -> set[str]:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
     return names
+
+
+def called(tree: ast.Module) -> set[str]:
+    """Return the whole names of the functions that are called, whatever name they were imported by."""
+    whole: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            whole |= {alias.asname: alias.name for alias in node.names if alias.asname}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            whole |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            first, dot, rest = ast.unparse(node.func).partition(".")
+            found.add(whole.get(first, first) + dot + rest)
+    return found
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_a_package_imports_only_the_allowed_packages(package: str) -> None:
     for path, tree in sources(package):
         ours = {name.split(".")[1] for name in imported(tree) if name.startswith("daedalus.")}
-        assert ours <= ALLOWED[package], path
+        assert ours & {*PACKAGES} <= ALLOWED[package], path
 
 
 def test_collecting_rollouts_needs_no_session() -> None:
@@ -77,9 +99,7 @@ def test_only_the_zenoh_files_of_the_transport_import_zenoh() -> None:
 def test_no_file_uses_a_function_that_executes_its_input(package: str) -> None:
     for path, tree in sources(package):
         assert not {name.split(".")[0] for name in imported(tree)} & EXECUTING, path
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call):
-                assert ast.unparse(node.func) not in {"eval", "exec", "torch.load", "yaml.load", "np.load"}, path
+        assert not called(tree) & EXECUTING_FUNCTIONS, path
 
 
 def test_no_decision_depends_on_the_system_clock() -> None:

@@ -175,14 +175,16 @@ async def _end(process: asyncio.subprocess.Process, working: Sequence[asyncio.Fu
     """End a process, also if this task is cancelled once more."""
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
-    drained = asyncio.ensure_future(_drain(process, working))
     try:
-        await asyncio.wait([drained], timeout=_END_SECONDS)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(_drain(process, working), _END_SECONDS)
     finally:
-        if not drained.done():
+        if process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
-            await asyncio.wait([drained], timeout=_KILLED_SECONDS)
+        # Once more, because the task that read its output may have been cancelled with this one.
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(_drain(process, working), _KILLED_SECONDS)
 
 
 async def _drain(process: asyncio.subprocess.Process, working: Sequence[asyncio.Future[None]]) -> None:

@@ -187,7 +187,8 @@ def test_policy_does_not_age_while_the_learner_confirms_it(learner: ScriptedLear
     with Client("tcp/127.0.0.1:1", **SPACES, name="robot", safe_action=1, max_policy_age=2.0) as client:
         learner.snapshot = encode(Refusal(code="not_ready", reason="the actor holds the newest snapshot"))
         seen = len(learner.fetches)
-        fill_rollout(client)  # nobody acknowledges it: the window stays full
+        for _ in range(2):
+            fill_rollout(client)  # nobody acknowledges them: the window stays full
         until(lambda: len(learner.fetches) > seen + 8)  # two seconds and more
         client.act(OBSERVATION)
         assert client.safe_reason == ""

@@ -6,18 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from processes import LIMIT
-from scripted_learner import POLICY, SPACES, SPEC, RunningActor, ScriptedLearner, acknowledge
+from scripted_learner import POLICY, SPACES, SPEC, Policy, RunningActor, ScriptedLearner, acknowledge
 
 from daedalus.actor.collecting.client_collector import ClientCollector
 from daedalus.actor.errors import ActorError
 from daedalus.actor.session.upload_maker import RolloutUploadMaker, make_upload_maker
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed
+from daedalus.learner.serving.gradient_checks import restored
 from daedalus.policy.user_modules import NO_MODULES, UserModules
 from daedalus.protocol.codec import decode
 from daedalus.protocol.limits import Limits
-from daedalus.protocol.spec import RunSpec
+from daedalus.protocol.spec import PolicySpec, RunSpec
 from daedalus.protocol.uploads import Gradient
 from daedalus.transport.memory import MemoryNetwork
 
@@ -43,6 +45,23 @@ def test_an_actor_sends_the_gradient_of_its_rollout_in_its_place(network: Memory
         assert message.gradient.keys() == {name for name, _ in POLICY.network.named_parameters()}
         assert any(values.any() for values in message.gradient.values())
         acknowledge(request, "accepted")
+    actor.stop.set()
+    actor.join()
+    assert actor.error is None
+
+
+def test_the_gradient_is_that_of_the_snapshot_that_played_the_rollout(network: MemoryNetwork) -> None:
+    """A value far too high, which only the snapshot's network has, makes a large gradient."""
+    policy = Policy.of(PolicySpec(), SPACES)
+    with torch.no_grad():
+        dict(policy.network.named_parameters())["value_head.bias"].fill_(1e4)
+    learner = ScriptedLearner(network, spec_of(), policy=policy)
+    actor = RunningActor(network)
+    learner.extras = {GRADIENT_INPUTS: packed(GradientInputs(0.01, 0.0, 0.0, 0.0))}
+    learner.publish(3)
+    message = decode(learner.rollouts.get(timeout=LIMIT).payload, Limits())
+    assert isinstance(message, Gradient)
+    assert restored(message).gradient["value_head.bias"].item() > 50.0
     actor.stop.set()
     actor.join()
     assert actor.error is None

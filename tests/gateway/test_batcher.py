@@ -1,16 +1,22 @@
 """Which clients' actions one call of the policy chooses, and when."""
 
 import asyncio
+from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import pytest
+from processes import LIMIT
 
+from daedalus.actor.collecting.rollout_writer import RowInputs
 from daedalus.gateway import batcher
 from daedalus.gateway.batcher import Batcher
 from daedalus.gateway.client_actor import ClientActor
 from daedalus.gateway.client_uploads import ClientUploads
 from daedalus.gateway.outbox import Outbox
 from daedalus.gateway.policy_versions import PolicyVersion
+from daedalus.policy.acting.noise import Noise, NoiseSize
+from daedalus.policy.acting.runtime import Choice
 
 
 class WaitingClient:
@@ -79,3 +85,75 @@ def test_each_turn_of_the_loop_sends_one_rollout() -> None:
     asyncio.run(run())
     assert [entry for entry in tape if entry != "|"] == ["a", "b", "a"]
     assert "|" in tape[tape.index("a") + 1 : tape.index("b")], "clients are answered between two rollouts"
+
+
+class Echo:
+    """A runtime whose choices say which inputs, and which version, they were made from."""
+
+    noise_size = NoiseSize(1, 0)
+
+    def __init__(self, version: int) -> None:
+        self.version, self.rows = version, list[int]()
+
+    def act(self, observations: Any, state: Any, noise: Noise, masks: Any, epsilon: Any) -> Choice:
+        self.rows.append(len(state))
+        assert len(noise.uniform) == len(epsilon) == len(masks["a"]) == len(state)
+        actions = {"a": observations["o"][:, :1], "mask": masks["a"][:, :1], "version": 0 * epsilon + self.version}
+        return Choice(actions, epsilon[:, 0], state + 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Version:
+    runtime: Echo
+
+
+class Choosing(WaitingClient):
+    """A client that keeps its choices, and whose first ones were for reset rows."""
+
+    def __init__(self, number: int, version: Any = None, resets: int = 0) -> None:
+        super().__init__(f"c-{number}")
+        self.number, self.version, self.resets = number, version, resets
+        self.taken: list[list[float]] = []
+
+    def select_version(self, current: Any) -> Any:
+        return self.version or current
+
+    def begin_row(self) -> RowInputs:
+        one = np.full((1, 1), self.number, np.float32)
+        return RowInputs({"o": one}, one + 1000.0, {"a": one + 2000.0}, one + 3000.0)
+
+    def take(self, choice: Choice) -> bool:
+        parts = [*choice.actions.values(), choice.log_probs, choice.state]
+        self.taken.append([float(part.item()) for part in parts])
+        return len(self.taken) > self.resets
+
+
+def test_each_client_has_the_choice_for_its_own_row_by_its_own_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More clients than one call takes, some of which still fill a rollout of an older version."""
+    monkeypatch.setattr(batcher, "_MAX_ROWS", 4)
+    monkeypatch.setattr(batcher, "_PAUSE_SECONDS", 0.0)
+    old, new = Version(Echo(1)), Version(Echo(2))
+    clients = [Choosing(number, old if number % 3 == 0 else None, resets=int(number == 5)) for number in range(15)]
+
+    faults: list[object] = []  # an exception in a callback of the event loop would only be logged
+
+    async def run() -> None:
+        noted = faults.append
+        chooser = Batcher(lambda: cast(Any, new), lambda: 100, noted, lambda actor, error: noted((actor.name, error)))
+        for each in clients:
+            chooser.add(cast(ClientActor, each))
+        left = Choosing(99)
+        chooser.add(cast(ClientActor, left))
+        chooser.remove(cast(ClientActor, left))
+        async with asyncio.timeout(LIMIT):
+            while any(len(each.taken) <= each.resets for each in clients) and not faults:
+                await asyncio.sleep(0.001)
+        assert not left.taken
+
+    asyncio.run(run())
+    assert not faults
+    for each in clients:
+        version = 1.0 if each.version is old else 2.0
+        own = float(each.number)
+        assert each.taken == [[own, own + 2000.0, version, own + 3000.0, own + 1000.5]] * (1 + each.resets)
+    assert (old.runtime.rows, new.runtime.rows) == ([4, 1], [4, 4, 2, 1])

@@ -1,6 +1,7 @@
 """The camera: what it says of an action, the episodes that it plays, and its process."""
 
 import asyncio
+import gc
 import json
 import os
 import struct
@@ -19,6 +20,7 @@ from scripted_learner import POLICY, SPEC, Policy
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.evaluation.episode_camera import EpisodeCamera, action_facts, jpeg
 from daedalus.gateway.learner_link import NewestPolicy
+from daedalus.gateway.watching import camera as camera_module
 from daedalus.gateway.watching.camera import CameraProcess, frame
 from daedalus.policy.acting.runtime import Choice, OnnxRuntime, program_hash
 from daedalus.policy.user_modules import NO_MODULES
@@ -28,6 +30,13 @@ from daedalus.protocol.spec import RunSpec
 
 COMMAND = (sys.executable, "-P", "-m", "daedalus.cli.commands.camera")
 STATE = np.zeros((3, 0), np.float32)
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the end of a process as long as a busy machine may take."""
+    monkeypatch.setattr(camera_module, "_END_SECONDS", LIMIT)
+    monkeypatch.setattr(camera_module, "_KILLED_SECONDS", LIMIT)
 
 
 def weights() -> dict[str, np.ndarray]:
@@ -192,13 +201,16 @@ def test_the_page_is_told_why_there_is_no_picture() -> None:
     assert "The camera cannot play: " in asyncio.run(watch())
 
 
+FLOOD = "import struct, sys\nwhile True: sys.stdout.buffer.write(struct.pack('<I', 300_000) + bytes(300_000))"
+ONE = "import struct, sys\nsys.stdout.buffer.write(struct.pack('<I', 4) + bytes(4)); sys.stdout.flush(); input()"
+
+
 def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
-    flood = "import struct, sys\nwhile True: sys.stdout.buffer.write(struct.pack('<I', 300_000) + bytes(300_000))"
     newest = policy()
 
     async def watch() -> None:
         before = open_files()
-        camera = CameraProcess((sys.executable, "-c", flood))
+        camera = CameraProcess((sys.executable, "-c", FLOOD))
         camera.newest_policy = lambda: newest
         frames = camera.frames()
         async with asyncio.timeout(LIMIT):
@@ -209,6 +221,24 @@ def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
                 await asyncio.sleep(0.05)
 
     asyncio.run(watch())
+
+
+@pytest.mark.parametrize("program", [FLOOD, ONE], ids=["flood", "one frame"])
+def test_a_loop_that_ends_while_the_process_is_ended_leaves_nothing(program: str) -> None:
+    """A transport that is not closed complains when it is collected: in another test, of this process."""
+    newest, before = policy(), open_files()
+
+    async def watch() -> None:
+        camera = CameraProcess((sys.executable, "-c", program))
+        camera.newest_policy = lambda: newest
+        frames = camera.frames()
+        async with asyncio.timeout(LIMIT):
+            await anext(frames)
+            await frames.aclose()
+
+    asyncio.run(watch())
+    gc.collect()
+    assert open_files() == before
 
 
 def open_files() -> int:

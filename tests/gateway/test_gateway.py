@@ -90,7 +90,7 @@ def test_msgpack_clients_may_send_bytes_for_arrays(learner: ScriptedLearner, con
 
     def ask(message: dict[str, Any]) -> dict[str, Any]:
         client.socket.send(bytes(msgpack.packb(message) or b""))
-        answer = client.socket.recv(timeout=10)
+        answer = client.socket.recv(timeout=LIMIT)
         assert isinstance(answer, bytes)
         return msgpack.unpackb(answer)
 
@@ -583,7 +583,7 @@ def test_client_with_many_faults_is_disconnected(learner: ScriptedLearner, conne
 def test_damaged_first_message_ends_the_connection(learner: ScriptedLearner, connect: Connect, data: Any) -> None:
     client = connect()
     client.socket.send(data)
-    answer = client.socket.recv(timeout=10)
+    answer = client.socket.recv(timeout=LIMIT)
     decoded = msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
     assert decoded["code"] == "malformed"
     assert ended(client) == 1008

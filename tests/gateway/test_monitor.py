@@ -77,9 +77,10 @@ def test_another_learner_epoch_begins_the_rows_anew(watched: Watched) -> None:
 def test_rows_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor_module, "_MAX_ROWS", 4)
     watched.source.answer = run_status()
-    for step in range(30):
-        watched.source.rows = [{"env_steps": float(step)}] * min(step + 1, 5)
-        until(lambda: watched.source.asked.acquire(timeout=LIMIT))
+    for step in range(30):  # the learner keeps its newest rows
+        watched.source.oldest = step - 3
+        watched.source.rows = [{"env_steps": float(number)} for number in range(step + 1)]
+        until(lambda step=step: watched.seen[-1].rows and watched.seen[-1].rows[-1][0] == step)
     assert max(len(seen.rows) for seen in watched.seen) <= 8
 
 
@@ -104,11 +105,12 @@ def test_a_large_fleet_is_not_queried_each_time(watched: Watched) -> None:
 
 def test_nobody_watching_means_few_queries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor_module, "UNWATCHED_SECONDS", 3600.0)
+    monkeypatch.setattr(monitor_module, "WATCHED_SECONDS", 0.01)
     one = Watched()
     one.monitor.open()
     try:
-        until(lambda: one.seen)
-        assert not one.source.asked.acquire(timeout=0.0) or not one.source.asked.acquire(timeout=0.3)
+        assert one.source.asked.acquire(timeout=LIMIT)
+        assert not one.source.asked.acquire(timeout=0.3)
         one.monitor.watch(True)  # the first viewer does not wait
         until(lambda: len(one.seen) > 1)
     finally:

@@ -3,10 +3,11 @@
 import json
 import re
 import ssl
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from email.message import Message
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.tokens import OperatorToken, Tokens
+from daedalus.gateway.tokens import TOKENS, OperatorToken, Tokens, digest
 from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.source import OtherRun
 from daedalus.transport.memory import MemoryNetwork
@@ -302,6 +303,22 @@ def test_operators_tokens_are_issued_renewed_and_revoked_with_their_certificates
     with pytest.raises(ClientError, match="needs an operator's token"):
         tokens.check_operator(second)
     assert not path.exists()
+
+
+def test_expired_tokens_of_operators_and_viewers_are_refused(tmp_path: Path) -> None:
+    operator, client = "an operator's token", "a client's token"
+    entries = {"operator:alice": operator, "phone": client}
+    for expires, refused in ((time.time() + 1000.0, False), (1.0, True)):
+        record = {name: {"sha256": digest(token), "expires": expires} for name, token in entries.items()}
+        (tmp_path / TOKENS).write_text(json.dumps(record))
+        tokens = Tokens(tmp_path)
+        for check, token in (
+            (tokens.check_operator, operator),
+            (tokens.check_viewer, operator),
+            (tokens.check_viewer, client),
+        ):
+            with pytest.raises(ClientError, match="expired") if refused else nullcontext():
+                check(token)
 
 
 def test_operators_token_of_a_gateway_without_certificates(tmp_path: Path) -> None:

@@ -61,6 +61,7 @@ class FakeSource:
         self.fails = False
         self.newest_events: tuple[Event, ...] = ()
         self.rows: list[dict[str, float]] = []
+        self.oldest = 0  # row that it still has
         self.page_rows = 3  # in one answer
         self.asked_actors: list[int] = []
         self.orders: list[Order] = []
@@ -77,7 +78,7 @@ class FakeSource:
         return EventsPage(run=status.run, learner_epoch=status.learner_epoch, events=self.newest_events)
 
     def metrics(self, status: RunStatus, first: int) -> MetricsReport | None:
-        numbers = list(range(first, len(self.rows)))[: self.page_rows]
+        numbers = list(range(max(first, self.oldest), len(self.rows)))[: self.page_rows]
         columns = tuple(sorted({name for number in numbers for name in self.rows[number]}))
         values = [[self.rows[number].get(name, np.nan) for name in columns] for number in numbers]
         return MetricsReport(

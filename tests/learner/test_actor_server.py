@@ -11,6 +11,7 @@ from building import ENVIRONMENTS, EPOCH, POLICY, RECURRENT, SPACES, identity, m
 from processes import LIMIT, until
 
 from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.serving import held_answers
 from daedalus.learner.serving.actor_server import ActorServer
 from daedalus.learner.training.learner import Learner
 from daedalus.protocol import keys
@@ -68,9 +69,10 @@ def server(network: MemoryNetwork) -> Iterator[ActorServer]:
 
 @pytest.mark.parametrize(("algorithm", "updates"), [("impala", 1), ("appo", 6)])
 def test_rollouts_of_the_next_version_are_accepted_as_soon_as_its_batch_is_taken(
-    network: MemoryNetwork, algorithm: str, updates: int
+    network: MemoryNetwork, algorithm: str, updates: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Actors may play the snapshot of that version before the next batch is complete."""
+    monkeypatch.setattr(held_answers, "_MOST_SECONDS", 1e6)  # only the next batch releases an answer
     counters = RunCounters(10)
     spec = run_spec(actors=1, algorithm=algorithm, passes=2, minibatches=3)
     server = open_server(network, spec, counters)

@@ -148,6 +148,19 @@ def test_one_owner_cannot_fill_the_fleet(monkeypatch: pytest.MonkeyPatch) -> Non
     assert fleet.actors.keys() == {"arm", "arm.2", "arm.3", "box.3"}
 
 
+def test_forgotten_actors_leave_room_for_others_of_their_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each process of a host may have a name of its own, such as arm.PID: their number over time has no bound."""
+    monkeypatch.setattr(fleet_module, "_MAX_OF_ONE_OWNER", 3)
+    fleet = joined_fleet("arm", "arm.1", "arm.2")
+    for name in ("arm", "arm.1", "arm.2"):
+        fleet.set_present(name, 1, False, 0.0)
+    fleet.forget_absent(1.0 + MINUTE)
+    for number in range(3, 6):
+        assert attempt(fleet, f"arm.{number}", now=100.0) is None
+        fleet.set_present(f"arm.{number}", 1, True, 100.0)
+    assert attempt(fleet, "arm.6", now=100.0) is not None
+
+
 def test_tokens_of_one_owner_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(presence, "_MAX_OF_ONE_OWNER", 2)
     fleet = joined_fleet("arm", "arm.1", "arm.2", "box")

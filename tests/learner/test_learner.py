@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from building import EPOCH, POLICY, RECURRENT, SPACES, identity, join, make_rollout, make_rollouts, run_spec
-from plain import ACTION, plain, plain_spaces
+from plain import ACTION, NAME, plain, plain_spaces
 from plain_learner import PlainLearner
 from torch import Tensor
 from torch.testing import assert_close
@@ -450,6 +450,17 @@ def test_checkpoint_counts_the_observations_of_its_batch_in_the_weights(tmp_path
     seen = np.concatenate([plain(each.frames)[:-1][each.valid] for each in consecutive_rollouts(0)])
     np.testing.assert_allclose(again.weights()["normalizer.means.0"].sum(0), seen.mean(0), rtol=1e-5)
     np.testing.assert_allclose(again.weights()["normalizer.scales.0"], 1.0 / seen.std(0), rtol=2**-8)
+
+
+def test_statistics_that_came_with_initial_weights_change_slowly() -> None:
+    """A run with --init-from begins with the observations of the other run, not with none."""
+    first, second = (make_learner(NORMALIZED, algorithm="a2c", seed=seed) for seed in (1, 2))
+    first.step(consecutive_rollouts(0), 0.0)
+    second.load(weights(first))
+    far = [replace(each, frames={NAME: plain(each.frames) + 100.0}) for each in consecutive_rollouts(1)]
+    second.step(far, 0.0)
+    before, after = (weights(each)["normalizer.means.0"].sum(0) for each in (first, second))
+    np.testing.assert_allclose(after, before, atol=0.2)
 
 
 def test_restore_refuses_a_checkpoint_without_the_statistics_of_rewards(tmp_path: Path) -> None:

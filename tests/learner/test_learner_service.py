@@ -242,6 +242,7 @@ def test_sender_of_rollouts_without_a_finite_gradient_is_quarantined_and_trainin
         hostile.query(keys.join("run", "hostile"), encode(join), timeout=LIMIT)
         answer, sequence = Acknowledgement(verdict="busy"), 0
         while answer.verdict != "quarantined":
+            assert sequence < 10_000
             rollout = make_rollout(
                 identity("hostile", sequence, epoch=status.status.learner_epoch),
                 version=answer.policy_version,
