@@ -23,7 +23,7 @@ _TOLERANCE = 1e-3  # of a recording's first results, as a share of their norm
 Function = Callable[[Sequence[Tensor]], tuple[Tensor, ...]]
 Recording = Callable[..., tuple[Tensor, ...]]
 
-_log = logging.getLogger(__name__)
+_logger = logging.getLogger(__name__)
 
 
 class OperationRecorder:
@@ -68,7 +68,7 @@ class OperationRecorder:
 
     def _refuse(self, reason: str, results: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         self._can_record = False
-        _log.debug("updates are not recorded, and take longer: %s", reason)
+        _logger.debug("updates are not recorded, and take longer: %s", reason)
         return results
 
 

@@ -43,10 +43,8 @@ _ALIGNMENT = 8
 _DTYPES = {name: np.dtype(name) for name in ("<f4", "|u1", "|b1", "<u2", "<i4", "<i8", "<f8")}
 _KINDS: dict[str, type] = {cls.__name__: cls for cls in typing.get_args(Message)}
 _COMPRESSED = (Rollout, Gradient, Program, CompactSnapshot)  # zstd cannot compress weights; other messages are small
-_LEVEL, _BYTES_LEVEL = (
-    -1,
-    1,
-)  # zstd levels: the faster one, for floats, would leave pixels and byte planes twice as large
+_LEVEL = -1  # of zstd for floats: the faster one, which would leave pixels and byte planes twice as large
+_BYTES_LEVEL = 1  # for these
 _MAX_DIMENSIONS = 8
 _MAX_DESCRIBED = 100  # faults of a model; pydantic describes all or none, and a hostile header has 60,000
 

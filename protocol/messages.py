@@ -84,7 +84,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """Verdict on a rollout, an evaluation report or a request on `drain/{actor}`. Learner -> sender.
+    """Verdict on a rollout or gradient, a report, an order, or a request on `drain/{actor}`. Learner -> sender.
 
     accepted: it will be trained on, unless the learner ends first or its policy lag exceeds the bound.
     busy: the learner's queue is full; send it again later.

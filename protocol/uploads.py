@@ -154,7 +154,7 @@ class Gradient:
     # By parameter that has a gradient: float32 [*shape], or the planes of its bfloat16 (protocol/compact.py), uint8
     # [2, *shape]. The mean over the valid rows; not clipped.
     gradient: dict[str, np.ndarray]
-    env_steps: int  # valid rows of the rollout
+    env_steps: int  # of the rollout: its rows to learn from
     metrics: dict[str, np.ndarray]  # each of LOSS_TERMS, and those of DIAGNOSTICS that are known: float32 scalars []
     # Mean and sum of squared deviations over the valid rows, float64 [2, *shape]: `observations/NAME` of each component
     # that is normalised, and `returns` of the discounted returns if rewards are normalised.

@@ -1,1 +1,1 @@
-"""Distributions of actions: one class a file, composed by `ActionDistributions`. Needs torch."""
+"""Distributions of actions: one kind a file, composed by `ActionDistribution` (joint.py). Needs torch."""
