@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,13 +57,13 @@ from daedalus.learner.service import LearnerService, Outcome
 from daedalus.learner.training.allocator import keep_freed_memory
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.policy.network.errors import NetworkError
-from daedalus.policy.saving.saved_policy import NoPolicyError, checkpoints, find_policy
+from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, checkpoints, find_policy
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModuleError
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 from daedalus.transport.credentials import Credentials, CredentialsError
-from daedalus.transport.interface import TransportError
+from daedalus.transport.interface import Transport, TransportError
 from daedalus.transport.security import (
     SECURITY_ERRORS,
     certificate_days_left,
@@ -123,9 +123,18 @@ def main() -> int:
         arguments.log_level, as_json=arguments.log_json, process=process, context=context, write=progress.say
     )
     try:
+        command = _Command(
+            arguments=arguments,
+            credentials=credentials,
+            stop=stop,
+            progress=progress,
+            started=arguments.started or started,
+            user_metrics=user_metrics,
+            context=context,
+            ranks=ranks,
+        )
         with ExitStack() as stack:
-            began = arguments.started or started
-            return _serve(run, arguments, credentials, stop, progress, began, user_metrics, context, ranks, stack)
+            return command.serve(run, stack)
     except RankLostError as error:
         text, status = ranks.fault(error)
         print_error("learner", text)
@@ -135,81 +144,97 @@ def main() -> int:
         return FAILED
 
 
-def _serve(
-    run: ChosenRun,
-    arguments: argparse.Namespace,
-    credentials: Credentials | None,
-    stop: threading.Event,
-    progress: Progress,
-    started: float,
-    user_metrics: UserMetrics,
-    context: dict[str, str],
-    ranks: RankProcesses,
-    stack: ExitStack,
-) -> int:
-    """Run the learner to its end and return the exit status. Raises _FAILURES or RankLostError.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Command:
+    """What one `daedalus learner` was started with, besides its run."""
 
-    `context` receives the fields of the log; `ranks` are its other processes; `stack` closes what is opened.
-    """
-    if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
-        stack.enter_context(RunLock(run.directory))
-    if arguments.run_dir is not None:
-        stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
-    Heartbeat(run.directory).clear()
-    resumed = arguments.resume and run.exists
-    finished = finished_run(run.directory, run.spec) if resumed else None
-    if finished is not None:
-        _logger.info("nothing to do: %s", finished.reason)
-        ranks.dismiss(run.spec, stop)
-        return NOT_REACHED if finished.missed else REACHED
-    if run.changed:
-        _logger.info("settings of the run changed: %s", ", ".join(run.changed))
-        run_directory.write_config(run.directory, run.spec)
-    restored = _newest_checkpoint(run.directory) if resumed else None
-    spaces = arguments.spaces
-    if restored is None and arguments.prepared is None:
-        run, spaces = _with_spaces(run, arguments, stop)
-    weights = arguments.init_from or (initial_to_resume(run.directory) if resumed else None)
-    initial = find_policy(weights) if weights is not None and restored is None else None
-    transport = open_transport(arguments, run.spec, credentials, stop)
-    stopped = STOPPED if arguments.prepared else 0
-    if transport is None:  # stopped while no router answered
-        return stopped
-    stack.enter_context(ranks)
-    stack.callback(transport.close)
-    if not run.exists:
-        new = {"numbered": arguments.run_dir is None, "init_from": arguments.init_from}
+    arguments: argparse.Namespace
+    credentials: Credentials | None
+    stop: threading.Event
+    progress: Progress
+    started: float  # on the monotonic clock
+    user_metrics: UserMetrics
+    context: dict[str, str]  # receives the fields of the log
+    ranks: RankProcesses  # the other processes of the learner
+
+    def serve(self, run: ChosenRun, stack: ExitStack) -> int:
+        """Run the learner to its end and return the exit status; `stack` closes what is opened.
+
+        Raises _FAILURES or RankLostError.
+        """
+        arguments = self.arguments
+        if run.exists and arguments.prepared is None:  # the launcher of a prepared run has locked it
+            stack.enter_context(RunLock(run.directory))
+        if arguments.run_dir is not None:
+            stack.enter_context(run_directory.made(run.directory))  # before a router is waited for, for status --alive
+        Heartbeat(run.directory).clear()
+        resumed = arguments.resume and run.exists
+        finished = finished_run(run.directory, run.spec) if resumed else None
+        if finished is not None:
+            _logger.info("nothing to do: %s", finished.reason)
+            self.ranks.dismiss(run.spec, self.stop)
+            return NOT_REACHED if finished.missed else REACHED
+        if run.changed:
+            _logger.info("settings of the run changed: %s", ", ".join(run.changed))
+            run_directory.write_config(run.directory, run.spec)
+        restored = _newest_checkpoint(run.directory) if resumed else None
+        spaces = arguments.spaces
+        if restored is None and arguments.prepared is None:
+            run, spaces = _with_spaces(run, arguments, self.stop)
+        weights = arguments.init_from or (initial_to_resume(run.directory) if resumed else None)
+        initial = find_policy(weights) if weights is not None and restored is None else None
+        transport = open_transport(arguments, run.spec, self.credentials, self.stop)
+        stopped = STOPPED if arguments.prepared else 0
+        if transport is None:  # stopped while no router answered
+            return stopped
+        stack.enter_context(self.ranks)
+        stack.callback(transport.close)
+        run = run if run.exists else self._with_directory(run, stack)
+        try:
+            service = self._service(run, transport, restored, initial, spaces)
+            self.context["epoch"] = f"{service.learner_epoch:x}"
+            announce(run, arguments, self.credentials)
+            if arguments.prepared is None:  # else the launcher starts them
+                _start_trackers(run.directory, arguments, self.progress, self.stop, stack)
+            outcome = service.run()
+        except _FAILURES:
+            if not run.exists:
+                run_directory.remove_failed(run.directory)
+            raise
+        return _status(outcome, run.spec, stopped, UNSAVED if arguments.exit_with_parent else FAILED)
+
+    def _with_directory(self, run: ChosenRun, stack: ExitStack) -> ChosenRun:
+        """Create the directory of a new run, and return the run in it; `stack` unlocks it."""
+        new = {"numbered": self.arguments.run_dir is None, "init_from": self.arguments.init_from}
         lock = stack.enter_context(run_directory.create_locked(run.directory, run.spec, **new))
-        run = replace(run, directory=lock.directory)
-        context["run"] = run_directory.run_name(run.directory)
-    try:
-        service = LearnerService(
+        self.context["run"] = run_directory.run_name(lock.directory)
+        return replace(run, directory=lock.directory)
+
+    def _service(
+        self,
+        run: ChosenRun,
+        transport: Transport,
+        restored: "Checkpoint | None",
+        initial: SavedPolicy | None,
+        spaces: Spaces | None,
+    ) -> LearnerService:
+        return LearnerService(
             run.spec,
             run.directory,
             transport,
-            stop,
-            progress,
-            _writers(run.directory, arguments.rows_to),
-            started=started,
+            self.stop,
+            self.progress,
+            _writers(run.directory, self.arguments.rows_to),
+            started=self.started,
             restored=restored,
             initial=initial,
             spaces=spaces,
             modules=run.modules,
-            certificate_days_left=partial(certificate_days_left, credentials),
-            user_metrics=user_metrics,
-            open_ranks=ranks.open,
-            confirms=arguments.confirm,
+            certificate_days_left=partial(certificate_days_left, self.credentials),
+            user_metrics=self.user_metrics,
+            open_ranks=self.ranks.open,
+            confirms=self.arguments.confirm,
         )
-        context["epoch"] = f"{service.learner_epoch:x}"
-        announce(run, arguments, credentials)
-        if arguments.prepared is None:  # else the launcher starts them
-            _start_trackers(run.directory, arguments, progress, stop, stack)
-        outcome = service.run()
-    except _FAILURES:
-        if not run.exists:
-            run_directory.remove_failed(run.directory)
-        raise
-    return _status(outcome, run.spec, stopped, UNSAVED if arguments.exit_with_parent else FAILED)
 
 
 def _with_spaces(
