@@ -1,6 +1,5 @@
 """One client as an actor towards the learner: its rows and its rollouts. For the gateway's event loop."""
 
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.actor.collecting.client_rows import ClientRows, check_run
+from daedalus.actor.collecting.client_rows import ClientRows, check_run, finished_copy, make_client_rows
 from daedalus.actor.collecting.rollout_writer import RolloutWriter, RowInputs
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.masks import mask_of_one
@@ -24,9 +23,6 @@ from daedalus.policy.acting.errors import PolicyError
 from daedalus.policy.acting.runtime import Choice
 from daedalus.protocol.messages import Join, Welcome
 from daedalus.protocol.spec import RunSpec
-from daedalus.protocol.uploads import RolloutIdentity
-
-_NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # sending replaces it
 
 
 class ClientActor:
@@ -108,26 +104,18 @@ class ClientActor:
         """Return rows for the learner epoch of a policy. Raises ClientError if it cannot explore as the client must."""
         assert self._transforms is not None
         assert self._session is not None
-        spec = current.session.spec
         try:
-            writer = RolloutWriter(
-                self._transforms.spaces,
-                1,
+            return make_client_rows(
+                current.session.spec,
+                self._transforms,
                 current.runtime,
-                spec.environment,
-                rollout_length=spec.collection.rollout_length,
-                random=np.random.default_rng(),  # not used: the batcher draws the noise
+                np.random.default_rng(),  # not used: the batcher draws the noise
                 epsilon=self._session.epsilon,
+                example_mask=self.spaces.example_mask,
+                on_full=self._keep,
             )
         except PolicyError as error:
             raise ClientError("refused", str(error)) from None
-        return ClientRows(
-            self._transforms,
-            writer,
-            example_mask=self.spaces.example_mask,
-            bootstrap_terminations=spec.environment.bootstrap_terminations,
-            on_full=self._keep,
-        )
 
     @property
     def rows(self) -> ClientRows:
@@ -196,7 +184,7 @@ class ClientActor:
 
     def _keep(self, writer: RolloutWriter) -> None:
         assert self.version is not None
-        rollout = copy.deepcopy(writer.finish(_NO_IDENTITY, self.version.version))
+        rollout = finished_copy(writer, self.version.version)
         self._full_version = self.version.version
         if self._rows_epoch == self.epoch:  # otherwise it is meant for a previous learner
             self.uploads.keep(rollout)

@@ -1,16 +1,12 @@
 """One agent of a loop that the caller owns: its rows, written as the loop reports observations and rewards."""
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
-from daedalus.actor.collecting.client_rows import ClientRows
+from daedalus.actor.collecting.client_rows import ClientRows, finished_copy
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
-from daedalus.protocol.uploads import RolloutIdentity
-
-_NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)  # `collect` replaces it
 
 
 class ClientAgent:
@@ -95,7 +91,7 @@ class ClientAgent:
     def keep(self, writer: RolloutWriter) -> None:
         """Hand over a full rollout. Called by the agent's rows."""
         assert self._loaded is not None
-        self._exchange.keep(self._index, copy.deepcopy(writer.finish(_NO_IDENTITY, self._loaded.version)))
+        self._exchange.keep(self._index, finished_copy(writer, self._loaded.version))
 
     def _switch_policy(self) -> None:
         """Continue with a policy that has begun meanwhile; drop the unfinished rollout of the previous one."""

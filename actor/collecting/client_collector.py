@@ -10,7 +10,7 @@ import numpy as np
 
 from daedalus.actor.collecting.client_agent import ClientAgent
 from daedalus.actor.collecting.client_exchange import ClientExchange, LoadedPolicy
-from daedalus.actor.collecting.client_rows import ClientRows, check_run
+from daedalus.actor.collecting.client_rows import ClientRows, check_run, make_client_rows
 from daedalus.actor.collecting.policy_guard import PolicyGuard
 from daedalus.actor.collecting.rollout_writer import RolloutWriter
 from daedalus.actor.environments.masks import mask_of_one
@@ -85,25 +85,18 @@ class ClientCollector:
     def _rows(self, agent: ClientAgent, spec: RunSpec, seed: tuple[int, int], epsilon: float) -> ClientRows:
         assert self._transforms is not None
         assert self._program is not None
-        writer = RolloutWriter(
-            self._transforms.spaces,
-            1,
-            self._program,
-            spec.environment,
-            rollout_length=spec.collection.rollout_length,
-            random=np.random.default_rng(seed),
-            epsilon=epsilon,
-        )
 
         def keep(full: RolloutWriter) -> None:
             agent.keep(full)
             self.on_rollout()
 
-        return ClientRows(
+        return make_client_rows(
+            spec,
             self._transforms,
-            writer,
+            self._program,
+            np.random.default_rng(seed),
+            epsilon=epsilon,
             example_mask=self._example_mask,
-            bootstrap_terminations=spec.environment.bootstrap_terminations,
             on_full=keep,
         )
 

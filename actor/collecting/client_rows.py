@@ -1,5 +1,6 @@
 """The rows of a loop that somebody else owns, under one learner. State without threads or I/O."""
 
+import copy
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -11,7 +12,9 @@ from daedalus.actor.environments.transforms import Transforms
 from daedalus.actor.errors import ActorError
 from daedalus.policy.acting.runtime import Choice, PolicyRuntime
 from daedalus.protocol.spec import EnvironmentSpec, RunSpec
+from daedalus.protocol.uploads import Rollout, RolloutIdentity
 
+_NO_IDENTITY = RolloutIdentity(actor="", incarnation=0, sequence=0, learner_epoch=0)
 _LARGEST_REWARD = float(np.finfo(np.float32).max)  # rollouts have float32
 
 
@@ -220,3 +223,46 @@ def _refuse_unapplied_settings(spec: EnvironmentSpec) -> None:
             f"this run sets {' and '.join(changed)}, which a client does not apply: its own loop wraps its "
             "environment, repeats actions and ends episodes; start the run without these settings"
         )
+
+
+def make_client_rows(
+    spec: RunSpec,
+    transforms: Transforms,
+    runtime: PolicyRuntime,
+    random: np.random.Generator,
+    *,
+    epsilon: float,
+    example_mask: Any,
+    on_full: Callable[[RolloutWriter], None],
+) -> ClientRows:
+    """Return the rows of one loop under one learner. Raises PolicyError if the program cannot explore as it must.
+
+    Args:
+      spec: of the run.
+      transforms: of the loop's spaces to the run's.
+      runtime: the policy.
+      random: draws the noise of the policy.
+      epsilon: final probability of a random action.
+      example_mask, on_full: see ClientRows.
+    """
+    writer = RolloutWriter(
+        transforms.spaces,
+        1,
+        runtime,
+        spec.environment,
+        rollout_length=spec.collection.rollout_length,
+        random=random,
+        epsilon=epsilon,
+    )
+    return ClientRows(
+        transforms,
+        writer,
+        example_mask=example_mask,
+        bootstrap_terminations=spec.environment.bootstrap_terminations,
+        on_full=on_full,
+    )
+
+
+def finished_copy(writer: RolloutWriter, policy_version: int) -> Rollout:
+    """Return a full rollout in memory of its own. Whoever sends it replaces its identity."""
+    return copy.deepcopy(writer.finish(_NO_IDENTITY, policy_version))
