@@ -205,17 +205,23 @@ FLOOD = "import struct, sys\nwhile True: sys.stdout.buffer.write(struct.pack('<I
 ONE = "import struct, sys\nsys.stdout.buffer.write(struct.pack('<I', 4) + bytes(4)); sys.stdout.flush(); input()"
 
 
-def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
+async def watched_for_a_frame(program: str) -> CameraProcess:
+    """Return the camera of a Python program that somebody watched until its first frame."""
     newest = policy()
+    camera = CameraProcess((sys.executable, "-c", program))
+    camera.newest_policy = lambda: newest
+    frames = camera.frames()
+    async with asyncio.timeout(LIMIT):
+        await anext(frames)
+        await frames.aclose()
+    return camera
 
+
+def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
     async def watch() -> None:
         before = open_files()
-        camera = CameraProcess((sys.executable, "-c", FLOOD))
-        camera.newest_policy = lambda: newest
-        frames = camera.frames()
+        camera = await watched_for_a_frame(FLOOD)
         async with asyncio.timeout(LIMIT):
-            await anext(frames)
-            await frames.aclose()
             await camera.close()
             while open_files() > before:
                 await asyncio.sleep(0.05)
@@ -226,17 +232,8 @@ def test_a_process_whose_frames_were_not_all_read_leaves_no_pipe_open() -> None:
 @pytest.mark.parametrize("program", [FLOOD, ONE], ids=["flood", "one frame"])
 def test_a_loop_that_ends_while_the_process_is_ended_leaves_nothing(program: str) -> None:
     """A transport that is not closed complains when it is collected: in another test, of this process."""
-    newest, before = policy(), open_files()
-
-    async def watch() -> None:
-        camera = CameraProcess((sys.executable, "-c", program))
-        camera.newest_policy = lambda: newest
-        frames = camera.frames()
-        async with asyncio.timeout(LIMIT):
-            await anext(frames)
-            await frames.aclose()
-
-    asyncio.run(watch())
+    before = open_files()
+    asyncio.run(watched_for_a_frame(program))
     gc.collect()
     assert open_files() == before
 
