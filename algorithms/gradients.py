@@ -91,12 +91,15 @@ class GradientComputer:
         if batch.rank_part is not None:
             yield from self._of_other_ranks(batch.rank_part, batch.rank_part.updates - updates)
 
+    def no_update(self) -> Terms:
+        """Write a gradient of 0 and return terms of 0: for a batch of which an own algorithm makes no update."""
+        self.parameters.gradients.zero_()
+        return Terms(*self.parameters.gradients.new_zeros(len(Terms._fields)))
+
     def _of_other_ranks(self, part: RankPart, most: int) -> Iterator[Terms]:
         """Take part in the updates that an algorithm of the user makes on other ranks only, until it makes none."""
-        none = part.valid.new_zeros(1)
         for _ in range(most):
-            self.parameters.gradients.zero_()
-            terms, makers = self._over_ranks(part, Terms(*none.expand(len(Terms._fields))), none, makes_update=False)
+            terms, makers = self._over_ranks(part, self.no_update(), part.valid.new_zeros(1), makes_update=False)
             if not makers:
                 return
             yield terms

@@ -44,3 +44,7 @@ class RankPart:
     end: int  # equal to `first` for a rank without environments: its batch is one column without valid rows
     valid: Tensor  # [T, B] float32, of the whole batch
     updates: int  # that the whole batch makes
+
+    def all_have(self, value: object | None) -> bool:
+        """Return whether no rank has None. All of them call it."""
+        return not self.ranks.sum(self.valid.new_full((1,), float(value is None))).any()

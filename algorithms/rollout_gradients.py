@@ -94,7 +94,7 @@ class RolloutGradients:
             if moments["returns"].squares.isfinite():  # else the learner rejects this gradient, and not the next one
                 self._rewards.moments.merge(moments["returns"])
             self._rewards.scale(batch)
-        (terms,) = self._computer.compute(batch, self._entropy_bonus)
+        (terms,) = list(self._computer.compute(batch, self._entropy_bonus)) or [self._computer.no_update()]
         first_pass = self._computer.take_first_pass()
         measured: dict[str, float] = {}
         if first_pass is not None:

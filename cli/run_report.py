@@ -18,8 +18,8 @@ def report(run: LocalRun, summary: dict[str, Any]) -> str:
     updates = f"{summary['updates']:,} updates{skipped}"
     if summary["solved"]:
         trained = (
-            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s, "
-            f"{summary['env_steps']:,} env_steps, {updates}"
+            f"solved: mean return {target:g} reached after {summary['seconds_to_target']:.1f} s; "
+            f"{summary['env_steps']:,} env_steps, {updates} in all"
         )
     else:
         goal = "" if target is None else f" (the target {target:g} was not reached)"

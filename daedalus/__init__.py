@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from daedalus.actor.evaluation.loaded_policy import Policy, load_policy
     from daedalus.actor.evaluation.video import VideoError
     from daedalus.cli.callbacks import Callback, TrainingRun
-    from daedalus.cli.comparing.recorded_run import RunDataError, read_metrics
+    from daedalus.cli.comparing.recorded_run import read_metrics
     from daedalus.cli.evaluate_function import EvaluationResult, evaluate
     from daedalus.cli.train_function import RunResult, TrainingError, train
+    from daedalus.learner.run.run_files import RunDataError
     from daedalus.learner.run.settings import SettingsError
     from daedalus.policy.saving.hub import HubError
     from daedalus.policy.saving.saved_policy import NoPolicyError

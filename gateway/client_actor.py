@@ -166,8 +166,7 @@ class ClientActor:
         if self._rows is None or not self._rows.in_episode:
             return  # another learner has come since the last action, whose row is dropped
         try:
-            self._rows.end_episode(values, terminated=message.terminated)
-            self._rows.reward(message.reward)
+            self._rows.end_episode(values, terminated=message.terminated, reward=message.reward)
             self._rows.complete_episode()
         except ValueError as error:
             raise ClientError("misfit", str(error)) from None

@@ -44,7 +44,7 @@ class ClientRows:
           bootstrap_terminations: whether a terminated episode needs its last observation.
           on_full: called when the rollout is full: it must call `writer.finish`.
         """
-        self._transforms, self._writer, self._example_mask = transforms, writer, example_mask
+        self._transforms, self._writer, self._has_masks = transforms, writer, example_mask is not None
         self._bootstrap_terminations = bootstrap_terminations
         self._on_full = on_full
         self._last: Observed | None = None  # the newest observation
@@ -76,9 +76,9 @@ class ClientRows:
         Adds `reward`, if there is one, to the reward of the last action. Raises ValueError if the observation, the mask
         or the reward does not fit; nothing has changed then.
         """
-        if action_mask is None and self._example_mask is not None:
+        if action_mask is None and self._has_masks:
             raise ValueError("this client was constructed with an action_mask: pass one to every act()")
-        if action_mask is not None and self._example_mask is None:
+        if action_mask is not None and not self._has_masks:
             raise ValueError(
                 "this client was constructed without an action_mask: construct it with an example of one, or act() "
                 "would choose illegal actions"
@@ -150,12 +150,17 @@ class ClientRows:
             raise ValueError(f"the reward is {total}: it must be finite, and a number of 32 bits holds it")
         self._reward = total
 
-    def end_episode(self, observation: Any, *, terminated: bool) -> None:
-        """End the episode with the last action; `observation` is the one that it led to, or None if unknown."""
+    def end_episode(self, observation: Any, *, terminated: bool, reward: float = 0.0) -> None:
+        """End the episode with the last action; `observation` is the one that it led to, or None if unknown.
+
+        Adds `reward`, if there is one, to the reward of the last action. Raises ValueError if the observation or the
+        reward does not fit, or if an observation is needed; nothing has changed then.
+        """
         if not self.in_episode:
             raise ValueError("the episode ended without any action: call act() first")
+        last = self._last
         if observation is not None:
-            self._last = self._transforms.observe_one(observation, self._example_mask, needed=False)
+            last = self._transforms.observe_one(observation, self._open_masks(), needed=False)
         elif not terminated:
             raise ValueError("a truncated episode needs its last observation for the bootstrap value: pass it")
         elif self._bootstrap_terminations:
@@ -163,7 +168,16 @@ class ClientRows:
                 "this run bootstraps terminated episodes too (environment.bootstrap_terminations): "
                 "pass the last observation"
             )
+        if reward:
+            self.reward(reward)
+        self._last = last
         self._terminated, self._truncated, self._ending = terminated, not terminated, True
+
+    def _open_masks(self) -> dict[str, np.ndarray] | None:
+        """Return masks that allow every choice, as an observation without a mask of its own has; None without masks."""
+        if not self._has_masks:
+            return None
+        return {name: np.ones(choices, np.bool_) for name, choices in self._transforms.spaces.masks.items()}
 
     def complete_episode(self) -> None:
         """Complete the last row of an episode that has ended: no more rewards come for it. Idempotent."""

@@ -9,6 +9,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
+from daedalus.actor.environments import atari
 from daedalus.actor.environments.environment_errors import (
     EnvironmentSetupError,
     creation_errors,
@@ -28,7 +29,10 @@ from daedalus.protocol.spec import EnvironmentSpec
 _PACKAGES = {"ALE/": ("ale_py", "atari"), "MiniGrid-": ("minigrid", "minigrid"), "BabyAI-": ("minigrid", "minigrid")}
 _OLD_ATARI = ("-v0", "-v4")  # versions of Atari's games under names without ALE/, such as PongNoFrameskip-v4
 # Arguments of the constructor that change an Atari game, by the same names on all backends. ALE's own has no modes.
-_ATARI_GAME_KWARGS = ("repeat_action_probability", "full_action_space", "mode", "difficulty")
+_ATARI_GAME_KWARGS = (
+    *("repeat_action_probability", "full_action_space", "mode", "difficulty"),
+    *("noop_max", "use_fire_reset"),
+)
 _CAR_RACING = "gymnasium.envs.box2d.car_racing:CarRacing"
 
 
@@ -46,6 +50,7 @@ class EnvironmentFactory:
         """Return a new environment. Raises whatever the environment raises."""
         spec, registered = self.spec, registration(self.spec.id, self.modules)
         kwargs = _kwargs(spec)
+        of_atari = atari.take_arguments(kwargs) if registered.namespace == "ALE" else {}
         if self.render_mode is not None:
             kwargs["render_mode"] = self.render_mode
         if kwargs.get("render_mode") == "rgb_array":  # also from environment.kwargs
@@ -63,6 +68,7 @@ class EnvironmentFactory:
             raise EnvironmentSetupError(
                 f"environment {spec.id} cannot render {self.render_mode} images: {reason}"
             ) from None
+        environment = atari.wrapped(environment, of_atari)
         if spec.wrap is not None:
             environment = _wrapped(environment, spec.wrap, self.modules)
         if environment.has_wrapper_attr("action_masks"):
@@ -179,8 +185,8 @@ def registration(environment_id: str, modules: UserModules) -> EnvSpec:
 def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
     """Return the specification for an evaluation on gymnasium's implementation of the environment.
 
-    Atari games of the other backends have another name there, and repeat actions unless told not to. Of their `kwargs`
-    those are kept that change the game itself.
+    Atari games of the other backends have another name there, repeat actions unless told not to, and begin always in
+    the same way. Of their `kwargs` those are kept that change the game itself.
     """
     evaluated = spec.as_evaluated("gymnasium")
     if spec.backend == "gymnasium":
@@ -191,7 +197,8 @@ def as_on_gymnasium(spec: EnvironmentSpec) -> EnvironmentSpec:
     if atari_id not in gymnasium.registry:
         return evaluated
     same_game = {name: value for name, value in evaluated.kwargs.items() if name in _ATARI_GAME_KWARGS}
-    kwargs = {"frameskip": 1, "repeat_action_probability": 0.0, **same_game}  # the defaults of the other backends
+    defaults = {"frameskip": 1, "repeat_action_probability": 0.0, **atari.DEFAULTS}  # of the other backends
+    kwargs = {**defaults, "maxpool": spec.action_repeat > 1, **same_game}
     return evaluated.model_copy(update={"id": atari_id, "kwargs": kwargs})
 
 

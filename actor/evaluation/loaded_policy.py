@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from daedalus.actor.environments.atari import pools_frames
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import as_on_gymnasium, make_gymnasium
 from daedalus.actor.environments.interface import Observed
@@ -45,6 +46,7 @@ class Policy:
         self._runtime.load(saved.weights)
         self._random = np.random.default_rng()
         self._repeat = saved.spec.environment.action_repeat
+        self._pools_frames = pools_frames(as_on_gymnasium(saved.spec.environment))
         self.reset()
 
     def reset(self, *, seed: int | None = None) -> None:
@@ -54,12 +56,15 @@ class Policy:
         self._running = RunningEpisodes(self._transforms.spaces, self._runtime, 1)
         self._action: Any = None
         self._repeats_left = 0
+        self._frame: Any = None  # the previous observation, if frames are pooled
 
     def act(self, observation: Any, *, sampled: bool = False, action_mask: Any = None) -> Any:
         """Return the action for the next step of the environment: the most probable one, or a sampled one.
 
         Call it once for every step, with the newest observation, and call `reset` at the start of each episode. If the
         run repeats actions (environment.action_repeat), an action is returned as many times before the next is chosen.
+        An Atari game must not repeat actions itself (frameskip=1): the policy observes the maximum of its two newest
+        frames, as in training on the backends `ale` and `envpool`.
 
         Args:
           observation: one observation, of the environment's own shape and dtype.
@@ -70,11 +75,18 @@ class Policy:
         Raises ValueError for an observation that is not of the space, and for a mask that is missing or does not fit.
         """
         self._check_mask(action_mask)
+        if self._pools_frames:
+            observation = self._pooled(observation)
         if self._repeats_left == 0:
             self._action = self._choose(self._transforms.observe_one(observation, action_mask), sampled)
             self._repeats_left = self._repeat
         self._repeats_left -= 1
         return copy.deepcopy(self._action)
+
+    def _pooled(self, frame: Any) -> Any:
+        """Return the maximum of the newest two observations, as Atari games were observed in training."""
+        before, self._frame = self._frame, np.array(frame)
+        return frame if before is None or before.shape != self._frame.shape else np.maximum(before, self._frame)
 
     def _check_mask(self, action_mask: Any) -> None:
         if action_mask is None and self._transforms.needs_mask:

@@ -13,6 +13,7 @@ import numpy as np
 from processes import processes_mentioning
 
 from benchmarks.chaos.scene import ENDLESS, LIMIT, FailedError, Scene, say, scene, seconds
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.checkpoint import load_newest, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.saving.sealed import DamagedError
@@ -140,7 +141,7 @@ def damaged(count: int) -> list[tuple[str, str]]:
                 program=learner.program(),
                 parameters=learner.weights(),
                 state=learner.state(),
-                counters={"env_steps": version},
+                counters=RunCounters(1).state(float(version)),
                 keep=2,
             )
 

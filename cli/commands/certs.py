@@ -225,7 +225,7 @@ def _named(parsed: argparse.Namespace) -> "list[Identity]":
     from daedalus.cli.certificate_folder import Identity
 
     if (parsed.role in _NAMED) != bool(parsed.names):
-        raise CredentialsError("wrong number of names: name actors and operators, but not a learner or router")
+        raise CredentialsError("wrong number of names: name actors, operators and clients, and nobody else")
     return [Identity(parsed.role, name) for name in parsed.names or [""]]
 
 

@@ -92,7 +92,7 @@ def _checked(spec: RunSpec, parsed: argparse.Namespace) -> list[tuple[str, str]]
     problems = [*report.problems, *filter(None, (chosen.text_problem(spec), fault))]
     return [
         *_description(spec, report),
-        *_choices(spec, network),
+        *(_choices(spec, network) if chosen.spaces is not None else ()),
         *(("warning", text) for text in report.warnings),
         *(("note", text) for text in (*report.notes, *_advice(spec, report))),
         *([("problem", with_preset(text, spec)) for text in problems] or [("result", _result(report))]),
@@ -158,16 +158,19 @@ def _advice(spec: RunSpec, report: EnvironmentReport) -> list[str]:
 
 
 def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tuple[str, str]:
-    """Return a description of the network and an empty string, or an empty string and why it cannot be built."""
+    """Return a description of the network, and an empty string; or an empty string, and why it cannot be learned."""
     if spaces is None:
         return "", ""
+    from daedalus.algorithms.errors import AlgorithmError
+    from daedalus.algorithms.gradients import GradientComputer
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
     from daedalus.policy.network.errors import NetworkError
 
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)
-    except NetworkError as error:
+        GradientComputer(spec.training, network, spaces, modules)  # tries an own algorithm
+    except (AlgorithmError, NetworkError) as error:
         return "", str(error)
     memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"
     parameters = sum(parameter.numel() for parameter in network.parameters())

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.comparing.comparison import compare_groups
-from daedalus.cli.comparing.recorded_run import SECONDS, RunDataError
+from daedalus.cli.comparing.recorded_run import SECONDS
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.cli.logs import print_error
+from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\
 Compares finished runs of one environment. Runs with equal settings apart from the seed are one group, which is named

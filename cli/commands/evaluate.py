@@ -63,7 +63,8 @@ def main(
     """
     output = output or sys.stdout
     words = sys.argv[1:] if command_line is None else command_line
-    arguments = parser().parse_args(words)
+    with redirect_stdout(output):  # for --help
+        arguments = parser().parse_args(words)
     configure_logging(
         arguments.log_level,
         as_json=arguments.log_json,
@@ -75,6 +76,9 @@ def main(
         check(arguments)
     except ValueError as error:
         print_error("evaluate", error)
+        return 2
+    if arguments.record and not (arguments.directory / "config.toml").is_file():
+        print_error("evaluate", f"--record: {arguments.directory} is not a run directory: it has no config.toml")
         return 2
     if arguments.exit_with_parent:
         exit_with_parent(stop)
@@ -89,7 +93,19 @@ def main(
         print_error("evaluate", "stopped" if stop.is_set() else error)
         return 1
     print(json.dumps(result) if arguments.json else _text(result), file=output, flush=True)
-    return 0
+    return 0 if not arguments.record or _record(result, arguments.directory) else 1
+
+
+def _record(result: dict[str, Any], directory: Path) -> bool:
+    """Keep a result in a run directory, and return whether that was possible."""
+    from daedalus.learner.run.run_directory import EVALUATION, write_json  # other evaluations need no learner's code
+
+    try:
+        write_json(directory / EVALUATION, result)
+    except OSError as error:
+        print_error("evaluate", f"{directory / EVALUATION} cannot be written: {error.strerror}")
+        return False
+    return True
 
 
 def _reserved_stdout() -> TextIO:

@@ -18,7 +18,8 @@ best checkpoint of the run, or the newest if there is no best one. Name the fold
 EXAMPLES = """\
 examples:
   daedalus evaluate runs/cartpole-impala-s1-20261121-101500
-  daedalus evaluate RUN_DIR --episodes 1000 --seed 7 --actions sampled
+  daedalus evaluate RUN_DIR --episodes 1000 --record
+  daedalus evaluate RUN_DIR --seed 7 --actions sampled
   daedalus evaluate RUN_DIR/checkpoints/0000000143
   daedalus evaluate RUN_DIR --backend gymnasium --episodes 100
   daedalus evaluate RUN_DIR --video drive.gif --max-seconds 20
@@ -81,6 +82,11 @@ def parser() -> argparse.ArgumentParser:
     )
     add_allow_module(options, "the run")
     options.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    options.add_argument(
+        "--record",
+        action="store_true",
+        help="keep the result in the run directory, as the evaluation that report and push show (evaluation.json)",
+    )
     _add_watching(options)
     add_logging(options)
     options.add_argument("--exit-with-parent", action="store_true", help=argparse.SUPPRESS)
@@ -114,6 +120,8 @@ def check(arguments: argparse.Namespace) -> None:
         )
     if arguments.revision is not None and arguments.from_hub is None:
         raise ValueError("--revision is that of a policy on the Hub: add --from-hub USER/NAME, or leave it out")
+    if arguments.record and arguments.directory is None:
+        raise ValueError("--record keeps the result in a run directory: name the directory of a run")
     if not 1 <= arguments.episodes <= _MOST_EPISODES:
         raise ValueError(f"--episodes is {arguments.episodes}: choose a number from 1 to {_MOST_EPISODES:,}")
     if arguments.envs is not None and not 1 <= arguments.envs <= 4096:

@@ -6,9 +6,10 @@ from pathlib import Path
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
 from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves, draw_profiles
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.logs import print_error
+from daedalus.learner.run.run_files import RunDataError
 
 _DESCRIPTION = """\
 Draws return, entropy, value loss and policy lag of runs. Runs with equal settings apart from the seed are one curve:

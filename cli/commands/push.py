@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.comparing.recorded_run import RunDataError
 from daedalus.cli.logs import add_logging, configure_logging, print_error
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.hub import HubError
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError

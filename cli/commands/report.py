@@ -1,15 +1,18 @@
 """`daedalus report`: write one HTML file about one or more runs."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.commands.compare import parse_groups
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError
+from daedalus.cli.comparing.grouping import Group
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.logs import print_error
 from daedalus.cli.reports.page import comparison_page, run_page
-from daedalus.cli.reports.run_record import read_record
+from daedalus.cli.reports.run_record import RunRecord, read_record
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.replacing import replace_text
 
 _DESCRIPTION = """\
@@ -62,9 +65,10 @@ def report(arguments: list[str]) -> int:
     parsed, parts = parse_groups(parser(), arguments)
     try:
         groups, problems = select(parts, finished=False, columns=[SECONDS])
+        groups, records, damaged = _read_records(groups)
+        problems += damaged
         for problem in problems:
             print_error("report", problem)
-        records = {run.directory: read_record(run) for group in groups for run in group.runs}
     except RunDataError as error:
         print_error("report", error)
         return 1
@@ -81,3 +85,21 @@ def report(arguments: list[str]) -> int:
         return 1
     print(f"wrote {output}")
     return 0
+
+
+def _read_records(groups: Sequence[Group]) -> tuple[list[Group], dict[Path, RunRecord], list[str]]:
+    """Return the records of the runs by directory, the groups of these runs, and one line for each run left out.
+
+    Raises RunDataError if no run is left.
+    """
+    records: dict[Path, RunRecord] = {}
+    problems: list[str] = []
+    for run in (run for group in groups for run in group.runs):
+        try:
+            records[run.directory] = read_record(run)
+        except RunDataError as error:
+            problems.append(str(error))
+    if not records:
+        raise RunDataError(problems[0])
+    kept = [Group(name=group.name, runs=[run for run in group.runs if run.directory in records]) for group in groups]
+    return [group for group in kept if group.runs], records, [f"left out: {problem}" for problem in problems]

@@ -10,7 +10,9 @@ from daedalus.cli.logs import one_line, print_error, printable
 from daedalus.cli.status_query import ask, ask_events, no_answer
 from daedalus.cli.watching.screen import Screen
 from daedalus.cli.watching.status_watch import watch_status
-from daedalus.learner.run.heartbeat import silence
+from daedalus.learner.run.heartbeat import HEARTBEAT, silence
+from daedalus.learner.run.run_directory import CONFIG
+from daedalus.learner.run.run_lock import LOCK
 from daedalus.protocol import keys
 from daedalus.protocol.codec import ProtocolError
 from daedalus.protocol.status import ActorStatus, EventsPage, RefusedJoin, RunStatus
@@ -39,7 +41,7 @@ epsilon is the probability with which an actor takes a random action, in the end
 counts snapshots. An s marks an actor that fetches compact snapshots.
 
 exit status: 0 healthy, 1 no learner answers, 2 bad usage, 3 unhealthy (the output names the problems); with --alive
-0 alive or starting, 1 not alive or no such directory"""
+0 alive, not begun or ended, 1 not alive or no run directory"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -123,6 +125,13 @@ def _check_alive(directory: Path) -> int:
     if not directory.is_dir():
         print_error("status", f"{directory} does not exist: name a run directory")
         return NO_ANSWER
+    # A learner that waits for its router has made no more than the directory.
+    if not (directory / CONFIG).exists() and any(entry.name != LOCK for entry in directory.iterdir()):
+        print_error("status", f"{directory} is not a run directory: it has no {CONFIG}")
+        return NO_ANSWER
+    if not (directory / HEARTBEAT).exists():
+        print(f"no learner works in {directory}: it has ended, or not begun yet")
+        return HEALTHY
     silent = silence(directory)
     if silent is None:
         return HEALTHY

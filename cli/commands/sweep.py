@@ -11,7 +11,6 @@ from pathlib import Path
 import tomli_w
 
 from daedalus.cli.arguments import command_parser
-from daedalus.cli.comparing.recorded_run import RunDataError
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import stop_on_signals
 from daedalus.cli.quick_check import EnvironmentProblemError, checked_defaults, checked_spaces
@@ -23,6 +22,7 @@ from daedalus.cli.sweeping.processes import RunProcesses
 from daedalus.cli.sweeping.report import report
 from daedalus.cli.sweeping.searches import INSTALL, GridSearch, SampledSearch, Search, import_optuna
 from daedalus.cli.sweeping.sweep import Sweep
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunInUseError, RunLock
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.replacing import replace_text

@@ -70,5 +70,6 @@ def evaluations(run: RecordedRun, by: str) -> tuple[np.ndarray, np.ndarray]:
     by_env_steps = {env_steps: value for env_steps, value in zip(at, returns, strict=True) if not np.isnan(env_steps)}
     x, y = np.array(list(by_env_steps)), np.array(list(by_env_steps.values()))
     if by != ENV_STEPS and len(x):
-        x = np.interp(x, *points(run, "wall_seconds", ENV_STEPS)) / 60.0
+        at_rows, seconds = points(run, SECONDS, ENV_STEPS)
+        x = np.interp(x, at_rows, seconds) / 60.0 if len(at_rows) else np.full(len(x), np.nan)
     return x, y

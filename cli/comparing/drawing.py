@@ -9,8 +9,9 @@ import numpy as np
 from daedalus.cli.comparing.comparison import final_returns
 from daedalus.cli.comparing.curves import evaluations, group_curve, points
 from daedalus.cli.comparing.grouping import Group
-from daedalus.cli.comparing.recorded_run import RETURN, RunDataError
+from daedalus.cli.comparing.recorded_run import RETURN
 from daedalus.cli.comparing.statistics import performance_profile, profile_interval
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.policy.saving.replacing import replacing
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daedalus.cli.comparing.recorded_run import ENVIRONMENT, SEED, RecordedRun, RunDataError
+from daedalus.cli.comparing.recorded_run import ENVIRONMENT, SEED, RecordedRun
+from daedalus.learner.run.run_files import RunDataError
 
 _SERVICE = "service."  # settings of how the learner runs, not of what it learns
 _FIRST = ("training.algorithm", "collection.upload", "collection.rollout_length")  # the names that say most

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from daedalus.cli.comparing.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
+from daedalus.learner.run.run_files import RunDataError, read_file, read_json, read_toml
 from daedalus.learner.run.run_lock import is_locked
 from daedalus.learner.run.settings import SettingsError, run_spec
 
@@ -78,14 +78,15 @@ class RecordedRun:
     def reached(self, threshold: float) -> tuple[float, float]:
         """Return env_steps and minutes until the mean return of the newest training episodes reached a threshold.
 
-        Infinite if the mean did not reach the threshold. The precision is that of the rows of metrics.csv, except for
-        the target of a run that stopped at the target. The metrics need wall_seconds.
+        Infinite if the mean did not reach the threshold. Rows that a resumed run repeated, from its checkpoint on,
+        replace the earlier ones. The precision is that of the rows of metrics.csv, except for the target of a run that
+        stopped at it. The metrics need wall_seconds.
         """
         at_target = self.summary.get("solved") and threshold == self.target
         steps, seconds = self.summary.get("env_steps"), self.summary.get("seconds_to_target")
         if at_target and self.settings.get("training.stop_when_solved") and steps is not None and seconds is not None:
             return float(steps), seconds / 60.0
-        above = self.metrics[RETURN] >= threshold
+        above = (self.metrics[RETURN] >= threshold) & not_repeated(self.metrics[ENV_STEPS])
         episodes = self.metrics.get("episodes")
         if episodes is not None:  # the mean of fewer episodes may be luck
             above &= episodes >= self.settings.get("training.target_episodes", 1)
@@ -98,7 +99,7 @@ class RecordedRun:
 def find_runs(paths: Iterable[Path]) -> list[Path]:
     """Return the run directories that paths name. A folder of run directories, such as runs/, stands for all of them.
 
-    Raises RunDataError for a path that is neither.
+    A run that has several paths is returned once, by the first of them. Raises RunDataError for a path that is neither.
     """
     found: list[Path] = []
     for path in paths:
@@ -114,7 +115,10 @@ def find_runs(paths: Iterable[Path]) -> list[Path]:
                 else f"{path} does not exist: name a run directory, or a folder of run directories"
             )
         found += inside
-    return list(dict.fromkeys(found))
+    runs: dict[Path, Path] = {}
+    for path in found:  # links give a run further paths
+        runs.setdefault(path.resolve(), path)
+    return list(runs.values())
 
 
 def one_run(directory: Path) -> Path:
@@ -184,7 +188,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _summary(path: Path) -> dict[str, Any]:
-    content = read_json(path)
+    content = read_json(path) or {}
     for name in _SUMMARY_NUMBERS:
         if not _is_number(content.get(name)):
             raise RunDataError(f"{path} is damaged: {name} is not a number")

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from daedalus.cli.comparing.grouping import Group, by_settings, by_user, check_comparable
-from daedalus.cli.comparing.recorded_run import RecordedRun, RunDataError, find_runs, read_run
+from daedalus.cli.comparing.recorded_run import RecordedRun, find_runs, read_run
+from daedalus.learner.run.run_files import RunDataError
 
 
 def select(

@@ -60,7 +60,7 @@ def notes(comparison: Comparison) -> list[str]:
             "0.5 if they are equal"
         )
     if comparison.threshold is None:
-        lines.append("env_steps and minutes to a return: name the return with --threshold")
+        lines.append("env_steps and minutes to a return: name the return with `daedalus compare --threshold`")
     if any(1 < result.runs < _FEW for result in comparison.results):
         lines.append(f"intervals of fewer than {_FEW} runs are too narrow: train more seeds")
     single = [result.group for result in comparison.results if result.runs == 1]

@@ -83,14 +83,14 @@ def _run_series(name: str, run: RecordedRun, column: str, by: str) -> Series:
     std_x, std = points(run, _STD, by)
     spread = np.interp(x, std_x, std) if len(std) else np.zeros(len(x))
     at, values = evaluations(run, by)
-    known = (np.abs(values) < LARGEST) & np.isfinite(at)
+    known = (np.abs(values) < LARGEST) & (np.abs(at) < LARGEST)
     marks = (at[known], values[known]) if known.any() else None
     return Series(name=name, x=x, y=y, low=y - spread, high=y + spread, marks=marks)
 
 
 def _drawable(series: Series) -> Series | None:
     """Return a series without the numbers that cannot be drawn, or None if nothing is left."""
-    kept = np.isfinite(series.x) & (np.abs(series.y) < LARGEST)
+    kept = (np.abs(series.x) < LARGEST) & (np.abs(series.y) < LARGEST)
     if not kept.any():
         return None
 

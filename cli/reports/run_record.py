@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from daedalus.cli.comparing.recorded_run import RecordedRun
-from daedalus.cli.comparing.run_files import RunDataError, read_json
 from daedalus.learner.run.event_file import RecordedEvent, read_events
 from daedalus.learner.run.run_directory import EVALUATION, EVENTS, OUTPUT, VERSIONS
+from daedalus.learner.run.run_files import RunDataError, read_json
 from daedalus.policy.saving.regular_files import open_regular
 
 _MAX_OUTPUT_BYTES = 16 << 10
@@ -104,11 +104,12 @@ def read_record(run: RecordedRun) -> RunRecord:
     except OSError as error:
         raise RunDataError(f"{directory / EVENTS}: {error.strerror}") from None
     confirmation = run.summary.get("confirmation")
+    versions = read_json(directory / VERSIONS) or {}
     return RunRecord(
         run=run,
         evaluation=_evaluation(directory, run),
         confirmation=confirmation if isinstance(confirmation, dict) else {},
-        versions={name: str(value) for name, value in read_json(directory / VERSIONS).items() if value is not None},
+        versions={name: str(value) for name, value in versions.items() if value is not None},
         events=events,
         output=_end_of(directory / OUTPUT),
         video=_video(directory),
@@ -141,7 +142,7 @@ def _evaluation(directory: Path, run: RecordedRun) -> RecordedEvaluation | None:
 
 def record_command(directory: Path) -> str:
     """Return the command that evaluates a run and records the result in its directory."""
-    return f"daedalus evaluate {shlex.quote(str(directory))} --json > {shlex.quote(str(directory / EVALUATION))}"
+    return f"daedalus evaluate {shlex.quote(str(directory))} --record"
 
 
 def _end_of(path: Path) -> str:

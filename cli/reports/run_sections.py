@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import shlex
 from collections.abc import Sequence
 
@@ -50,7 +51,8 @@ def summary_tiles(record: RunRecord) -> Html:
         values.append(("evaluation", f"{written(mean)} ± {written(statistics.std)}", more))
         if statistics.interquartile is not None:
             value, low, high = statistics.interquartile
-            values.append(("interquartile mean", written(value), f"95 % interval {written(low)} to {written(high)}"))
+            interval = "" if math.isnan(low) else f"95 % interval {_interval(low, high)}"
+            values.append(("interquartile mean", written(value), interval))
     trained = record.number("episode_return_mean")
     values.append(("training", written(trained), "mean return of the newest episodes"))
     budget = record.run.settings.get("training.env_steps")

@@ -106,11 +106,14 @@ def _digest(text: str) -> str:
 
 
 def is_done(run: PlannedRun) -> bool:
-    """Return whether a run has ended and was evaluated. Raises SettingsError if its files are damaged."""
+    """Return whether a run has ended and was evaluated. One with a damaged summary has not: it writes it again."""
     summary = run.directory / run_directory.SUMMARY
     if not has_begun(run) or not summary.exists():
         return False
-    content = run_directory.read_json(summary)
+    try:
+        content = run_directory.read_json(summary)
+    except SettingsError:
+        return False
     return bool(content.get("finished")) and content.get("evaluation") is not None
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 from daedalus.cli.comparing.comparison import compare_groups, final_returns
 from daedalus.cli.comparing.drawing import COLUMNS, INSTALL, draw_curves
 from daedalus.cli.comparing.grouping import Group, short
-from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, RunDataError, read_run
+from daedalus.cli.comparing.recorded_run import ENV_STEPS, SECONDS, read_run
 from daedalus.cli.comparing.selection import select
 from daedalus.cli.comparing.statistics import interquartile_mean
 from daedalus.cli.comparing.tables import as_csv, as_text
 from daedalus.cli.sweeping.plan import PlannedRun
 from daedalus.cli.sweeping.sweep import SweepEnd
+from daedalus.learner.run.run_files import RunDataError
 
 TABLE, RUNS, CURVES = "table.csv", "runs.csv", "curves.png"
 

@@ -5,21 +5,26 @@ import errno
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from daedalus.learner.reporting.metrics import COLUMNS, Details
 from daedalus.policy.saving.replacing import replacing
 
+_BLOCK_BYTES = 1 << 16
+
 
 class CsvWriter:
     """Writer that appends one line for each row. A resumed run continues its file.
 
-    Lines are complete: if the disk is full, a partly written line is removed. A row with new columns, such as the first
-    scalar of the environment's info, adds them to the header, for which the file is written anew.
+    Lines are complete: one that was written in part, because the disk was full or the machine crashed, is removed. A
+    row with new columns, such as the first scalar of the environment's info, adds them to the header, for which the
+    file is written anew.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        _remove_partial_line(path)
         self._columns = _header(path)  # another release may have had other columns
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         if not self._columns:
@@ -74,6 +79,22 @@ def _header(path: Path) -> Sequence[str]:
     if not path.exists():
         return ()
     return next(_rows(path), ())
+
+
+def _remove_partial_line(path: Path) -> None:
+    """Remove the part of a line at the end of a file, if the file exists."""
+    with suppress(FileNotFoundError), open(path, "rb+") as file:
+        length = end = file.seek(0, os.SEEK_END)
+        while end > 0:
+            begin = max(end - _BLOCK_BYTES, 0)
+            file.seek(begin)
+            line_end = file.read(end - begin).rfind(b"\n")
+            if line_end >= 0:
+                end = begin + line_end + 1
+                break
+            end = begin
+        if end < length:
+            file.truncate(end)
 
 
 def _rows(path: Path) -> Iterator[Sequence[str]]:

@@ -23,8 +23,15 @@ def with_changes(spec: RunSpec, assignments: Sequence[str], directory: Path) -> 
     """
     settings = spec.model_dump(mode="json", exclude_none=True)
     override(settings, assignments)
-    changed = run_spec(settings)
-    if fixed := fixed_changes(spec, changed):
+    try:
+        changed = run_spec(settings)
+        fixed = fixed_changes(spec, changed)
+    except SettingsError:  # perhaps because others would have to change with a setting that cannot
+        fixed = [name for name in _named(assignments) if _is_fixed(name) and name in _values(spec)]
+        if not fixed:
+            raise
+        changed = spec
+    if fixed:
         changes = [word for assignment in assignments for word in ("--set", assignment)]
         words = ["daedalus", "train", f"{directory}/config.toml", "--init-from", str(directory), *changes]
         raise SettingsError(
@@ -43,6 +50,10 @@ def differing(before: RunSpec, after: RunSpec) -> list[str]:
     """Return the settings in which two specifications differ, as `section.key`."""
     old = _values(before)
     return [name for name, value in _values(after).items() if value != old[name]]
+
+
+def _named(assignments: Sequence[str]) -> list[str]:
+    return [assignment.partition("=")[0].strip() for assignment in assignments]
 
 
 def _is_fixed(name: str) -> bool:

@@ -3,9 +3,10 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, TypeAdapter
 
 from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
@@ -23,6 +24,37 @@ _SAVED = (
     "policy_lag_max",
     "snapshots_published",
 )
+
+
+_Count = Annotated[int, Field(ge=0, lt=2**63)]
+_COUNTS = TypeAdapter(dict[str, _Count], config={"strict": True})  # of _SAVED
+
+
+class _AnnealingState(BaseModel, strict=True, extra="forbid"):
+    """Result of Annealing.state."""
+
+    budget: int
+    env_steps: int = 0
+    progress: float = 0.0
+
+
+class _State(BaseModel, strict=True):
+    """The other values of RunCounters.state, and what RunState adds."""
+
+    rollouts_rejected: dict[str, _Count]
+    best_evaluation: float | None = None  # absent in checkpoints of earlier releases
+    wall_seconds: Annotated[float, Field(ge=0)]
+    seconds_to_target: float | None = None  # absent in checkpoints of earlier releases
+    returns: list[float]
+    lengths: list[int]
+    annealing: _AnnealingState | None = None  # absent in checkpoints of earlier releases
+
+
+def check_counters(state: Any) -> dict[str, Any]:
+    """Return counters that were read, if they can be restored. Raises KeyError or ValueError if they cannot."""
+    _State.model_validate(state)
+    _COUNTS.validate_python({name: state[name] for name in _SAVED if name in state or name == "env_steps"})
+    return state
 
 
 @dataclass(slots=True)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from daedalus.learner.run.counters import RunCounters
+from daedalus.learner.run.counters import RunCounters, check_counters
 from daedalus.learner.run.run_directory import SUMMARY, read_json
 from daedalus.learner.run.settings import SettingsError
 from daedalus.policy.saving.saved_policy import checkpoints
@@ -36,7 +36,7 @@ def finished_run(directory: Path, spec: RunSpec) -> FinishedRun | None:
     solved = counters.is_solved(training) and bool(summary.get("solved"))  # not while new episodes have to confirm it
     if solved and training.stop_when_solved:
         reason = (
-            f"the target return {training.target_return:g} was reached after {counters.env_steps:,} env_steps: "
+            f"the target return {training.target_return:g} was reached, and {counters.env_steps:,} env_steps are done: "
             "train on with --set training.stop_when_solved=false, or raise training.target_return"
         )
     elif counters.env_steps >= training.env_steps:
@@ -55,8 +55,8 @@ def _newest_counters(directory: Path, spec: RunSpec) -> RunCounters | None:
     for checkpoint in checkpoints(directory):
         counters = RunCounters(spec.training.target_episodes)
         try:
-            counters.restore(SealedDirectory(checkpoint).content["counters"])
-        except (DamagedError, KeyError, TypeError, ValueError):
+            counters.restore(check_counters(SealedDirectory(checkpoint).content["counters"]))
+        except (DamagedError, KeyError, ValueError):
             continue  # the learner reports it
         return counters
     return None

@@ -26,9 +26,10 @@ from typing import Any
 
 import tomli_w
 
+from daedalus.learner.run import run_files
 from daedalus.learner.run.heartbeat import HEARTBEAT
 from daedalus.learner.run.run_lock import LOCK, RunLock
-from daedalus.learner.run.settings import SettingsError, read_file, run_spec
+from daedalus.learner.run.settings import SettingsError, read_settings, run_spec
 from daedalus.policy.saving.replacing import replace_text
 from daedalus.protocol import keys
 from daedalus.protocol.spec import RunSpec
@@ -179,7 +180,11 @@ def read_config(directory: Path) -> RunSpec:
     """Return the specification of a run. Raises SettingsError if the directory has no valid config.toml."""
     if not (directory / CONFIG).is_file():
         raise SettingsError(f"{directory} is not a run directory: it has no {CONFIG}")
-    return run_spec(read_file(directory / CONFIG))
+    settings = read_settings(directory / CONFIG)
+    try:
+        return run_spec(settings)
+    except SettingsError as error:
+        raise SettingsError(f"{directory / CONFIG}: {error}") from None
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -190,11 +195,12 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file of a run directory. Raises SettingsError if it is missing or damaged."""
     try:
-        return json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path}: {error.strerror}") from None
-    except ValueError:
-        raise SettingsError(f"{path} is damaged: it is not valid JSON") from None
+        content = run_files.read_json(path)
+    except run_files.RunDataError as error:
+        raise SettingsError(str(error)) from None
+    if content is None:
+        raise SettingsError(f"{path} does not exist")
+    return content
 
 
 def _versions() -> dict[str, Any]:

@@ -56,7 +56,7 @@ def _path(location: tuple[int | str, ...]) -> list[str]:
 def unknown_setting(path: list[str], section: list[str]) -> str:
     """Return the message for a name that is not in a section of the settings, with what its user may have meant."""
     known = known_names(section)
-    near = difflib.get_close_matches(path[-1], known, 3, 0.5)
+    near = [".".join([*path[:-1], name]) for name in difflib.get_close_matches(path[-1], known, 3, 0.5)]
     hint = f"did you mean {' or '.join(near)}?" if near else f"the settings are {', '.join(known)}"
     return f"unknown setting {'.'.join(path)}: {hint}"
 

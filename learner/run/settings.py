@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from daedalus.learner.run.run_files import RunDataError, read_toml
 from daedalus.learner.run.setting_errors import known_names, one_line, unknown_setting
 from daedalus.protocol.algorithms import check_algorithm
 from daedalus.protocol.spec import RunSpec, TrainingSpec
@@ -29,7 +30,7 @@ def preset_names() -> list[str]:
 def read_preset(name: str) -> dict[str, Any]:
     """Return the settings of a preset, or of a TOML file if `name` ends with ".toml". Raises SettingsError."""
     if name.endswith(".toml"):
-        return read_file(Path(name))
+        return read_settings(Path(name))
     if name not in preset_names():
         raise SettingsError(_unknown_preset(name))
     text = (importlib.resources.files("daedalus.learner.run.presets") / f"{name}.toml").read_text("utf-8")
@@ -44,22 +45,26 @@ def _unknown_preset(name: str) -> str:
             f"{name} is a run directory: continue it with `daedalus resume {directory}`, or start a new run with its "
             f"settings with `daedalus train {config}`"
         )
+    if name.endswith(".py"):
+        module = Path(name).stem
+        return f"{name} is a module, not a preset: register an environment in it, and name it as --env {module}:ID"
     if ":" in name or re.search(r"-v\d+$", name):
         command = f"daedalus train --env {shlex.quote(name)}"
-        return f"unknown preset {name!r}: an environment is named with --env, such as with: {command}"
+        in_python = f"in Python: daedalus.train(env={name!r})"
+        return f"unknown preset {name!r}: an environment is named with --env, such as with: {command} ({in_python})"
     near = difflib.get_close_matches(name, preset_names(), 3, 0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"the presets are {', '.join(preset_names())}."
     return f"unknown preset {name!r}: {hint} Any gymnasium environment runs with --env ID"
 
 
-def read_file(path: Path) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
     """Return the settings in a TOML file, such as the config.toml of a run, by section. Raises SettingsError."""
     try:
-        settings = tomllib.loads(path.read_text("utf-8-sig"))  # some editors of Windows begin a file with a mark
-    except OSError as error:
-        raise SettingsError(f"{path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path} is not valid TOML: {error}") from None
+        settings = read_toml(path)
+    except RunDataError as error:
+        raise SettingsError(str(error)) from None
+    if settings is None:
+        raise SettingsError(f"{path} does not exist")
     if outside := [name for name, value in settings.items() if not isinstance(value, dict)]:
         raise SettingsError(
             f"{path}: {outside[0]} is a value outside of the sections: write it below a section, such as [environment]"

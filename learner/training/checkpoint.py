@@ -18,6 +18,7 @@ import safetensors.numpy
 import safetensors.torch
 from torch import Tensor
 
+from daedalus.learner.run.counters import check_counters
 from daedalus.policy.saving.saved_policy import (
     FORMAT,
     PARAMETERS_FILE,
@@ -35,6 +36,7 @@ from daedalus.protocol.spec import RunSpec
 _logger = logging.getLogger(__name__)
 
 _STATE_FILE = "learner.safetensors"
+_MAX_STATE_BYTES = 8 << 30  # several times the largest parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,11 +94,11 @@ def load_checkpoint(directory: Path) -> Checkpoint:
     policy = read_policy(directory)
     sealed = SealedDirectory(directory)
     try:
-        state = safetensors.torch.load(sealed.read(_STATE_FILE))
-        counters = sealed.content["counters"]
-    except (KeyError, safetensors.SafetensorError) as error:
+        state = safetensors.torch.load(sealed.read(_STATE_FILE, _MAX_STATE_BYTES))
+        counters = check_counters(sealed.content["counters"])
+    except (KeyError, ValueError, safetensors.SafetensorError) as error:
         raise DamagedError(
-            f"{directory}: written by another release ({type(error).__name__}): resume the run with that release"
+            f"{directory}: damaged, or of another release ({type(error).__name__}): resume the run with that release"
         ) from None
     return Checkpoint(policy=policy, state=state, counters=counters)
 

@@ -138,13 +138,17 @@ class Learner:
           end: policy version after the last update.
         """
         self.first_pass = None  # its memory is used for this batch
-        for terms in self._gradients.compute(batch.to(self.device), self.entropy_bonus(progress)):
+        batch = batch.to(self.device)
+        for terms in self._gradients.compute(batch, self.entropy_bonus(progress)):
             if not self._make_update(terms, progress):
                 return False
             if self.policy_version == end:
                 break
         self.policy_version = end  # an algorithm of the user may stop early
-        self.first_pass = self._gradients.take_first_pass()
+        first_pass = self._gradients.take_first_pass()
+        # An algorithm of the user may make no update on some ranks: then the whole batch has no first pass.
+        if batch.rank_part is None or batch.rank_part.all_have(first_pass):
+            self.first_pass = first_pass
         return True
 
     def _make_update(self, terms: Terms, progress: float) -> bool:

@@ -11,9 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
 from daedalus.policy.saving.replacing import replace_text
-from daedalus.policy.saving.saved_policy import PARAMETERS_FILE, PROGRAM_FILE
+from daedalus.policy.saving.saved_policy import POLICY_LIMITS
 from daedalus.policy.saving.sealed import MANIFEST, MAX_MANIFEST_BYTES, SEAL
 from daedalus.protocol.texts import bounded_text
 
@@ -23,9 +22,8 @@ if TYPE_CHECKING:
 LIMITS = {
     MANIFEST: MAX_MANIFEST_BYTES,
     SEAL: 1 << 10,
-    PROGRAM_FILE: MAX_PROGRAM_BYTES,
-    PARAMETERS_FILE: 1 << 30,
-}  # size of each file of a policy, in bytes
+    **POLICY_LIMITS,
+}  # size of each file in a repository, in bytes
 LIBRARY = "daedalus-rl"
 _ANSWER_SECONDS = 20.0
 _INSTALL = f'the Hub needs huggingface-hub: pip install "{LIBRARY}[hub]"'

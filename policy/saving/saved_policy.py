@@ -9,21 +9,28 @@ import difflib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import safetensors
 import safetensors.numpy
+from pydantic import Field, TypeAdapter
 
+from daedalus.policy.acting.program_check import MAX_PROGRAM_BYTES
 from daedalus.policy.saving.best_checkpoints import best_checkpoints
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
+from daedalus.protocol.limits import LEARNER_LIMITS
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import RunSpec
 
 _logger = logging.getLogger(__name__)
 
 PROGRAM_FILE, PARAMETERS_FILE = "program.onnx", "parameters.safetensors"
+# Size of each file of a policy, in bytes.
+POLICY_LIMITS = {PROGRAM_FILE: MAX_PROGRAM_BYTES, PARAMETERS_FILE: LEARNER_LIMITS.max_bytes}
 FORMAT = 2  # of the spaces, the program and the names of the parameters; older releases wrote no number
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
+_VERSION = TypeAdapter(Annotated[int, Field(ge=0, lt=2**63, strict=True)])
 
 
 class OtherFormatError(DamagedError):
@@ -106,7 +113,7 @@ def export_policy(checkpoint: Path, target: Path) -> None:
     Raises DamagedError if the checkpoint is damaged, OSError if writing fails.
     """
     sealed = SealedDirectory(checkpoint)
-    files = {name: sealed.read(name) for name in (PROGRAM_FILE, PARAMETERS_FILE)}
+    files = {name: sealed.read(name, limit) for name, limit in POLICY_LIMITS.items()}
     write_sealed(target, files, sealed.content)
 
 
@@ -122,11 +129,11 @@ def read_policy(directory: Path) -> SavedPolicy:
     try:
         return SavedPolicy(
             directory=directory,
-            policy_version=int(sealed.content["policy_version"]),
+            policy_version=_VERSION.validate_python(sealed.content["policy_version"]),
             spec=RunSpec.model_validate(sealed.content["spec"]),
             spaces=Spaces.model_validate(sealed.content["spaces"]),
-            program=sealed.read(PROGRAM_FILE),
-            weights=safetensors.numpy.load(sealed.read(PARAMETERS_FILE)),
+            program=sealed.read(PROGRAM_FILE, POLICY_LIMITS[PROGRAM_FILE]),
+            weights=safetensors.numpy.load(sealed.read(PARAMETERS_FILE, POLICY_LIMITS[PARAMETERS_FILE])),
         )
     except (KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
         raise DamagedError(f"{directory}: written by another release ({type(error).__name__})") from None

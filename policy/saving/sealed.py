@@ -131,11 +131,13 @@ class SealedDirectory:
         self._files = parsed.files
         self.content = parsed.content
 
-    def read(self, name: str) -> bytes:
-        """Return the bytes of a file. Raises DamagedError if it is missing or damaged."""
+    def read(self, name: str, limit: int) -> bytes:
+        """Return the bytes of a file. Raises DamagedError if it is missing, damaged or larger than `limit` bytes."""
         entry = self._files.get(name)
         if entry is None:
             raise DamagedError(f"{self._directory}: no file {name}")
+        if entry.bytes > limit:
+            raise DamagedError(f"{self._directory / name} has {entry.bytes:,} bytes, the limit is {limit:,}")
         try:
             size = (self._directory / name).stat().st_size
             if size != entry.bytes:

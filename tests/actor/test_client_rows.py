@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -124,6 +125,50 @@ def test_rollouts_of_any_loop_keep_the_rules(events: list[str]) -> None:
                 loop.cut(while_it_waits=event == "cut while it waits")
     for rollout in loop.rollouts:
         check(rollout)
+
+
+def test_last_observation_of_an_episode_allows_every_choice() -> None:
+    """The mask with which a client was constructed is an example of any state."""
+    transforms = Transforms(SPEC.environment, OBSERVATIONS, ACTIONS, np.array([[True, False, False]]))
+    network = ActorCritic(PolicySpec(hidden=(8,)), transforms.spaces)
+    runtime = OnnxRuntime(export_program(network, transforms.spaces))
+    runtime.load({name: parameter.detach().numpy() for name, parameter in network.named_parameters()})
+    writer = RolloutWriter(
+        transforms.spaces, 1, runtime, SPEC.environment, rollout_length=ROWS, random=np.random.default_rng(1)
+    )
+    rollouts: list[Rollout] = []
+    rows = ClientRows(
+        transforms,
+        writer,
+        example_mask=[True, False, False],
+        bootstrap_terminations=False,
+        on_full=lambda writer: rollouts.append(copy.deepcopy(writer.finish(IDENTITY, 0))),
+    )
+    for _ in range(ROWS):
+        rows.observe(np.zeros(2, np.float32), [False, True, True])
+        while rows.choose() is None:
+            pass
+        rows.end_episode(np.zeros(2, np.float32), terminated=False)
+    masks = rollouts[0].masks["action"][:, 0].astype(bool).tolist()
+    assert masks[:4] == [[False, True, True], [True, True, True]] * 2
+
+
+def test_end_of_an_episode_with_a_wrong_reward_has_changed_nothing() -> None:
+    loop = Loop()
+    loop.act()
+    last = np.array([1, 1], np.float32)
+    for wrong in (1e39, float("nan")):
+        with pytest.raises(ValueError, match="it must be finite"):
+            loop.rows.end_episode(last + 5, terminated=True, reward=wrong)
+    assert loop.rows.in_episode
+    loop.rows.end_episode(last, terminated=False, reward=0.5)
+    loop.begin_episode()
+    for _ in range(3):
+        loop.act()
+    loop.observe()
+    (rollout,) = loop.rollouts
+    assert (rollout.terminated[0, 0], rollout.truncated[0, 0], rollout.rewards[0, 0]) == (False, True, 1.5)
+    assert rollout.frames["observation"][2, 0].tolist() == [1, 1]
 
 
 def test_memory_begins_anew_after_an_interruption() -> None:

@@ -562,9 +562,10 @@ def test_atari_games_of_gymnasium_have_their_own_frames() -> None:
 
 def test_an_atari_game_of_another_backend_is_the_same_game_on_gymnasium() -> None:
     pytest.importorskip("ale_py")
-    kwargs = {"repeat_action_probability": 0.25, "full_action_space": True, "noop_max": 1}
+    kwargs = {"repeat_action_probability": 0.25, "full_action_space": True, "noop_max": 1, "episodic_life": False}
     spec = as_on_gymnasium(EnvironmentSpec(id="Pong-v5", backend="envpool", kwargs=kwargs, action_repeat=4))
-    assert spec.kwargs == {"frameskip": 1, "repeat_action_probability": 0.25, "full_action_space": True}
+    of_backend = {"frameskip": 1, "use_fire_reset": True, "maxpool": True}
+    assert spec.kwargs == {**of_backend, "repeat_action_probability": 0.25, "full_action_space": True, "noop_max": 1}
     environments = make_environments(spec, 1)
     assert choices(environments.spaces) == 18
     environments.close()

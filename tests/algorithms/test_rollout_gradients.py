@@ -1,5 +1,6 @@
 """algorithms/rollout_gradients.py: what actors compute is what the learner would compute from their rollouts."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -8,13 +9,19 @@ import pytest
 import torch
 from building import ENVIRONMENTS, ROWS, SPACES, identity, make_rollout, run_spec
 
+from daedalus.algorithms.algorithm import Losses
+from daedalus.algorithms.batch import Batch
+from daedalus.algorithms.forward import Forward
 from daedalus.algorithms.gradient_inputs import NAME as GRADIENT_INPUTS
 from daedalus.algorithms.gradient_inputs import GradientInputs, packed, unpacked
 from daedalus.algorithms.gradients import Terms
+from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.algorithms.rollout_gradients import RolloutGradients
 from daedalus.learner.serving.gradient_checks import gradient_violation, restored
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.errors import PolicyError
+from daedalus.policy.user_modules import UserModules
+from daedalus.protocol.algorithms import AlgorithmRecord
 from daedalus.protocol.codec import decode, encode
 from daedalus.protocol.compact import bfloat16, bits_of, float32
 from daedalus.protocol.limits import Limits
@@ -49,6 +56,28 @@ def played(actor: str, sequence: int, state_size: int = 0) -> Rollout:
 
 def snapshot(learner: Learner, progress: float = 0.0) -> dict[str, np.ndarray]:
     return {name: values.copy() for name, values in learner.weights().items()} | learner.gradient_inputs(progress)
+
+
+class NothingWithoutRows(PolicyGradient):
+    """Makes no update of a batch without rows to learn from."""
+
+    record = AlgorithmRecord(synchronous=True)
+
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
+        return super().losses(batch, forward) if batch.valid.any() else iter(())
+
+
+def test_rollout_of_which_an_own_algorithm_makes_no_update_has_a_gradient_of_0() -> None:
+    name, modules = f"{__name__}:NothingWithoutRows", UserModules(frozenset({__name__}))
+    spec = spec_of(name, algorithm_record=NothingWithoutRows.record.model_dump())
+    learner = Learner(spec.training, spec.policy, SPACES, modules)
+    gradients = RolloutGradients(spec, SPACES, modules)
+    gradients.load(snapshot(learner))
+    rollout = played("a", 0)
+    assert any(values.any() for values in sent(gradients, rollout).gradient.values())
+    none = np.zeros_like(rollout.valid)
+    empty = replace(rollout, valid=none, terminated=none, truncated=none)
+    assert not any(values.any() for values in sent(gradients, empty).gradient.values())
 
 
 @pytest.mark.parametrize("memory", ["none", "gru"])

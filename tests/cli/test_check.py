@@ -34,6 +34,10 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
         (["--set", "environment.kwargs.fault=reward"], "problem       environment .* the reward nan: it must be fini"),
         (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
         (
+            [*("--algorithm", "own_losses:Weighted", "--set", "training.algorithm_kwargs.wieght=1")],
+            "problem       training.algorithm=own_losses:Weighted: .* unexpected keyword argument 'wieght'",
+        ),
+        (
             ["--set", "environment.kwargs.fault=crash"],
             r"problem       .*Faulty-v0 ended its process \(status 7\), as it",
         ),
@@ -56,7 +60,9 @@ def test_an_environment_that_hangs_is_a_problem(
 
 def test_an_unknown_environment_with_the_name_of_a_preset(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(["--env", "cartpole"]) == 1
-    assert "; 'cartpole' is a preset, which is named without --env" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "; 'cartpole' is a preset, which is named without --env" in output
+    assert "\ntrain " not in output  # the settings depend on the environment
 
 
 def test_warnings_do_not_change_the_exit_status(capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,7 +88,7 @@ def test_runs_with_other_targets_have_no_threshold(folder: Path, capsys: pytest.
     record(folder / "b", settings=["training.target_return=none"])
     assert compare(["a", "b"]) == 0
     output = capsys.readouterr().out
-    assert "env_steps and minutes to a return: name the return with --threshold" in output
+    assert "env_steps and minutes to a return: name the return with `daedalus compare --threshold`" in output
     assert "minutes to 475" not in output
 
 

@@ -138,7 +138,7 @@ def test_an_evaluation_of_another_policy_is_not_the_result(hub: HubServer, capsy
     assert "evaluation.json" not in hub.files("ada/cart")
     (warning,) = capsys.readouterr().err.splitlines()
     assert "is of policy version 4, the policy is version 9" in warning
-    assert warning.endswith("before the push: daedalus evaluate run --json > run/evaluation.json")
+    assert warning.endswith("before the push: daedalus evaluate run --record")
 
 
 def test_texts_of_the_run_are_no_markup_in_the_card(hub: HubServer) -> None:

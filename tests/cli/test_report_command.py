@@ -1,5 +1,6 @@
 """Test of `daedalus report`: what the file shows, and that nothing in a run directory becomes markup."""
 
+import csv
 import json
 import os
 import re
@@ -114,7 +115,7 @@ def test_a_run_without_an_evaluation_says_how_to_evaluate_it(folder: Path) -> No
     assert report(["run"]) == 0
     text = Page(run / "report.html").text
     assert "No evaluation is recorded. Evaluate the run with:" in text
-    assert "daedalus evaluate run --json > run/evaluation.json" in text
+    assert "daedalus evaluate run --record" in text
 
 
 def test_a_run_of_an_earlier_release_has_an_evaluation_without_a_histogram(folder: Path) -> None:
@@ -240,8 +241,8 @@ class TestFileThatIsNotRegular:
     ("content", "reason"),
     [
         ("[" * 200_000, "is damaged: it is not valid JSON; delete the file"),
-        ('{"a": ' + "[" * 200 + "]" * 200 + "}", "is damaged: its values are nested too deeply"),
-        ('{"a": 1' + "0" * 4000 + "}", "is damaged: it has an integer of more than 64 bits"),
+        ('{"a": ' + "[" * 200 + "]" * 200 + "}", "is not valid: its values are nested too deeply"),
+        ('{"a": 1' + "0" * 4000 + "}", "is not valid: it has an integer of more than 64 bits"),
     ],
     ids=["depth beyond Python's limit", "depth", "integer"],
 )
@@ -256,10 +257,10 @@ def test_excessive_json_is_refused(
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("a = " + "[" * 20_000, "its values are nested too deeply"),
-        (f"[environment.kwargs.{'.'.join('a' * 5000)}]", "its values are nested too deeply"),
-        ("[environment.kwargs]\na = 0x" + "f" * 9000, "it has an integer of more than 64 bits"),
-        ("a = 1" + "0" * 9000, "Exceeds the limit (4300 digits) for integer string conversion"),
+        ("a = " + "[" * 20_000, ": its values are nested too deeply"),
+        (f"[environment.kwargs.{'.'.join('a' * 50_000)}]", ": its values are nested too deeply"),
+        ("[environment.kwargs]\na = 0x" + "f" * 9000, ": it has an integer of more than 64 bits"),
+        ("a = 1" + "0" * 9000, " TOML: Exceeds the limit (4300 digits) for integer string conversion"),
     ],
     ids=["lists", "tables", "integer", "digits"],
 )
@@ -268,13 +269,13 @@ def test_excessive_settings_are_refused(
 ) -> None:
     run = record(folder / "run")
     (run / "config.toml").write_text(content)
-    assert refused(run, capsys).startswith(f"config.toml is damaged: {reason}")
+    assert refused(run, capsys).startswith(f"config.toml is not valid{reason}")
 
 
 def test_file_that_is_larger_than_any_of_a_run_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = record(folder / "run")
     os.truncate(run / "config.toml", (1 << 20) + 1)
-    assert refused(run, capsys) == "config.toml is larger than 1 MiB: it is not a file of a run"
+    assert refused(run, capsys) == "config.toml is larger than 1 MiB, the limit for such a file of a run"
 
 
 def test_dates_in_the_settings_of_another_release_are_shown(folder: Path) -> None:
@@ -346,6 +347,37 @@ def test_a_run_that_cannot_be_read_is_left_out(folder: Path, capsys: pytest.Capt
     expected = "left out: runs/b has no metrics yet: wait until the run has made its first updates"
     assert capsys.readouterr().err == f"daedalus report: {expected}\n"
     assert expected in Page(folder / "both.html").text
+
+
+def test_a_run_whose_evaluation_is_damaged_is_left_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluated(record(folder / "runs/a"))
+    (record(folder / "runs/b", seed=2) / "evaluation.json").write_text("")
+    assert report(["runs", "--output", "both.html"]) == 0
+    expected = "left out: runs/b/evaluation.json is damaged: it is not valid JSON; delete the file"
+    assert capsys.readouterr().err == f"daedalus report: {expected}\n"
+    assert expected in Page(folder / "both.html").text
+
+
+def test_the_evaluation_of_one_episode_has_no_interval(folder: Path) -> None:
+    run = evaluated(record(folder / "run"), [7.0])
+    assert report(["run"]) == 0
+    assert "95 % interval -" not in Page(run / "report.html").text
+
+
+@pytest.mark.parametrize("name", ["env_steps", "wall_seconds"])
+def test_numbers_of_a_hostile_run_that_cannot_be_drawn_are_left_out(folder: Path, name: str) -> None:
+    run = record(folder / "run")
+    for values in (["-1e308", "1e308", "1e308"], ["", "", ""]):
+        rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
+        changed = [{**row, name: value} for row, value in zip(rows, values, strict=True)]
+        changed = [{**row, "evaluation_env_steps": "2000", "evaluation_return_mean": "9"} for row in changed]
+        with open(run / "metrics.csv", "w", newline="") as file:
+            writer = csv.DictWriter(file, list(changed[0]))
+            writer.writeheader()
+            writer.writerows(changed)
+        for by in ("env_steps", "minutes"):
+            assert report(["run", "--by", by]) == 0
+            assert not re.search(r'd="[^"]*(nan|inf)', (run / "report.html").read_text())
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,14 @@ def test_alive_depends_on_the_age_of_the_heartbeat_only(
     now = 5000.0
     monkeypatch.setattr(heartbeat, "time", SimpleNamespace(monotonic=lambda: now))
     alive, beating = ["--alive", str(tmp_path)], heartbeat.Heartbeat(tmp_path)
-    assert status_command(alive) == 0  # the learner is starting
+    assert status_command(alive) == 0  # the learner waits for its router
+    assert capsys.readouterr().out == f"no learner works in {tmp_path}: it has ended, or not begun yet\n"
+    (tmp_path / "other").touch()
+    assert status_command(alive) == 1
+    assert "is not a run directory: it has no config.toml" in capsys.readouterr().err
+    (tmp_path / "config.toml").touch()
+    assert status_command(alive) == 0
+    assert capsys.readouterr().out == f"no learner works in {tmp_path}: it has ended, or not begun yet\n"
     beating.beat()
     now += 119.0
     assert status_command(alive) == 0
@@ -252,6 +259,7 @@ def test_a_directory_that_does_not_exist_is_not_alive(tmp_path: Path, capsys: py
 
 @pytest.mark.parametrize("content", ["", "x", "12 y z", "nan -"])
 def test_unreadable_heartbeat_is_no_reason_for_a_restart(tmp_path: Path, content: str) -> None:
+    (tmp_path / "config.toml").touch()
     (tmp_path / heartbeat.HEARTBEAT).write_text(content)
     assert status_command(["--alive", str(tmp_path)]) == 0
 

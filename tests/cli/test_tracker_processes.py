@@ -63,7 +63,8 @@ def test_local_files_have_settings_metrics_and_summary_and_a_resumed_run_keeps_i
 ) -> None:
     pytest.importorskip(name) if name != "mlflow" else pytest.importorskip("mlflow.version")
     monkeypatch.setattr(tracker_processes, "_FINISH_SECONDS", LIMIT)
-    directory = record(tmp_path / "run", seed=5, solved=True, evaluation=490.0)
+    settings = ['environment.kwargs."a*b/c"=3']  # MLflow takes no such name
+    directory = record(tmp_path / "run", seed=5, settings=settings, solved=True, evaluation=490.0)
     (shown,) = log(directory, name)
     assert shown.startswith(f"{name}: ")
     run = read(name, tmp_path, directory)

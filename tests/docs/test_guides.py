@@ -15,7 +15,7 @@ from daedalus.actor.environments.make import make_environments
 from daedalus.cli.callbacks import TrainingRun
 from daedalus.cli.own_algorithm import with_record
 from daedalus.learner.reporting.metrics import Details, MetricsWriter
-from daedalus.learner.run.settings import choose_algorithm, read_file, run_spec
+from daedalus.learner.run.settings import choose_algorithm, read_settings, run_spec
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.user_modules import UserModules
@@ -50,7 +50,7 @@ def test_the_environment_can_be_played(folder: Path) -> None:
 
 def test_the_preset_is_a_run(folder: Path) -> None:
     (folder / "corridor.toml").write_text(example("environment.md", "toml"))
-    settings = read_file(folder / "corridor.toml")
+    settings = read_settings(folder / "corridor.toml")
     choose_algorithm(settings, "a3c")
     assert run_spec(settings).training.learning_rate == 3e-4
 

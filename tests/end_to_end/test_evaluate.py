@@ -30,7 +30,7 @@ from daedalus.cli.running.confirmation import Confirmations
 from daedalus.cli.running.final_evaluation import evaluate_run
 from daedalus.cli.running.local_run import LocalRun
 from daedalus.learner.run.confirmation_file import ConfirmationFile
-from daedalus.learner.run.run_directory import create, read_json, write_json
+from daedalus.learner.run.run_directory import create, read_json, write_config, write_json
 from daedalus.policy.acting.runtime import OnnxRuntime
 from daedalus.policy.saving.best_checkpoints import best_checkpoints, best_score
 from daedalus.policy.saving.saved_policy import checkpoints, read_policy
@@ -224,6 +224,14 @@ def test_a_video_has_every_frame_before_action_repeat(tmp_path: Path, evaluate: 
     assert frames[0].shape == (400, 600, 3)
     assert any((frames[0] != frame).any() for frame in frames[1:])
     assert evaluate(run, "--episodes", 1, "--seed", 2)["returns"] == result["returns"]
+
+
+def test_a_recorded_evaluation_replaces_that_of_the_run(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
+    run = save(tmp_path / "run", CARTPOLE, 1)
+    write_config(run, RunSpec(environment=CARTPOLE))
+    (run / "evaluation.json").write_text("of another time")
+    result = evaluate(run, "--episodes", 2, "--record")
+    assert read_json(run / "evaluation.json") == result
 
 
 def test_a_video_of_an_atari_game_uses_gymnasiums_implementation(tmp_path: Path, evaluate: Callable[..., dict]) -> None:
@@ -513,6 +521,8 @@ def test_a_signal_ends_an_evaluation(start: Start, tmp_path: Path) -> None:
         (["RUN", "--max-seconds", 5], 2, "need --video FILE"),
         (["RUN", "--backend", "ale"], 1, "unknown environment 'CartPole-v1'"),
         (["nowhere"], 1, "nowhere does not exist: name a run directory"),
+        (["RUN", "--record"], 2, "is not a run directory: it has no config.toml"),
+        (["--pretrained", "car_racing", "--record"], 2, "--record keeps the result in a run directory"),
     ],
 )
 def test_a_mistake_is_reported_in_one_line(

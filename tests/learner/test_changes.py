@@ -60,5 +60,13 @@ def test_settings_that_define_what_is_learned_are_refused_by_name(assignment: st
 
 def test_a_setting_may_be_repeated_and_a_wrong_one_is_reported() -> None:
     assert with_changes(run_spec(), ["training.seed=1", "environment.id=Any-v0"], RUN) == run_spec()
-    with pytest.raises(SettingsError, match=r"unknown setting training.sed: did you mean seed"):
+    with pytest.raises(SettingsError, match=r"unknown setting training.sed: did you mean training.seed"):
         with_changes(run_spec(), ["training.sed=1"], RUN)
+
+
+def test_setting_that_cannot_change_is_named_although_others_do_not_go_with_it() -> None:
+    before = run_spec(algorithm="impala", batch_rollouts=4)
+    with pytest.raises(SettingsError, match=r"^training\.algorithm cannot change when a run is resumed"):
+        with_changes(before, ["training.algorithm=a2c"], RUN)
+    with pytest.raises(SettingsError, match=r"training\.learning_rate"):
+        with_changes(before, ["training.learning_rate=7"], RUN)

@@ -19,7 +19,13 @@ from daedalus.policy.saving.saved_policy import FORMAT, OtherFormatError, checkp
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, UnreadableError, write_sealed
 
 SPEC = run_spec(algorithm="a3c", learning_rate=0.003, target_return=1.5)
-COUNTERS = {"env_steps": 12, "returns": [1.5, -2.25], "rollouts_rejected": {"stale": 3}}
+COUNTERS = {
+    "env_steps": 12,
+    "returns": [1.5, -2.25],
+    "lengths": [3, 9],
+    "rollouts_rejected": {"stale": 3},
+    "wall_seconds": 7.5,
+}
 
 
 def parameters(version: int) -> dict[str, np.ndarray]:
@@ -163,11 +169,25 @@ def test_run_of_another_format_is_refused_and_its_checkpoints_are_not_called_dam
     for version in (1, 2):
         directory = save(tmp_path, version)
         sealed = SealedDirectory(directory)
-        files = {name: sealed.read(name) for name in FILES if name not in ("manifest.json", "seal")}
+        files = {name: sealed.read(name, 1 << 20) for name in FILES if name not in ("manifest.json", "seal")}
         write_sealed(directory, files, {**sealed.content, "format": FORMAT - 1})
     with pytest.raises(OtherFormatError, match=rf"has format {FORMAT - 1} of checkpoints.* reads format {FORMAT} only"):
         load_newest(tmp_path)
     assert not LINES
+
+
+@pytest.mark.parametrize(
+    "counters",
+    [
+        *({**COUNTERS, "annealing": {"budget": "x"}}, {**COUNTERS, "annealing": {"other": 3}}),
+        *(None, [], {}, {**COUNTERS, "env_steps": "x"}, {**COUNTERS, "updates": -1}, {**COUNTERS, "returns": 1.0}),
+        *({**COUNTERS, "rollouts_rejected": {"stale": 2**70}}, {**COUNTERS, "wall_seconds": float("nan")}),
+    ],
+)
+def test_checkpoint_with_counters_that_are_none_is_damaged(tmp_path: Path, counters: Any) -> None:
+    directory = save(tmp_path, 1, counters=counters)
+    with pytest.raises(DamagedError, match=re.escape(str(directory))):
+        load_checkpoint(directory)
 
 
 FILES = ["learner.safetensors", "manifest.json", "parameters.safetensors", "program.onnx", "seal"]
@@ -217,9 +237,9 @@ def test_saved_checkpoint_is_kept_when_a_damaged_one_has_a_higher_version(tmp_pa
 
 def test_same_version_can_be_saved_again(tmp_path: Path) -> None:
     save(tmp_path, 1)
-    save(tmp_path, 1, counters={"env_steps": 99})
+    save(tmp_path, 1, counters={**COUNTERS, "env_steps": 99})
     assert names(tmp_path) == ["0000000001"]
-    assert load_newest(tmp_path).counters == {"env_steps": 99}
+    assert load_newest(tmp_path).counters["env_steps"] == 99
 
 
 def test_unfinished_directory_is_not_listed_as_a_checkpoint(tmp_path: Path) -> None:
@@ -243,7 +263,7 @@ def test_full_disk_leaves_only_the_previous_checkpoint(
 
     monkeypatch.setattr("daedalus.policy.saving.sealed.os.fsync", filling)
     with pytest.raises(OSError, match="No space left"):
-        save(tmp_path, version, keep=1, counters={})
+        save(tmp_path, version, keep=1)
     monkeypatch.undo()
     assert names(tmp_path) == ["0000000001"]
     assert load_newest(tmp_path).counters == COUNTERS
@@ -265,7 +285,7 @@ def test_failed_rename_leaves_only_the_previous_checkpoint(
 
     monkeypatch.setattr("daedalus.policy.saving.sealed.os.replace", refusing)
     with pytest.raises(OSError, match="Input/output"):
-        save(tmp_path, version, keep=1, counters={})
+        save(tmp_path, version, keep=1)
     monkeypatch.undo()
     assert names(tmp_path) == ["0000000001"]
     assert load_newest(tmp_path).counters == COUNTERS

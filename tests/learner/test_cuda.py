@@ -10,6 +10,7 @@ import torch
 from building import ENVIRONMENTS, ROWS, SPACES, make_rollout, run_spec
 from plain import NAME, act, array_space
 
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
 from daedalus.learner.training.learner import Learner
 from daedalus.policy.acting.runtime import OnnxRuntime
@@ -85,7 +86,7 @@ def test_program_and_checkpoints_from_cuda_work_on_cpu(tmp_path: Path) -> None:
         program=there.program(),
         parameters=there.weights(),
         state=there.state(),
-        counters={},
+        counters=RunCounters(1).state(0.0),
         keep=1,
     )
     checkpoint = load_checkpoint(directory)

@@ -34,7 +34,7 @@ class Run:
             program=b"program",
             parameters={"w": np.full(3, version, np.float32)},
             state={},
-            counters={},
+            counters=RunCounters(1).state(0.0),
             keep=keep,
             also_keep=self.evaluations.checkpoints_in_use,
         )

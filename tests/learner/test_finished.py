@@ -45,7 +45,7 @@ def test_a_run_at_its_budget_has_nothing_to_train(run: Path) -> None:
 def test_a_run_that_reached_its_target_has_nothing_to_train(run: Path) -> None:
     end = finished(run, {}, **TARGET)
     assert end is not None
-    assert end.reason.startswith("the target return 10 was reached after 5,000 env_steps: train on with --set")
+    assert end.reason.startswith("the target return 10 was reached, and 5,000 env_steps are done: train on with --set")
     assert (end.missed, end.to_evaluate) == (False, True)
     assert finished(run, {}, **TARGET, stop_when_solved=False) is None
     assert finished(run, {}, **{**TARGET, "target_return": 99.0}) is None

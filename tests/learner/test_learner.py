@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from daedalus.algorithms.gradients import Terms
+from daedalus.learner.run.counters import RunCounters
 from daedalus.learner.training.checkpoint import load_checkpoint, save_checkpoint
 from daedalus.learner.training.errors import CheckpointMismatchError
 from daedalus.learner.training.learner import Learner
@@ -361,7 +362,7 @@ def saved(learner: Learner, directory: Path) -> Path:
         program=b"program",
         parameters=learner.weights(),
         state=learner.state(),
-        counters={},
+        counters=RunCounters(1).state(0.0),
         keep=1,
     )
 

@@ -93,12 +93,29 @@ def test_csv_continues_a_file_whose_header_is_damaged(tmp_path: Path) -> None:
 def test_csv_without_rows_raises_os_error_that_says_what_to_do(tmp_path: Path, header: bytes) -> None:
     """The recorder then logs it, and training continues."""
     path = tmp_path / "metrics.csv"
-    path.write_bytes(header + b'"' + b"x" * 200_000)
+    path.write_bytes(header + b'"' + b"x" * 200_000 + b"\n")
     with (
         pytest.raises(OSError, match=r"metrics\.csv is damaged \(field larger .*\): move it away"),
         closing(CsvWriter(path)) as writer,
     ):
         writer.write({"env_steps": 1, "env/laps": 2.0}, NONE)
+
+
+@pytest.mark.parametrize("partial", [b"3", b"3,4", b"3,4\r", b"7" * 150_000])
+def test_csv_continues_after_the_part_of_a_line_that_a_crash_left(tmp_path: Path, partial: bytes) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(b"wall_seconds,env_steps\r\n1,2\r\n" + partial)
+    writer = CsvWriter(path)
+    writer.write({"wall_seconds": 5.0, "env_steps": 6}, NONE)
+    writer.close()
+    assert path.read_bytes() == b"wall_seconds,env_steps\r\n1,2\r\n5,6\r\n"
+
+
+def test_csv_writes_its_header_anew_after_a_part_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(b"wall_sec")
+    CsvWriter(path).close()
+    assert path.read_text().strip() == ",".join(COLUMNS)
 
 
 def test_csv_writes_a_header_to_an_empty_file(tmp_path: Path) -> None:

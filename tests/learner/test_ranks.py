@@ -17,6 +17,7 @@ from daedalus.algorithms.algorithm import Algorithm, Forward, Losses, MinibatchL
 from daedalus.algorithms.appo import Appo
 from daedalus.algorithms.batch import Batch
 from daedalus.algorithms.losses import shares_of
+from daedalus.algorithms.policy_gradient import PolicyGradient
 from daedalus.learner.ranks import leader
 from daedalus.learner.ranks.parts import bounds_of, part_of
 from daedalus.learner.training.learner import Learner
@@ -182,6 +183,32 @@ def test_an_algorithm_that_makes_fewer_updates_on_some_ranks_does_not_hang() -> 
         learner.step(make_rollouts(1, state_size=5), 0.0)
         learner.step(make_rollouts(2, state_size=5), 0.0)
     assert learner.policy_version == 2 * 2 * ENVIRONMENTS
+    assert_equal_state(learner, ranks)
+
+
+class NothingWithoutRows(PolicyGradient):
+    """Makes no update of a part without rows to learn from, and has a first pass otherwise."""
+
+    record = AlgorithmRecord(synchronous=True)
+
+    def losses(self, batch: Batch, forward: Forward) -> Iterator[Losses]:
+        return super().losses(batch, forward) if batch.valid.any() else iter(())
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_batch_of_which_an_own_algorithm_makes_no_update_on_one_rank_is_learned_from(empty: int) -> None:
+    name, modules = f"{__name__}:NothingWithoutRows", UserModules(frozenset({__name__}))
+    spec = spec_of(POLICY, algorithm=name, algorithm_record=NothingWithoutRows.record.model_dump())
+    rollouts = make_rollouts(1, count=2)
+    none = np.zeros_like(rollouts[0].valid)
+    rollouts[empty] = replace(rollouts[empty], valid=none, terminated=none, truncated=none)
+    with ranked_learner(2, spec, SPACES, modules) as (learner, ranks):
+        before = {name: values.copy() for name, values in learner.weights().items()}
+        assert learner.step(rollouts, 0.0) == []
+        assert learner.take_diagnostics() == {}
+        learner.step(make_rollouts(2, count=2), 0.0)
+        assert learner.take_diagnostics()
+    assert any((learner.weights()[name] != values).any() for name, values in before.items())
     assert_equal_state(learner, ranks)
 
 

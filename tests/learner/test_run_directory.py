@@ -111,14 +111,37 @@ def test_read_config_refuses_a_directory_without_config_toml(tmp_path: Path) -> 
         run_directory.read_config(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "setting environment is missing"),
+        ("[environment]\nid = 3", "setting environment.id"),
+        ("a = " + "[" * 50_000, "is not valid: its values are nested too deeply"),
+        ("a." * 8000 + "a = 1", "is not valid: its values are nested too deeply"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
+        ("#" * ((1 << 20) + 1), "is larger than 1 MiB"),
+    ],
+)
+def test_damaged_config_toml_is_named(tmp_path: Path, text: str, reason: str) -> None:
+    """A sweep has many of them."""
+    path = tmp_path / run_directory.CONFIG
+    path.write_text(text)
+    with pytest.raises(SettingsError) as error:
+        run_directory.read_config(tmp_path)
+    assert str(error.value).startswith(str(path))
+    assert reason in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_json_reads_back_and_damage_raises(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     run_directory.write_json(path, {"solved": True, "seconds": 1.5})
     assert run_directory.read_json(path) == {"solved": True, "seconds": 1.5}
-    path.write_text(path.read_text()[:9])
-    with pytest.raises(SettingsError, match="is damaged"):
-        run_directory.read_json(path)
-    with pytest.raises(SettingsError, match="No such file"):
+    for damaged in (path.read_text()[:9], "", "[]", "[" * 200_000, '{"a": ' + "9" * 5000 + "}"):
+        path.write_text(damaged)
+        with pytest.raises(SettingsError, match="is damaged"):
+            run_directory.read_json(path)
+    with pytest.raises(SettingsError, match="does not exist"):
         run_directory.read_json(tmp_path / "none.json")
 
 

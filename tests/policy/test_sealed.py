@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
@@ -28,12 +29,13 @@ from daedalus.policy.saving.saved_policy import (
 from daedalus.policy.saving.sealed import DamagedError, SealedDirectory, write_sealed
 
 FILES = {"weights": bytes(range(40)), "program": b"onnx", "empty": b""}
+LIMIT = 40  # bytes of the largest of FILES
 CONTENT = {"policy_version": 3, "note": "é", "nested": {"list": [1, None, 2.5]}}
 
 
 def read_all(directory: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
     sealed = SealedDirectory(directory)
-    return {name: sealed.read(name) for name in FILES}, sealed.content
+    return {name: sealed.read(name, LIMIT) for name in FILES}, sealed.content
 
 
 def is_damaged(directory: Path) -> bool:
@@ -125,7 +127,14 @@ def test_missing_directory_is_reported_as_damaged(tmp_path: Path) -> None:
 def test_unknown_file_name_is_rejected(sealed: Path) -> None:
     for name in ("other", "manifest.json", "../0001/weights"):
         with pytest.raises(DamagedError, match=f"{re.escape(str(sealed))}: no file"):
-            SealedDirectory(sealed).read(name)
+            SealedDirectory(sealed).read(name, LIMIT)
+
+
+def test_file_that_is_larger_than_its_limit_is_not_read(sealed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anybody can write a manifest with a right seal, and a file of any size that takes no room on the disk."""
+    monkeypatch.setattr(Path, "stat", lambda path: pytest.fail(f"{path} was looked at"))
+    with pytest.raises(DamagedError, match=r"weights has 40 bytes, the limit is 39"):
+        SealedDirectory(sealed).read("weights", LIMIT - 1)
 
 
 def test_manifest_of_another_directory_is_detected(sealed: Path) -> None:
@@ -198,10 +207,10 @@ def test_directory_is_complete_if_syncing_the_rename_fails(sealed: Path, disk_fu
 
 
 def test_overwrite_replaces_all_files(sealed: Path) -> None:
-    newer = {name: data + b"newer" for name, data in FILES.items() if name != "program"}
+    newer = {name: b"newer" + data[5:] for name, data in FILES.items() if name != "program"}
     write_sealed(sealed, newer, {"policy_version": 4})
     reread = SealedDirectory(sealed)
-    assert {name: reread.read(name) for name in newer} == newer
+    assert {name: reread.read(name, LIMIT) for name in newer} == newer
     assert reread.content == {"policy_version": 4}
     assert not (sealed / "program").exists()
     assert [entry.name for entry in sealed.parent.iterdir()] == ["0001"]
@@ -239,6 +248,10 @@ def test_saved_policy_is_read_back(tmp_path: Path) -> None:
     [
         {"policy_version": None},
         {"policy_version": "seven"},
+        {"policy_version": -1},
+        {"policy_version": 2**63},
+        {"policy_version": True},
+        {"policy_version": math.inf},
         {"spec": {}},
         {"spec": {**POLICY_CONTENT["spec"], "new_section": {}}},
         {"spaces": None},

@@ -14,6 +14,7 @@ from daedalus.learner.reporting.trackers.tracker import PROJECT, SUMMARY, Tracke
 # MLflow's own defaults make a call to a server that does not answer last for many minutes.
 _HTTP = {"MLFLOW_HTTP_REQUEST_TIMEOUT": "20", "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1"}
 _PARAMETERS_A_CALL = 100  # limit of MLflow
+_LONGEST_NAME = 250  # characters; limit of MLflow
 _LONGEST = 5000  # characters of a value; MLflow's limit is 6000 for parameters and 8000 for tags
 
 
@@ -34,7 +35,7 @@ class MlflowTracker:
         self._client = MlflowClient()
         self._env_steps = 0
         known = self._known(run.id)
-        settings = {name: str(value)[:_LONGEST] for name, value in flat(run.settings)}
+        settings = {_parameter_name(name): str(value)[:_LONGEST] for name, value in flat(run.settings)}
         if known is None:
             self.id = self._client.create_run(self._experiment(), run_name=run.name).info.run_id
             try:
@@ -100,3 +101,8 @@ class MlflowTracker:
     def close(self) -> None:
         """See MetricsWriter."""
         self._client.set_terminated(self.id)
+
+
+def _parameter_name(setting: str) -> str:
+    """Return a name of characters that MLflow takes. Arguments of an environment may have any names."""
+    return re.sub(r"[^\w.\- :]", "_", setting)[:_LONGEST_NAME]

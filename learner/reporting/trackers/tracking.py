@@ -17,7 +17,7 @@ from daedalus.learner.reporting.trackers.metrics_follower import MetricsFollower
 from daedalus.learner.reporting.trackers.tracker import OpenTracker, TrackedRun, Tracker, flat
 from daedalus.learner.reporting.trackers.tracking_state import TrackingState
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY, read_json
-from daedalus.learner.run.settings import SettingsError, read_file
+from daedalus.learner.run.settings import SettingsError, read_settings
 
 _POLL_SECONDS = 1.0
 _RETRY_SECONDS = 60.0  # after the tracker failed
@@ -103,7 +103,7 @@ class Tracking:
             self._evaluation |= {name: row[name] for name in GROUPS["evaluation"] if name in row}
 
     def _opened(self) -> Tracker:
-        settings = read_file(self._directory / CONFIG)
+        settings = read_settings(self._directory / CONFIG)
         tracker = self._open(TrackedRun(directory=self._directory.resolve(), settings=settings, id=self._state.id))
         self._state.id = tracker.id
         self._save()

@@ -6,7 +6,8 @@ import pytest
 from recorded_runs import record
 
 from daedalus.cli.comparing.grouping import by_settings, by_user, check_comparable, text
-from daedalus.cli.comparing.recorded_run import RecordedRun, RunDataError, read_run
+from daedalus.cli.comparing.recorded_run import RecordedRun, read_run
+from daedalus.learner.run.run_files import RunDataError
 
 
 def run(folder: Path, name: str, *settings: str, seed: int = 1, preset: str = "cartpole") -> RecordedRun:

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from recorded_runs import TARGET, record
 
-from daedalus.cli.comparing.recorded_run import SECONDS, RunDataError, find_runs, read_run
+from daedalus.cli.comparing.recorded_run import SECONDS, find_runs, read_run
 from daedalus.learner.run.run_directory import CONFIG, METRICS, SUMMARY
+from daedalus.learner.run.run_files import RunDataError
 from daedalus.learner.run.run_lock import RunLock
 
 
@@ -31,6 +32,12 @@ class TestThreshold:
         run = read_run(record(tmp_path / "run", returns=(480.0, 300.0, 480.0), env_steps=(990, 2000, 3000)))
         assert run.settings["training.target_episodes"] == 100
         assert run.reached(480.0) == (3000.0, 3.0)
+
+    def test_rows_that_a_resumed_run_repeated_do_not_count(self, tmp_path: Path) -> None:
+        returns, env_steps = (20.0, 480.0, 20.0, 300.0), (1000, 9000, 2000, 9500)
+        run = read_run(record(tmp_path / "run", returns=returns, env_steps=env_steps))
+        assert run.reached(475.0) == (math.inf, math.inf)
+        assert run.reached(300.0) == (9500.0, 4.0)
 
     def test_the_target_is_exact_where_the_run_stopped(self, tmp_path: Path) -> None:
         run = read_run(record(tmp_path / "run", solved=True, seconds_to_target=90.0, env_steps=(1000, 2000, 2800)))
@@ -88,6 +95,13 @@ class TestBadInput:
         (tmp_path / "other").mkdir()
         assert find_runs([runs[1], tmp_path]) == [runs[1], runs[0]]
 
+    def test_a_run_of_several_paths_is_found_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        runs = [record(Path("runs") / name) for name in ("a", "b")]
+        Path("runs/newest").symlink_to("b")
+        assert find_runs([Path("runs")]) == runs
+        assert find_runs([Path("runs/newest"), runs[0].resolve(), *runs]) == [Path("runs/newest"), runs[0].resolve()]
+
     def test_a_run_without_metrics(self, tmp_path: Path) -> None:
         run = record(tmp_path / "run")
         header = (run / METRICS).read_text().splitlines()[0]
@@ -126,7 +140,7 @@ class TestBadInput:
         (run / SUMMARY).write_text("[]")
         assert refused(run) == "RUN/summary.json is damaged: it is not a JSON object; delete the file"
         (run / CONFIG).write_text("[training")
-        assert "RUN/config.toml is damaged: " in refused(run)
+        assert "RUN/config.toml is not valid TOML: " in refused(run)
 
     def test_summary_without_steps_is_that_of_the_last_row(self, tmp_path: Path) -> None:
         directory = record(tmp_path / "run", solved=True, seconds_to_target=90.0)

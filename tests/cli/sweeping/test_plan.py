@@ -44,7 +44,7 @@ def test_an_algorithm_brings_the_settings_of_its_preset(tmp_path: Path) -> None:
 def test_settings_that_are_not_valid_are_refused_before_any_run(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"collection\.rollout_length"):
         planner(tmp_path).runs("n", {"collection.rollout_length": "-1"}, [1])
-    with pytest.raises(SettingsError, match=r"did you mean rollout_length\?"):
+    with pytest.raises(SettingsError, match=r"did you mean collection\.rollout_length\?"):
         planner(tmp_path).runs("n", {"collection.rolout_length": "5"}, [1])
 
 
@@ -75,6 +75,8 @@ def test_a_run_is_done_when_it_was_evaluated(tmp_path: Path) -> None:
     finish(run)
     assert (has_begun(run), is_done(run)) == (True, True)
     (run.directory / SUMMARY).write_text('{"finished": true, "evaluation": null}')
+    assert (has_begun(run), is_done(run)) == (True, False)
+    (run.directory / SUMMARY).write_text("")  # as a machine that crashes may leave it
     assert (has_begun(run), is_done(run)) == (True, False)
     assert run.resume_words == ("resume", str(run.directory))
 

@@ -4,6 +4,7 @@ Values are limited in depth and size too, so that others can compare and print t
 """
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from daedalus.policy.saving.regular_files import read_regular
 _MAX_JSON_BYTES, _MAX_TOML_BYTES = 32 << 20, 1 << 20
 _MAX_DEPTH = 64  # of lists and maps within each other; Python's recursion limit is not far above
 _LARGEST_INTEGER = 2**64  # Python refuses to print integers of many digits
+# More names than that with dots between them. tomllib takes hours for a name of 1 MiB.
+_DEEP_NAME = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){{{_MAX_DEPTH}}}""")
 
 
 class RunDataError(Exception):
@@ -31,15 +34,15 @@ def read_file(path: Path, limit: int) -> bytes | None:
     except OSError as error:
         raise RunDataError(f"{path}: {error.strerror}") from None
     if len(content) > limit:
-        raise RunDataError(f"{path} is larger than {limit >> 20} MiB: it is not a file of a run")
+        raise RunDataError(f"{path} is larger than {limit >> 20} MiB, the limit for such a file of a run")
     return content
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file, or an empty dictionary without the file. Raises RunDataError."""
+def read_json(path: Path) -> dict[str, Any] | None:
+    """Return the content of a JSON file, or None without the file. Raises RunDataError."""
     content = read_file(path, _MAX_JSON_BYTES)
     if content is None:
-        return {}
+        return None
     try:
         values = json.loads(content.decode())
     except (ValueError, RecursionError):
@@ -50,17 +53,20 @@ def read_json(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file, or an empty dictionary without the file. Raises RunDataError."""
+def read_toml(path: Path) -> dict[str, Any] | None:
+    """Return the content of a TOML file, or None without the file. Raises RunDataError."""
     content = read_file(path, _MAX_TOML_BYTES)
     if content is None:
-        return {}
+        return None
     try:
-        values = tomllib.loads(content.decode())
+        text = content.decode("utf-8-sig")  # some editors of Windows begin a file with a mark
+        if _DEEP_NAME.search(text):
+            raise RecursionError
+        values = tomllib.loads(text)
     except RecursionError:
-        raise RunDataError(f"{path} is damaged: its values are nested too deeply") from None
+        raise RunDataError(f"{path} is not valid: its values are nested too deeply") from None
     except ValueError as error:
-        raise RunDataError(f"{path} is damaged: {error}") from None
+        raise RunDataError(f"{path} is not valid TOML: {error}") from None
     _check_values(values, path)
     return values
 
@@ -70,7 +76,7 @@ def _check_values(values: dict[str, Any], path: Path) -> None:
     level: list[Any] = [values]
     for _ in range(_MAX_DEPTH):
         if any(isinstance(value, int) and abs(value) > _LARGEST_INTEGER for value in level):
-            raise RunDataError(f"{path} is damaged: it has an integer of more than 64 bits")
+            raise RunDataError(f"{path} is not valid: it has an integer of more than 64 bits")
         level = [
             child
             for value in level
@@ -78,4 +84,4 @@ def _check_values(values: dict[str, Any], path: Path) -> None:
             for child in (value.values() if isinstance(value, dict) else value)
         ]
     if level:
-        raise RunDataError(f"{path} is damaged: its values are nested too deeply")
+        raise RunDataError(f"{path} is not valid: its values are nested too deeply")
