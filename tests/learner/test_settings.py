@@ -69,7 +69,8 @@ def test_environment_in_place_of_a_preset_is_shown_its_option() -> None:
         with pytest.raises(SettingsError) as caught:
             read_preset(name)
         assert str(caught.value).startswith(f"unknown preset {name!r}: ")
-        assert str(caught.value).endswith(f"such as with: daedalus train --env {name}")
+        end = f"such as with: daedalus train --env {name} (in Python: daedalus.train(env={name!r}))"
+        assert str(caught.value).endswith(end)
 
 
 def test_run_directory_in_place_of_a_preset_is_shown_its_commands(tmp_path: Path) -> None:
