@@ -5,7 +5,6 @@ import json
 import os
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -22,6 +21,7 @@ from daedalus.actor.evaluation.episodes import Evaluation, cut_note, environment
 from daedalus.actor.evaluation.video import Video, VideoError
 from daedalus.cli.arguments import allowing
 from daedalus.cli.commands.evaluate_arguments import check, parser
+from daedalus.cli.evaluation_progress import EvaluationProgress, EvaluationStoppedError
 from daedalus.cli.logs import configure_logging, print_error
 from daedalus.cli.processes import (
     exit_on_thread_exceptions,
@@ -39,16 +39,17 @@ from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, mod
 from daedalus.protocol.spec import EnvironmentSpec
 from daedalus.protocol.texts import short_number
 
-_PROGRESS_SECONDS = 5.0
 _FRAMES_PER_SECOND = 30.0  # of environments without render_fps
 _ATARI_FRAMES_PER_SECOND = 60.0
-
-
-class _StoppedError(Exception):
-    """Error of an evaluation that was stopped before its last episode ended."""
-
-
-_FAILURES = (_StoppedError, DamagedError, EnvironmentSetupError, HubError, NoPolicyError, PolicyError, VideoError)
+_FAILURES = (
+    EvaluationStoppedError,
+    DamagedError,
+    EnvironmentSetupError,
+    HubError,
+    NoPolicyError,
+    PolicyError,
+    VideoError,
+)
 
 
 def main(
@@ -124,7 +125,7 @@ def run_evaluation(arguments: argparse.Namespace, stop: threading.Event, stream:
     spec, modules = _environment(policy, arguments), _modules(policy, arguments)
     modules.check(spec.user_modules)
     seed = policy.spec.training.seed + 2**32 if arguments.seed is None else arguments.seed
-    progress = _Progress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
+    progress = EvaluationProgress(stream, arguments.episodes, policy.spec.evaluation.max_episode_env_steps, stop)
     filmed: dict[str, Any] = {}
     try:
         if arguments.video is None:
@@ -172,7 +173,7 @@ def _play(
     modules: UserModules,
     arguments: argparse.Namespace,
     seed: int,
-    progress: "_Progress",
+    progress: EvaluationProgress,
     video: Video | None,
 ) -> Evaluation:
     episodes = arguments.episodes
@@ -262,40 +263,6 @@ def _text(result: dict[str, Any]) -> str:
     if "video" in result:
         text += f"\nvideo: {result['video']}, {result['video_seconds']:.1f} s"
     return "\n".join([text, *result["notes"]])
-
-
-class _Progress:
-    """Callback that reports progress every few seconds, and raises _StoppedError when `stop` is set.
-
-    On a terminal it rewrites one line.
-    """
-
-    def __init__(self, stream: TextIO, episodes: int, longest: int, stop: threading.Event) -> None:
-        self._stream, self._episodes, self._longest, self.stop = stream, episodes, longest, stop
-        self._terminal = stream.isatty()
-        self._due = time.monotonic() + _PROGRESS_SECONDS
-        self._rewriting = False
-
-    def __call__(self, finished: int, mean: float) -> bool:
-        if self.stop.is_set():
-            raise _StoppedError
-        if time.monotonic() < self._due:
-            return False
-        self._due = time.monotonic() + _PROGRESS_SECONDS
-        so_far = (
-            f", mean return {short_number(mean)}" if finished else f" (each is cut after {self._longest:,} env_steps)"
-        )
-        line = f"evaluation: {finished} of {self._episodes} episodes{so_far}"
-        self._stream.write(f"\r\x1b[K{line}" if self._terminal else f"{line}\n")
-        self._stream.flush()
-        self._rewriting = self._terminal
-        return False
-
-    def end(self) -> None:
-        """Clear the rewritten line."""
-        if self._rewriting:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """How far annealed settings are on the way to their final values. Pure."""
 
-from dataclasses import asdict, dataclass
 from typing import Any
 
+from pydantic import BaseModel
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Annealing:
+
+class Annealing(BaseModel, frozen=True, strict=True, extra="forbid"):
     """Progress of the annealed settings over the budget of a run, from 0 to 1.
 
     The progress grows linearly from `progress` at `env_steps` to 1 at `budget`. A new run begins at 0. A run that is
@@ -31,4 +31,4 @@ class Annealing:
 
     def state(self) -> dict[str, Any]:
         """Return the fields as plain JSON values."""
-        return asdict(self)
+        return self.model_dump()

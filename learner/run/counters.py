@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
+from daedalus.learner.run.annealing import Annealing
 from daedalus.protocol.spec import TrainingSpec
 from daedalus.protocol.uploads import MAX_INFO_NAMES, Upload
 
@@ -24,18 +25,8 @@ _SAVED = (
     "policy_lag_max",
     "snapshots_published",
 )
-
-
 _Count = Annotated[int, Field(ge=0, lt=2**63)]
 _COUNTS = TypeAdapter(dict[str, _Count], config={"strict": True})  # of _SAVED
-
-
-class _AnnealingState(BaseModel, strict=True, extra="forbid"):
-    """Result of Annealing.state."""
-
-    budget: int
-    env_steps: int = 0
-    progress: float = 0.0
 
 
 class _State(BaseModel, strict=True):
@@ -47,7 +38,7 @@ class _State(BaseModel, strict=True):
     seconds_to_target: float | None = None  # absent in checkpoints of earlier releases
     returns: list[float]
     lengths: list[int]
-    annealing: _AnnealingState | None = None  # absent in checkpoints of earlier releases
+    annealing: Annealing | None = None  # absent in checkpoints of earlier releases
 
 
 def check_counters(state: Any) -> dict[str, Any]:

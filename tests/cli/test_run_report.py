@@ -50,3 +50,12 @@ def test_skipped_updates_are_counted() -> None:
     run = LocalRun(directory=Path("runs/one"), spec=RunSpec(environment=EnvironmentSpec(id="CartPole-v1")), started=0.0)
     assert "5 updates (2 skipped)" in report(run, {**SUMMARY, "updates_skipped": 2})
     assert "skipped" not in report(run, {**SUMMARY, "updates_skipped": 0})
+
+
+def test_duration_to_the_target_is_apart_from_the_counts_of_the_whole_run() -> None:
+    """A run that trains on after its target has more env_steps at its end."""
+    environment = EnvironmentSpec(id="CartPole-v1")
+    spec = RunSpec.model_validate({"environment": environment, "training": {"target_return": 475.0}})
+    run = LocalRun(directory=Path("runs/one"), spec=spec, started=0.0)
+    text = report(run, {**SUMMARY, "solved": True, "seconds_to_target": 15.12})
+    assert text.startswith("solved: mean return 475 reached after 15.1 s; 1,234 env_steps, 5 updates in all\n")

@@ -1,11 +1,12 @@
 """Test of mistakes on the command line: one line that says what to do, and an exit status other than 0."""
 
 import signal
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Running, until
+from processes import DAEDALUS, LIMIT, Running, until
 
 from daedalus.cli.command_table import COMMANDS
 
@@ -120,3 +121,9 @@ def test_every_command_has_help_with_examples(start: Start, command: str) -> Non
     running = start(command, "--help")
     assert running.wait() == 0
     running.expect("examples:")
+
+
+def test_help_of_a_command_that_reserves_its_output_can_be_piped() -> None:
+    ended = subprocess.run([*DAEDALUS, "evaluate", "--help"], capture_output=True, text=True, timeout=LIMIT, check=True)
+    assert ended.stdout.startswith("usage: daedalus evaluate")
+    assert ended.stderr == ""
