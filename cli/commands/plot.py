@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     options.usage = "daedalus plot [-h] --output FILE [--by env_steps|minutes] [--profile] RUN_DIR... [-- RUN_DIR...]"
     options.add_argument("directories", nargs="+", type=Path, metavar="RUN_DIR", help="runs to draw")
     options.add_argument(
-        "--output", type=Path, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
+        "--output", type=_picture, required=True, metavar="FILE", help="picture to write: .png, .svg or .pdf"
     )
     options.add_argument(
         "--by",
@@ -52,12 +52,17 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def _picture(word: str) -> Path:
+    path = Path(word)
+    if path.suffix.lower() not in _PICTURES:
+        raise argparse.ArgumentTypeError(f"{path}: the name must end with {', '.join(_PICTURES)}")
+    return path
+
+
 def plot(arguments: list[str]) -> int:
-    """Run `daedalus plot` and return its exit status: 0 done, 1 failed."""
+    """Run `daedalus plot` and return its exit status: 0 done, 1 failed. Bad usage raises SystemExit(2)."""
     parsed, parts = parse_groups(parser(), arguments)
     try:
-        if parsed.output.suffix.lower() not in _PICTURES:
-            raise RunDataError(f"--output {parsed.output}: the name must end with {', '.join(_PICTURES)}")
         columns = () if parsed.profile else COLUMNS if parsed.by == ENV_STEPS else (*COLUMNS, SECONDS)
         groups, problems = select(parts, finished=parsed.profile, columns=columns)
         for problem in problems:

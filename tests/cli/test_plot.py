@@ -93,6 +93,13 @@ def test_a_curve_is_drawn_for_each_group(tmp_path: Path, monkeypatch: pytest.Mon
     assert (low, high) == (10.0, 30.0)
 
 
+def test_a_picture_of_another_kind_is_bad_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        plot([str(record(tmp_path / "run")), "--output", "curve.gif"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith("--output: curve.gif: the name must end with .png, .svg, .pdf\n")
+
+
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
 
@@ -104,7 +111,6 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     run = record(tmp_path / "run")
     other = record(tmp_path / "other", preset="acrobot")
     assert refused(tmp_path / "nowhere").startswith("TMP/nowhere does not exist: name a run directory")
-    assert refused(run, output="curve.gif") == "--output TMP/curve.gif: the name must end with .png, .svg, .pdf"
     assert refused(run, output="no/curve.png") == "TMP/no/curve.png: No such file or directory"
     assert refused(run, other).startswith("the runs play different environments")
     (run / "metrics.csv").write_text("env_steps,episode_return_mean\n1,2\n")
