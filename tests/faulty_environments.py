@@ -56,6 +56,8 @@ class Faulty(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         self._step += 1
         over: Any = self._step == 10 and not self._never_ends
+        if self._fault == "close":  # a signal that it handles does not end it, either
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if self._fault == "crash":
             os._exit(7)
         if self._fault == "error":
@@ -73,8 +75,7 @@ class Faulty(gymnasium.Env[Any, Any]):
         return result[:4] if self._fault == "values" else result
 
     def close(self) -> None:
-        if self._fault == "close" and self._step:  # a signal that it handles does not end it, either
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if self._fault == "close" and self._step:
             time.sleep(3600)
 
 

@@ -1,5 +1,6 @@
 """Processes under test: start them, wait for their output, and find processes that are left."""
 
+import itertools
 import os
 import re
 import socket
@@ -13,6 +14,8 @@ from pathlib import Path
 
 DAEDALUS = [sys.executable, "-P", "-c", "from daedalus.cli.main import main; raise SystemExit(main())"]
 LIMIT = 120.0  # seconds; timeout of each step, long enough for a slow machine
+_first_port = 20_000 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 10 * 1000
+_port_numbers = itertools.count(os.getpid())  # another run of the tests begins elsewhere
 
 
 class Running:
@@ -90,10 +93,17 @@ def starting(folder: Path) -> Iterator[Callable[..., Running]]:
 
 
 def free_address() -> str:
-    """Return a loopback address that no process listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """Return a loopback address that no process listens on.
+
+    The port is below those that the system gives to sockets without one, and each worker has its own: until the process
+    under test listens there, which takes seconds, no other socket takes it.
+    """
+    for number in itertools.islice(_port_numbers, 1000):
+        port = _first_port + number % 1000
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return f"tcp/127.0.0.1:{port}"
+    raise AssertionError("no free port")
 
 
 def until(condition: Callable[[], object]) -> None:

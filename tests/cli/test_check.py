@@ -9,6 +9,7 @@ from daedalus.cli.commands import check as command
 from daedalus.cli.commands.check import check
 
 ENV = ["--env", "faulty_environments:Faulty-v0", "--seconds", "0.05"]
+LONGER = ["--seconds", "1"]  # enough for several steps on a busy machine
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +18,7 @@ def _beside_the_module(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check([*ENV, "--algorithm", "a2c"]) == 0
+    assert check([*ENV, *LONGER, "--algorithm", "a2c"]) == 0
     lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if "note" not in line)
     assert lines["environment"] == "faulty_environments:Faulty-v0 of gymnasium"
     assert lines["spaces"] == "observation: float32 array of shape (2,); action: 2 choices"
@@ -31,7 +32,10 @@ def test_a_good_environment_and_what_train_would_choose(capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--set", "environment.kwargs.fault=reward"], "problem       environment .* the reward nan: it must be fini"),
+        (
+            [*LONGER, "--set", "environment.kwargs.fault=reward"],
+            "problem       environment .* the reward nan: it must be fini",
+        ),
         (["--set", "policy.encoder=nature"], "problem       the encoder 'nature' takes images"),
         (
             [*("--algorithm", "own_losses:Weighted", "--set", "training.algorithm_kwargs.wieght=1")],

@@ -103,11 +103,12 @@ def test_silent_connections_keep_no_threads_and_nobody_out(monkeypatch: pytest.M
     monkeypatch.setattr(metrics_server._Handler, "timeout", None)  # nothing but the limit ends a silent connection
     server = metrics_server.MetricsServer("127.0.0.1", 0, CollectorRegistry())
     thread = threading.Thread(target=server.serve_forever)
+    before = set(threading.enumerate())
     thread.start()
 
     def serving() -> int:
-        """Count the threads of this server's connections only: other tests may have left threads that end meanwhile."""
-        return sum("process_request_thread" in each.name for each in threading.enumerate())
+        """Count the threads of this server's connections only: earlier tests may have left threads that end now."""
+        return sum("process_request_thread" in each.name for each in set(threading.enumerate()) - before)
 
     address = ("127.0.0.1", server.server_port)
     with contextlib.ExitStack() as stack:

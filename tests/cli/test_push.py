@@ -5,6 +5,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,10 @@ POLICY = {"manifest.json", "seal", "program.onnx", "parameters.safetensors"}
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     """A Hub that the library asks instead of the real one, with a token that may write and an empty cache."""
-    from huggingface_hub import constants
+    from huggingface_hub import close_session, constants
 
-    with serving() as server:
+    with serving() as server, ExitStack() as stack:
+        stack.callback(close_session)  # it would keep its connections, and the server their threads
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(constants, "ENDPOINT", server.address)
         template = server.address + "/{repo_id}/resolve/{revision}/{filename}"

@@ -10,7 +10,7 @@ import pytest
 from building import run_spec
 from log_lines import LINES
 from plain import array_space, vector_spaces
-from processes import until
+from processes import LIMIT, until
 
 from daedalus.cli import check_process
 from daedalus.cli import quick_check as module
@@ -90,10 +90,17 @@ def test_a_stopped_check_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     spawn = check_process._spawned
     monkeypatch.setattr(check_process, "_spawned", spawned)
-    stop = threading.Event()
+    monkeypatch.setattr(module, "_MOST_SECONDS", 10 * LIMIT)
+    stop, ended = threading.Event(), threading.Event()
     stop.set()
-    with pytest.raises(CheckTimeoutError):
-        quick_check(faulty("hang"), MODULES, stop=stop)
+
+    def check() -> None:
+        with pytest.raises(CheckTimeoutError):
+            quick_check(faulty("hang"), MODULES, stop=stop)
+        ended.set()
+
+    threading.Thread(target=check, daemon=True).start()
+    assert ended.wait(LIMIT)
     with pytest.raises(ChildProcessError):
         os.waitpid(started[0], os.WNOHANG)  # it has ended
 
@@ -118,6 +125,7 @@ def test_a_check_that_is_not_done_in_time_ends_the_programs_that_its_environment
         "from daedalus.cli import quick_check as module\n"
         "from daedalus.policy.user_modules import UserModules\n"
         "from daedalus.protocol.spec import EnvironmentSpec\n"
+        "module._MOST_SECONDS = 1000.0\n"
         "class Stop:\n"
         "    def is_set(self): return __import__('os').path.exists('pid')\n"
         "spec = EnvironmentSpec(id='slow_simulator:Slow-v0', kwargs={'file': 'pid'})\n"
@@ -125,7 +133,9 @@ def test_a_check_that_is_not_done_in_time_ends_the_programs_that_its_environment
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-c", program]
-    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=LIMIT
+    )
     assert "CheckTimeoutError" in result.stderr
     until(lambda: _has_ended(int(file.read_text())))
 

@@ -83,12 +83,17 @@ MANY = """
 CHILD = """
     import signal, time
     stop = processes.stop_on_signals()
+    reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        time.sleep(1000)
-    time.sleep(0.2)
+        inherited = signal.getsignal(signal.SIGTERM)
+        signal.signal(signal.SIGTERM, lambda *signalled: (inherited(*signalled), os.write(writing, b"handled")))
+        os.write(writing, b"forked.")
+        while True:
+            time.sleep(1000)
+    assert os.read(reading, 7) == b"forked."
     os.kill(child, signal.SIGTERM)
-    time.sleep(0.2)
+    assert os.read(reading, 7) == b"handled"
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     print("ready" if not stop.wait(0.1) else "stopped by the signal of its child", flush=True)
@@ -140,11 +145,11 @@ BLOCKED_OUTPUT = """
 )
 def test_signal_is_seen_in_native_code_and_only_by_its_process(program: str, by_signal: bool, status: int) -> None:
     command = [sys.executable, "-c", textwrap.dedent(PREAMBLE) + textwrap.dedent(program)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdin is not None
             assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
+            assert process.stdout.readline() == b"ready\n"  # and no more: the rest stays in the pipe
             if by_signal:
                 process.send_signal(signal.SIGTERM)
             else:

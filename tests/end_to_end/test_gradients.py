@@ -67,7 +67,11 @@ class RunningLearner:
 def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, algorithm: str) -> None:
     settings = read_preset("cartpole")
     choose_algorithm(settings, algorithm)
-    changes: list[Any] = ["collection.upload=gradients", "collection.envs_per_actor=16", "training.env_steps=6000"]
+    changes: list[Any] = [
+        "collection.upload=gradients",
+        "collection.envs_per_actor=16",
+        "training.env_steps=1000000000",
+    ]
     override(settings, [*changes, "training.normalize_rewards=true", "service.log_seconds=0.05"])
     spec, directory, network = run_spec(settings), tmp_path / "run", MemoryNetwork()
     run_directory.create(directory, spec)
@@ -87,7 +91,9 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
         first.stop.set()
         assert not first.join().finished
         env_steps = first.rows.rows[-1]["env_steps"]
-        second = RunningLearner(network, spec, directory, resume=True)
+        budget = int(env_steps) + 3000
+        training = spec.training.model_copy(update={"env_steps": budget})
+        second = RunningLearner(network, spec.model_copy(update={"training": training}), directory, resume=True)
         assert second.join().finished
     finally:
         stop.set()
@@ -95,7 +101,7 @@ def test_a_run_with_gradients_continues_with_another_learner(tmp_path: Path, alg
             thread.join(LIMIT)
     assert second.rows.rows[0]["env_steps"] >= env_steps
     last = second.rows.rows[-1]
-    assert last["env_steps"] >= 6000
+    assert last["env_steps"] >= budget
     assert last["episodes"] > 0
     measured = {name for row in second.rows.rows for name in row}
     assert {"policy_loss", "entropy", "explained_variance", "gradient_norm", "value_error_p50"} <= measured

@@ -1,21 +1,18 @@
 """Test of the router process."""
 
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from certificates import make_certificates
-from processes import Running, until
+from processes import Running, free_address, until
 
 Start = Callable[..., Running]
 
 
 @pytest.fixture
 def other_address() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_address()
 
 
 def test_a_router_prints_its_address_and_ends_on_sigterm(start: Start, address: str) -> None:

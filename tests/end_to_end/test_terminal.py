@@ -1,5 +1,6 @@
 """Test of `daedalus train` on a terminal, as a person sees it: a pseudo-terminal of 40 columns, and Ctrl-C."""
 
+import codecs
 import fcntl
 import os
 import pty
@@ -48,11 +49,12 @@ class AtTerminal:
         self._reader.start()
 
     def _read(self) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")()  # a read may end within a character
         try:
             while True:
                 data = os.read(self._master, 1 << 16)
                 self.raw += data
-                self.terminal.feed(data.decode())
+                self.terminal.feed(decoder.decode(data))
         except OSError:  # the process has closed the terminal
             return
         except Exception as error:
@@ -92,11 +94,8 @@ def at_terminal(tmp_path: Path) -> Iterator[Callable[..., AtTerminal]]:
 
 def child_of(parent: int, text: str) -> int:
     """Return the id of the child process of `parent` whose command line contains `text`."""
-    (child,) = (
-        pid
-        for pid in processes_mentioning(text)
-        if int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) == parent
-    )
+    children = set(map(int, Path(f"/proc/{parent}/task/{parent}/children").read_text().split()))
+    (child,) = children & set(processes_mentioning(text))
     return child
 
 

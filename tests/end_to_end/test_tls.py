@@ -26,8 +26,9 @@ def tls(address: str) -> str:
 def test_authorised_actors_solve_cartpole_over_tls(start: Start, tls: str, certificates: Path) -> None:
     learner = start("learner", "cartpole", "--listen", tls, "--tls", certificates / "learner", "--run-dir", "run")
     arm = start("actor", "--connect", tls, "--tls", certificates / "actor-arm")
+    box = start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box")
     arm.expect(r"joined run 'run' as 'arm\.[\w-]+-\d+'")
-    start("actor", "--connect", tls, "--tls", certificates / "actor-box", "--name", "box").expect("joined run")
+    box.expect("joined run")
     assert learner.wait() == 0, learner.output
     assert arm.wait() == 0, arm.output
 
@@ -59,8 +60,9 @@ def test_certificates_are_revoked_and_issued_without_a_restart(start: Start, tls
     arm.expect(r"the service at .* refuses the certificate in .*kept: it was revoked, or issued after")
     assert certs(["issue", "actor", "late", "--directory", str(certificates)]) == 0
     router.expect("2 actors and 1 operators are authorised; all connections are renewed")
+    trained = len(learner.lines)
     start("actor", "--connect", tls, "--tls", certificates / "actor-late").expect("joined run")
-    learner.expect("actors 2")
+    until(lambda: any("actors 2" in line for line in learner.lines[trained:]))
     assert [each.process.poll() for each in (router, learner, box)] == [None] * 3
 
 

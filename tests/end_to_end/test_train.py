@@ -36,8 +36,10 @@ def newest_checkpoint(directory: Path) -> Path:
     return max((directory / "checkpoints").iterdir())
 
 
-def is_socket_removed(output: str) -> bool:
-    return not Path(output.split("unixsock-stream/")[1].split(";")[0]).parent.exists()
+def is_nothing_left(output: str) -> bool:
+    """Return whether the socket of a finished `daedalus train` is gone, and the processes that connected to it."""
+    socket_file = output.split("unixsock-stream/")[1].split(";")[0]
+    return not Path(socket_file).parent.exists() and not processes_mentioning(socket_file)
 
 
 def is_free(directory: Path) -> bool:
@@ -125,7 +127,7 @@ def test_the_run_directory_is_complete(solved: tuple[Path, str]) -> None:
 
 def test_no_process_and_no_open_port_is_left(solved: tuple[Path, str]) -> None:
     assert not processes_mentioning("solved-run")
-    assert is_socket_removed(solved[1])
+    assert is_nothing_left(solved[1])
 
 
 def test_evaluate_plays_a_finished_run(solved: tuple[Path, str], start: Start) -> None:
@@ -190,7 +192,7 @@ def test_a_signal_ends_all_processes_after_a_checkpoint(start: Start, tmp_path: 
     running.expect("continue with: daedalus resume stopped-run")
     assert newest_checkpoint(tmp_path / "stopped-run").name.isdigit()
     assert not processes_mentioning("stopped-run")
-    assert is_socket_removed(running.output)
+    assert is_nothing_left(running.output)
 
 
 def test_the_run_is_locked_until_the_child_processes_of_a_killed_train_have_ended(start: Start, tmp_path: Path) -> None:
@@ -213,7 +215,7 @@ def test_a_killed_actor_is_restarted_and_training_reaches_its_end(start: Start, 
         "train", "cartpole", "--run-dir", "run", "--set", "training.stop_when_solved=false", "--env-steps", 1_000_000
     )
     address = running.expect(r"at (unixsock-stream/\S+);").group(1)
-    running.expect(r"updates .*/s")
+    running.expect(r"updates .*/s.* actors 2")
     (victim,) = [pid for pid in processes_mentioning("actor-1") if pid in processes_mentioning(address)]
     os.kill(victim, signal.SIGKILL)
     running.expect("actor-1 was killed by signal 9; started again")

@@ -80,7 +80,7 @@ def test_rows_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> 
     for step in range(30):  # the learner keeps its newest rows
         watched.source.oldest = step - 3
         watched.source.rows = [{"env_steps": float(number)} for number in range(step + 1)]
-        until(lambda step=step: watched.seen[-1].rows and watched.seen[-1].rows[-1][0] == step)
+        until(lambda step=step: watched.seen and watched.seen[-1].rows and watched.seen[-1].rows[-1][0] == step)
     assert max(len(seen.rows) for seen in watched.seen) <= 8
 
 
@@ -98,8 +98,7 @@ def test_equal_parts_stay_the_same_objects(watched: Watched) -> None:
 def test_a_large_fleet_is_not_queried_each_time(watched: Watched) -> None:
     actors = tuple(actor_status(f"a{number:03}") for number in range(100))
     watched.source.answer = run_status(actors, actors_alive=1000)
-    until(lambda: len(watched.source.asked_actors) > 5)
-    assert 0 in watched.source.asked_actors
+    until(lambda: 0 in watched.source.asked_actors)
     assert any(asked > 1000 for asked in watched.source.asked_actors)
 
 

@@ -18,7 +18,7 @@ from daedalus.cli.processes import RANK_LOST
 from daedalus.cli.ranks import LaunchedRanks, StartedRanks, follow
 from daedalus.learner.ranks import agreement
 from daedalus.learner.ranks.agreement import Options, this_run
-from daedalus.learner.ranks.commands import receive
+from daedalus.learner.ranks.commands import CommandKind, give, receive
 from daedalus.learner.ranks.errors import RankLostError, RanksDisagreeError
 from daedalus.learner.ranks.follower import Follower
 from daedalus.learner.ranks.leader import Leader
@@ -63,7 +63,7 @@ def test_a_rank_that_dies_in_an_update_is_noticed_at_once() -> None:
 
 def test_a_rank_that_hangs_is_noticed_after_the_limit() -> None:
     release = threading.Event()
-    leader, _ = lead_with(lambda _: release.wait(SECONDS), seconds=1.0)
+    leader, _ = lead_with(lambda _: release.wait(SECONDS), seconds=5.0)
     try:
         with pytest.raises(RankLostError):
             leader.begin(SPACES, tuple)
@@ -191,10 +191,16 @@ def test_a_wrong_meeting_is_refused_in_one_line(changed: dict[str, str], message
 
 def test_an_idle_rank_0_shows_that_it_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daedalus.learner.ranks.leader._WAIT_SECONDS", 0.0)
+    given: list[CommandKind] = []
     with ranked_learner(2, run_spec(), SPACES) as (learner, _):
         leader = learner._other_ranks
+        monkeypatch.setattr(
+            "daedalus.learner.ranks.leader.give",
+            lambda group, command: given.append(command.kind) or give(group, command),
+        )
         for _ in range(3):
             leader.wait()
+        assert given == [CommandKind.WAIT] * 3
         assert learner.step(make_rollouts(1), 0.0) == []
 
 

@@ -5,8 +5,7 @@ import time
 from contextlib import ExitStack, closing
 
 import pytest
-from processes import LIMIT, until
-from test_transports import free_endpoint
+from processes import LIMIT, free_address, until
 
 from daedalus.protocol import keys
 from daedalus.protocol.limits import JOIN_LIMITS
@@ -21,7 +20,7 @@ NO_ANSWER_SECONDS = 2.0
 
 def listen_somewhere(max_message_bytes: int = MAX_MESSAGE_BYTES) -> tuple[str, Transport]:
     while True:
-        endpoint = free_endpoint()
+        endpoint = free_address()
         try:
             return endpoint, listen([endpoint], max_message_bytes=max_message_bytes)
         except AddressInUseError:

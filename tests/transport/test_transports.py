@@ -6,12 +6,12 @@ A fixture closes all sessions: an open session would prevent the process from en
 import itertools
 import queue
 import re
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from processes import free_address
 
 from daedalus.transport.interface import AddressInUseError, Request, Transport, TransportError
 from daedalus.transport.memory import MemoryNetwork, MemoryTransport
@@ -32,15 +32,9 @@ class Tape(queue.SimpleQueue[Any]):
         return self.get(timeout=WAIT)
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def listen_somewhere() -> tuple[str, Transport]:
     for _ in range(10):
-        endpoint = free_endpoint()
+        endpoint = free_address()
         try:
             return endpoint, listen([endpoint])
         except AddressInUseError:  # another process took it meanwhile
@@ -387,7 +381,7 @@ def test_error_of_zenoh_names_no_place_in_its_source(closing: Callable[[Transpor
 
 
 def test_unreachable_address_is_reported_at_once(closing: Callable[[Transport], Transport]) -> None:
-    endpoint = free_endpoint()
+    endpoint = free_address()
     refused = Tape()
 
     def try_to_connect() -> None:
