@@ -4,12 +4,14 @@ The environments of a user may print at every step: this must neither flood the 
 """
 
 import os
+import select
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -23,6 +25,7 @@ _KEPT_LINES = 40
 _SHOWN_AT_END = 5  # error lines of a process that were not shown before: a traceback ends with what matters
 _REPETITION = 2  # a line that equals one of so many before it is not shown: a warning that every environment repeats
 _CLOSE_SECONDS = 5.0
+_POLL_SECONDS = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,11 +101,11 @@ class ChildOutput:
         self._write = {"stdout": write_out, "stderr": write_err}
         now = time.monotonic()
         self._limits = {stream: RateLimit(now) for stream in self._write}
-        self._lock = threading.Lock()  # guards all but the threads
+        self._lock = threading.Lock()  # guards all but the readers
         self.withheld = 0  # lines that should have been shown, and were not
         self._unshown: dict[str, deque[str]] = {}  # newest lines of standard error that were not shown, by process
         self._newest: dict[tuple[str, str], deque[str]] = {}  # newest lines by process and stream
-        self._threads: dict[str, list[threading.Thread]] = {}
+        self._readers: dict[str, list[_Reader]] = {}
 
     @contextmanager
     def pipes(self, name: str, *, shown: Collection[str] = STREAMS) -> Iterator[Streams]:
@@ -131,20 +134,20 @@ class ChildOutput:
 
     def unshown(self, name: str) -> list[str]:
         """Return the newest error lines of a process that were not shown. Call it after the end of the process."""
-        self._join(self._threads.get(name, []))
+        self._wait(self._readers.get(name, []))
         with self._lock:
             return list(self._unshown.get(name, ()))
 
     def last_error(self, name: str) -> str:
         """Return the last line of standard error of a process, or an empty string. Call it after the process's end."""
-        self._join(self._threads.get(name, []))
+        self._wait(self._readers.get(name, []))
         with self._lock:
             lines = [line.strip() for line in self._newest.get((name, "stderr"), ())]
         return next(filter(None, reversed(lines)), "")
 
     def close(self) -> None:
-        """Wait until the child processes have closed their streams, and say how many lines were not shown."""
-        self._join([thread for threads in self._threads.values() for thread in threads])
+        """Read what is left of the output, and say how many lines were not shown. Call it after the processes' end."""
+        self._wait([reader for readers in self._readers.values() for reader in readers])
         with self._lock:
             self._log.close()
             if self.withheld:
@@ -164,16 +167,13 @@ class ChildOutput:
         try:
             for stream in self._write:
                 reading, writing[stream] = os.pipe()
-                thread = threading.Thread(
-                    target=_read, args=(reading, take, end, stream), name=f"output-of-{name}", daemon=True
-                )
-                self._threads.setdefault(name, []).append(thread)
-                thread.start()
+                reader = _Reader(reading, name, partial(take, stream), partial(end, stream))
+                self._readers.setdefault(name, []).append(reader)
             yield Streams(**writing)
         finally:
             for descriptor in writing.values():
                 os.close(descriptor)
-        self._threads[name] = [thread for thread in self._threads[name] if thread.is_alive()]
+        self._readers[name] = [reader for reader in self._readers[name] if not reader.has_ended]
 
     def _take(self, name: str, stream: str, lines: list[str], shown: bool) -> None:
         with self._lock:
@@ -210,21 +210,64 @@ class ChildOutput:
                 self._write[stream](line)
 
     @staticmethod
-    def _join(threads: Sequence[threading.Thread]) -> None:
+    def _wait(readers: Sequence["_Reader"]) -> None:
+        """Wait until everything that ended processes have written is read."""
         deadline = time.monotonic() + _CLOSE_SECONDS
-        for thread in threads:
-            thread.join(max(deadline - time.monotonic(), 0.0))
+        while not all(reader.is_up_to_date for reader in readers) and time.monotonic() < deadline:
+            time.sleep(_POLL_SECONDS)
 
 
-def _read(reading: int, take: Callable[[str, list[str]], None], end: Callable[[str], None], stream: str) -> None:
-    """Read a pipe to its end, and pass its lines on; then call `end`."""
-    rest = b""
-    with open(reading, "rb", buffering=0) as pipe:
-        while data := pipe.read(_LONGEST_LINE):
-            *lines, rest = (rest + data).replace(b"\r", b"\n").split(b"\n")  # progress bars rewrite their line
-            if len(rest) >= _LONGEST_LINE:
-                lines, rest = [*lines, rest], b""
-            take(stream, [line.decode(errors="replace") for line in lines])
-    if rest:
-        take(stream, [rest.decode(errors="replace")])
-    end(stream)
+class _Reader:
+    """A thread that reads a pipe to its end, and passes its lines on."""
+
+    def __init__(self, reading: int, name: str, take: Callable[[list[str]], None], end: Callable[[], None]) -> None:
+        """Start to read. `end` is called at the end of the pipe."""
+        self._pipe = open(reading, "rb", buffering=0)  # noqa: SIM115 - closed at its end
+        self._take, self._end = take, end
+        self._rest = b""
+        self._reading = threading.Lock()  # held while there is something to read or to pass on
+        self.has_ended = False
+        threading.Thread(target=self._run, name=f"output-of-{name}", daemon=True).start()
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether nothing is left to read now.
+
+        The end of the pipe may come much later than that of the process: its own child processes, such as simulators,
+        write there, too.
+        """
+        if not self._reading.acquire(blocking=False):
+            return False
+        try:
+            return self.has_ended or not self._is_readable(milliseconds=0)
+        finally:
+            self._reading.release()
+
+    def _run(self) -> None:
+        while not self.has_ended:
+            self._is_readable()
+            with self._reading:
+                self._read()
+
+    def _is_readable(self, milliseconds: int | None = None) -> bool:
+        """Wait for output, or for the end of the pipe."""
+        poll = select.poll()  # `select.select` refuses descriptors from 1024 on
+        poll.register(self._pipe, select.POLLIN)
+        return bool(poll.poll(milliseconds))
+
+    def _read(self) -> None:
+        data = self._pipe.read(_LONGEST_LINE)
+        if not data:
+            self._pipe.close()
+            if self._rest:
+                self._pass([self._rest])
+            self._end()
+            self.has_ended = True
+            return
+        *lines, self._rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")  # progress bars rewrite their line
+        if len(self._rest) >= _LONGEST_LINE:
+            lines, self._rest = [*lines, self._rest], b""
+        self._pass(lines)
+
+    def _pass(self, lines: Sequence[bytes]) -> None:
+        self._take([line.decode(errors="replace") for line in lines])

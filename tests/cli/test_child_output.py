@@ -1,11 +1,15 @@
 """Test of cli/child_output.py: the output of child processes goes to a log and, within a limit, to the screen."""
 
+import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Collection
 from pathlib import Path
 
 import pytest
+from processes import LIMIT
 
 from daedalus.cli import child_output
 from daedalus.cli.child_output import STREAMS, ChildOutput, OutputLog, RateLimit
@@ -91,6 +95,30 @@ def test_unlimited_output_is_shown_and_not_logged(screen: Screen) -> None:
     screen.output.close()
     assert screen.out == [str(n) for n in range(1000)]
     assert not screen.log.exists()
+
+
+def test_the_end_does_not_wait_for_programs_that_a_process_has_started(
+    screen: Screen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child_output, "_CLOSE_SECONDS", 10 * LIMIT)
+    file, closed = screen.log.with_name("pid"), threading.Event()
+    screen.run(
+        "actor-0",
+        "import pathlib, subprocess, sys\n"
+        "simulator = subprocess.Popen([sys.executable, '-S', '-c', 'import time; time.sleep(1000)'])\n"
+        f"pathlib.Path({str(file)!r}).write_text(str(simulator.pid))\n"
+        "print('x\\n' * 100_000)\n"
+        "print('the last line', file=sys.stderr)",
+    )
+    pid = int(file.read_text())
+    try:
+        threading.Thread(target=lambda: (screen.output.close(), closed.set()), daemon=True).start()
+        assert closed.wait(LIMIT)
+        os.kill(pid, 0)  # it runs
+    finally:
+        os.kill(pid, signal.SIGKILL)
+    assert screen.err == ["the last line"]
+    assert screen.log.read_text().count("[actor-0] x\n") == 100_000
 
 
 def test_a_line_without_end_does_not_fill_the_memory(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> None:
