@@ -4,6 +4,7 @@ import multiprocessing.connection
 import multiprocessing.resource_tracker
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,6 +26,8 @@ _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a v
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
 _DEATH_SECONDS = 2.0  # from the end of a process's pipe to its exit status
 _ERROR_SECONDS = 10.0  # from the answer of a process that failed to its error
+
+_PRELOADED = ["daedalus.actor.environments.gymnasium_backend"]
 
 _Stepped = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
@@ -137,8 +140,7 @@ class EnvironmentProcesses(AsyncVectorEnv):
         self._idle = True
 
     def _start(self, makers: Sequence[_Maker]) -> None:
-        # Zenoh does not work after a fork.
-        options: dict[str, Any] = {"context": "spawn", "autoreset_mode": AutoresetMode.NEXT_STEP}
+        options: dict[str, Any] = {"context": _start_method(), "autoreset_mode": AutoresetMode.NEXT_STEP}
         try:
             super().__init__(makers, **options)
         except (TypeError, ValueError) as error:
@@ -222,6 +224,24 @@ class EnvironmentProcesses(AsyncVectorEnv):
             reason = f"signal {-status}" if status < 0 else f"status {status}"
             hint = f" ({reason}): the environment or one of its libraries ended it; play it with `daedalus check`"
         return EnvironmentSetupError(f"environment {self._name}: the process of an environment has died{hint}")
+
+
+def _start_method() -> str:
+    """Return how processes start, after the start of the server that forks them, if there is one.
+
+    The server is a new interpreter, because Zenoh does not work after a fork. It has imported what all processes need,
+    and nothing of the user's: a new interpreter for each process would take ten times as long.
+    """
+    if sys.platform != "linux":  # Apple's frameworks do not work after a fork
+        return "spawn"
+    from multiprocessing import forkserver  # Windows may have none
+
+    forkserver.set_forkserver_preload(_PRELOADED)
+    try:
+        forkserver.ensure_running()
+    except OSError:  # such as a folder for temporary files whose path is too long for a socket
+        return "spawn"
+    return "forkserver"
 
 
 @contextmanager
