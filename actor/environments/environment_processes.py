@@ -1,6 +1,7 @@
 """Environments in separate processes: gymnasium's AsyncVectorEnv with a safe start and end."""
 
 import multiprocessing.connection
+import multiprocessing.process
 import multiprocessing.resource_tracker
 import os
 import signal
@@ -14,6 +15,7 @@ from queue import Empty
 from typing import Any, SupportsFloat
 
 import gymnasium
+import numpy as np
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
@@ -99,16 +101,19 @@ class _Maker:
     parent: int
 
     def __call__(self) -> gymnasium.Env:
-        threading.Thread(target=self._end_with_parent, name="parent-watch", daemon=True).start()
-        return OfItsOwnProcess(self.make(), self.name, self.left_out)
-
-    def _end_with_parent(self) -> None:
-        """End this process after its parent has died: an environment that hangs would run on for ever."""
         parent = multiprocessing.parent_process()
         if parent is not None and parent.pid == self.parent:  # else gymnasium has called this maker in the parent
-            parent.join()
-            time.sleep(_CLOSE_SECONDS)  # one that does not hang ends by itself
-            os._exit(1)
+            # Forked processes have the same global generator; some environments use it in place of their own.
+            np.random.seed()
+            threading.Thread(target=_end_after, args=(parent,), name="parent-watch", daemon=True).start()
+        return OfItsOwnProcess(self.make(), self.name, self.left_out)
+
+
+def _end_after(parent: multiprocessing.process.BaseProcess) -> None:
+    """End this process after its parent has died: an environment that hangs would run on for ever."""
+    parent.join()
+    time.sleep(_CLOSE_SECONDS)  # one that does not hang ends by itself
+    os._exit(1)
 
 
 class EnvironmentProcesses(AsyncVectorEnv):
