@@ -235,7 +235,7 @@ def _start_method() -> str:
     """Return how processes start, after the start of the server that forks them, if there is one.
 
     The server is a new interpreter, because Zenoh does not work after a fork. It has imported what all processes need,
-    and nothing of the user's: a new interpreter for each process would take ten times as long.
+    and nothing of the user's: a new interpreter for each process takes several times as long (docs/results.md).
     """
     if sys.platform != "linux":  # Apple's frameworks do not work after a fork
         return "spawn"
