@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 _PACKAGES = {".mp4": "av", ".gif": "PIL"}
+FORMATS = tuple(_PACKAGES)
 
 _GIF_MAX_FRAMES_PER_SECOND = 15
 _GIF_COLOURS = 64
@@ -43,7 +44,7 @@ class Video:
         Raises VideoError for an unknown suffix or a missing package.
         """
         if path.suffix.lower() not in _PACKAGES:
-            raise VideoError(f"a video file must end with {' or '.join(_PACKAGES)}, unlike {path.name!r}")
+            raise VideoError(f"a video file must end with {' or '.join(FORMATS)}, unlike {path.name!r}")
         try:
             importlib.import_module(_PACKAGES[path.suffix.lower()])
         except ImportError as error:

@@ -32,7 +32,7 @@ from daedalus.cli.processes import (
 )
 from daedalus.policy.acting.runtime import OnnxRuntime, PolicyError
 from daedalus.policy.saving.best_checkpoints import is_best
-from daedalus.policy.saving.hub import HubError, pull
+from daedalus.policy.saving.hub import HubError, RepositoryNameError, pull
 from daedalus.policy.saving.saved_policy import NoPolicyError, SavedPolicy, find_policy, pretrained
 from daedalus.policy.saving.sealed import DamagedError
 from daedalus.policy.user_modules import ModuleNotAllowedError, UserModules, module_of
@@ -88,6 +88,9 @@ def main(
             result = run_evaluation(arguments, stop, sys.stderr)
     except ModuleNotAllowedError as error:
         print_error("evaluate", allowing(error, ["daedalus", "evaluate", *words]))
+        return 2
+    except RepositoryNameError as error:
+        print_error("evaluate", error)
         return 2
     except _FAILURES as error:
         # The signal may also have ended the processes of the environments: their errors are not the reason then.

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+from daedalus.actor.evaluation.video import FORMATS
 from daedalus.cli.arguments import add_allow_module, command_parser
 from daedalus.cli.logs import add_logging
 from daedalus.protocol.spec import Backend
@@ -130,6 +131,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--seed is {arguments.seed}: choose 0 or more")
     if arguments.wrap not in (None, "none") and re.fullmatch(r"\w+(\.\w+)*:\w+", arguments.wrap) is None:
         raise ValueError(f"--wrap is {arguments.wrap}: write MODULE:FUNCTION, or none")
+    if arguments.video and arguments.video.suffix.lower() not in FORMATS:
+        raise ValueError(f"--video is {arguments.video}: the name must end with {' or '.join(FORMATS)}")
     if arguments.video and arguments.render:
         raise ValueError("--video and --render cannot be used together: run the command twice with the same --seed")
     if not arguments.video and (arguments.width is not None or arguments.max_seconds is not None):

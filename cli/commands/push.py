@@ -7,7 +7,7 @@ from pathlib import Path
 from daedalus.cli.arguments import command_parser
 from daedalus.cli.logs import add_logging, configure_logging, print_error
 from daedalus.learner.run.run_files import RunDataError
-from daedalus.policy.saving.hub import HubError
+from daedalus.policy.saving.hub import HubError, RepositoryNameError
 from daedalus.policy.saving.saved_policy import NoPolicyError
 from daedalus.policy.saving.sealed import DamagedError
 
@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def push(arguments: list[str]) -> int:
-    """Run `daedalus push` and return its exit status: 0 done, 1 failed."""
+    """Run `daedalus push` and return its exit status: 0 done, 1 failed, 2 bad usage."""
     from daedalus.cli.hub.upload import push as upload
 
     parsed = parser().parse_args(arguments)
@@ -53,6 +53,9 @@ def push(arguments: list[str]) -> int:
     )
     try:
         address = upload(parsed.directory, parsed.repository, private=parsed.private)
+    except RepositoryNameError as error:
+        print_error("push", error)
+        return 2
     except (HubError, RunDataError, NoPolicyError, DamagedError) as error:
         print_error("push", error)
         return 1

@@ -34,6 +34,10 @@ class HubError(Exception):
     """Error of the Hub, or of the way to it. The message is one line and says what to do."""
 
 
+class RepositoryNameError(HubError):
+    """The name of a repository does not have the form USER/NAME."""
+
+
 def hub_api() -> "HfApi":
     """Return the client of the Hub. Raises HubError if huggingface_hub is not installed."""
     try:
@@ -47,7 +51,7 @@ def hub_api() -> "HfApi":
 
 
 def check_repository(repository: str) -> None:
-    """Raise HubError unless the name has the form USER/NAME."""
+    """Raise RepositoryNameError unless the name has the form USER/NAME."""
     from huggingface_hub.errors import HFValidationError
     from huggingface_hub.utils import validate_repo_id
 
@@ -57,7 +61,7 @@ def check_repository(repository: str) -> None:
     except HFValidationError:
         valid = False
     if not valid:
-        raise HubError(
+        raise RepositoryNameError(
             f"{repository!r} is not the name of a repository: write USER/NAME, of letters, digits, - _ and ."
         )
 

@@ -253,8 +253,6 @@ def nothing(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
             "run ada/cart",
             "ada/cart has files that are not of a policy of Daedalus: choose another name",
         ),
-        (nothing, "run cart", "'cart' is not the name of a repository: write USER/NAME"),
-        (nothing, "run ada/../cart", "'ada/../cart' is not the name of a repository: write USER/NAME"),
         (nothing, "nowhere ada/cart", "nowhere does not exist: name a run directory"),
         (nothing, "empty ada/cart", "empty has no checkpoints yet: its learner saves the first one after"),
     ],
@@ -281,7 +279,6 @@ def test_a_push_that_fails_is_one_line(
     [
         (nothing, "ada/other", "there is no repository ada/other on the Hub, or it is private: check the name"),
         (nothing, "ada/cart --revision v7", "ada/cart has no revision 'v7': name a branch, a tag or a commit"),
-        (nothing, "cart", "'cart' is not the name of a repository: write USER/NAME"),
         (offline, "ada/cart", "the Hub is not asked, because HF_HUB_OFFLINE is set, and this machine has no copy of"),
         (gone, "ada/cart", "the Hub cannot be reached ("),
         (silent, "ada/cart", "the Hub cannot be reached (timed out), and this machine has no copy of ada/cart: check"),
@@ -304,6 +301,13 @@ def test_a_pull_that_fails_is_one_line(
     trouble(hub, monkeypatch)
     assert evaluate(["--from-hub", *words.split(), "--episodes", "1"]) == 1
     assert line(capsys).startswith(f"daedalus evaluate: {message}")
+
+
+@pytest.mark.parametrize("name", ["cart", "ada/../cart", ""])
+def test_a_name_that_no_repository_can_have_is_bad_usage(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for command, words in ((push, ["run", name]), (evaluate, ["--from-hub", name])):
+        assert command(words) == 2
+        assert f"{name!r} is not the name of a repository: write USER/NAME" in line(capsys)
 
 
 # ----------------------------------------------------------------------------------------------------- pulling

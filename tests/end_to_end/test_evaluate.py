@@ -511,7 +511,7 @@ def test_a_signal_ends_an_evaluation(start: Start, tmp_path: Path) -> None:
         (["RUN", "--episodes", 10**13], 2, "--episodes is 10000000000000: choose a number from 1 to 1,000,000"),
         (["RUN", "--envs", 0], 2, "--envs is 0: choose a number from 1 to 4096"),
         (["RUN", "--seed", -1], 2, "--seed is -1: choose 0 or more"),
-        (["RUN", "--video", "x.avi"], 1, r".mp4 or .gif, unlike 'x.avi'"),
+        (["RUN", "--video", "x.avi"], 2, "--video is x.avi: the name must end with .mp4 or .gif"),
         (["RUN", "--video", "nowhere/x.mp4"], 1, "cannot write nowhere/x.mp4: No such file or directory"),
         (["RUN", "--video", "x.mp4", "--render"], 2, "--video and --render cannot be used together"),
         (["RUN", "--video", "x.mp4", "--envs", 2], 2, "leave out --envs 2"),
