@@ -183,8 +183,9 @@ class TrainingSpec(Specification):
     batch_rollouts: PositiveInt | None = None
     """Rollouts in a batch. Unset: `collection.actors` for `impala` and `appo`, 1 for the others. Not for `a2c`."""
     max_policy_lag: NaturalInt | None = None
-    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 32 batches for `impala` and
-    `appo`, of 8 for the others; of more where the live actors can have more than half as many in flight."""
+    """Drop and count rollouts with a larger policy lag, in updates. Unset: the updates of 8 batches for `a3c` and the
+    methods of action values, of 32 for the others; of more where the live actors can have more than half as many in
+    flight."""
 
     discount_factor: UnitInterval = 0.99
     """Discount of the reward of the next step."""

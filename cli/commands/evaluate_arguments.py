@@ -41,7 +41,11 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument(
         "directory", type=Path, nargs="?", metavar="RUN_DIR", help="a run directory, or one of its checkpoints"
     )
-    options.add_argument("--pretrained", metavar="NAME", help="a policy that is part of the package, instead of a run")
+    options.add_argument(
+        "--pretrained",
+        metavar="NAME",
+        help="a policy that is part of the package, instead of a run: car_racing or car_racing_continuous",
+    )
     options.add_argument(
         "--from-hub", metavar="USER/NAME", help="a policy on the Hugging Face Hub (daedalus push), instead of a run"
     )

@@ -48,6 +48,7 @@ examples:
   daedalus certs issue gateway --host play.example
   daedalus certs issue client phone-1
   daedalus gateway --connect tcp/127.0.0.1:7447 --listen 0.0.0.0:8443 --serve-tls certs/gateway
+  daedalus certs issue actor gateway        (makes certs/actor-gateway)
   daedalus gateway --connect tls/gpu-box:7447 --tls certs/actor-gateway --operator certs/operator
   daedalus gateway --connect tcp/127.0.0.1:7447 --compare runs/cartpole-a2c-s1 runs/cartpole-appo-s1
 
