@@ -153,10 +153,14 @@ class ClientActor:
         return True
 
     def reward(self, value: float) -> None:
-        """Add to the reward of the last action. Raises ClientError if the episode has none."""
+        """Add to the reward of the last action. Raises ClientError if the episode has none, or it is too large."""
         self._check_reward(value)
-        if value:
+        if not value:
+            return
+        try:
             self.rows.reward(value)
+        except ValueError as error:
+            raise ClientError("misfit", str(error)) from None
 
     def end_episode(self, message: EndEpisode) -> None:
         """End the episode. Raises ClientError if the message does not fit; nothing has changed then."""

@@ -66,6 +66,11 @@ class UserModules:
             return importlib.import_module(name)
         except ImportError as error:
             raise UserModuleError(f"{setting}={value}: {_import_failure(name, error)}") from error
+        except SystemExit as error:  # such as a script that reads its command line
+            raise UserModuleError(
+                f"{setting}={value}: {name} ends the process when it is imported: "
+                'begin what it does as a program with `if __name__ == "__main__":`'
+            ) from error
 
     def attribute(self, setting: str, value: str) -> Any:
         """Import the module of a setting `module:name`, and return what has the name there. See `load`."""

@@ -6,7 +6,8 @@ The environment's nested spaces are flattened to components, and actions back (a
 import math
 from typing import Annotated, Literal
 
-from pydantic import FailFast, Field, StringConstraints, model_validator
+import numpy as np
+from pydantic import FailFast, Field, StringConstraints, field_validator, model_validator
 
 from daedalus.protocol.specification import PositiveInt, Specification
 
@@ -133,14 +134,21 @@ class DiscreteSpace(Specification):
 class ContinuousSpace(Specification):
     """D continuous actions with optional bounds: gymnasium's Box, flattened.
 
-    In messages, an action with both bounds is scaled to [-1, 1]; any other is as the environment has it. Values are
-    float32 [D], and may lie outside the bounds: an actor clips them before the environment receives them. Two equal
-    bounds are the only value of their action, whatever the message says.
+    In messages, an action with both bounds is scaled to [-1, 1]; any other is as the environment has it. Bounds and
+    values are float32 [D]. Values may lie outside the bounds: an actor clips them before the environment
+    receives them. Two equal bounds are the only value of their action, whatever the message says.
     """
 
     kind: Literal["continuous"] = "continuous"
     low: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096), FailFast()]
     high: Annotated[tuple[float | None, ...], Field(min_length=1, max_length=4096), FailFast()]
+
+    @field_validator("low", "high")
+    @classmethod
+    def _as_float32(cls, bounds: tuple[float | None, ...]) -> tuple[float | None, ...]:
+        """Round bounds as values are: an environment has them in float64 and its client, or its copy, in float32."""
+        with np.errstate(over="ignore"):
+            return tuple(None if bound is None else float(np.float32(bound)) for bound in bounds)
 
     @model_validator(mode="after")
     def _bounds_agree(self) -> "ContinuousSpace":
@@ -148,7 +156,7 @@ class ContinuousSpace(Specification):
             raise ValueError(f"{len(self.low)} lower bounds, but {len(self.high)} upper bounds")
         for low, high in zip(self.low, self.high, strict=True):
             if not all(bound is None or math.isfinite(bound) for bound in (low, high)):
-                raise ValueError("a bound is not finite: leave it out")
+                raise ValueError("a bound is not finite in float32: leave it out")
             if low is not None and high is not None and low > high:
                 raise ValueError(f"the lower bound {low:g} is above the upper bound {high:g}: exchange them")
         return self

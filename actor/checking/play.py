@@ -23,7 +23,7 @@ from daedalus.actor.checking.violations import (
 )
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.masks import MASK_KEY, mask_of_one
+from daedalus.actor.environments.masks import MASK_KEY, has_choices, mask_of_one
 from daedalus.actor.environments.transforms import Transforms
 from daedalus.policy.user_code import first_line, place_of
 from daedalus.policy.user_modules import UserModules
@@ -81,7 +81,7 @@ def _check_one(
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     try:
-        mask = _first_mask(environment, seed)
+        mask = _first_mask(environment, seed) if has_choices(environment.action_space, spec) else None
         texts = Texts(environment.observation_space, rest.leave_out)
         texts.watch(environment, seed)
         rest = rest.model_copy(update={"leave_out": (*rest.leave_out, *texts.names)})
@@ -100,8 +100,6 @@ def _check_one(
 
 def _first_mask(environment: gymnasium.Env, seed: int) -> Any:
     """Return the mask of the first action with a first axis of 1, or None if the environment has no masks."""
-    if isinstance(environment.action_space, gymnasium.spaces.Box):
-        return None
     with suppress(Exception, SystemExit):  # of the user's code; playing reports it
         mask = environment.reset(seed=seed)[1].get(MASK_KEY)
         return None if mask is None else mask_of_one(mask)

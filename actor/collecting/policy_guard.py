@@ -6,6 +6,8 @@ from typing import Any
 
 import gymnasium
 
+from daedalus.actor.environments.components import batch_of_one, only_of_batch
+
 _logger = logging.getLogger(__name__)
 
 DEFAULT_MAX_AGE = 30.0  # seconds
@@ -32,10 +34,9 @@ class PolicyGuard:
             raise ValueError("max_policy_age and untrained say when the safe action is played: pass a safe_action too")
         if max_policy_age is not None and not max_policy_age > 0.0:
             raise ValueError(f"max_policy_age is {max_policy_age}: it must be above 0 seconds")
-        if safe_action is not None and not callable(safe_action) and not action_space.contains(safe_action):
-            raise ValueError(f"safe_action {safe_action!r} is not in the action space {action_space}")
-        # Of an array a copy, here and for each caller: a loop may scale the action that it got.
-        self._action = safe_action if callable(safe_action) else copy.deepcopy(safe_action)
+        if safe_action is not None and not callable(safe_action):
+            safe_action = _as_action(action_space, safe_action)
+        self._action = safe_action
         self._untrained = untrained
         self.max_age = DEFAULT_MAX_AGE if max_policy_age is None else max_policy_age
         self.reason = ""  # why the safe action is played now; empty while the policy acts
@@ -57,7 +58,7 @@ class PolicyGuard:
         return not reason
 
     def action(self, observation: Any) -> Any:
-        """Return the safe action for an observation."""
+        """Return the safe action for an observation: a copy, because a loop may scale the action that it got."""
         return self._action(observation) if callable(self._action) else copy.deepcopy(self._action)
 
     def _reason(self, policy_version: int, age: float) -> str:
@@ -66,3 +67,11 @@ class PolicyGuard:
         if policy_version == 0 and not self._untrained:
             return "no update has changed the policy yet: pass untrained=True to let it act"
         return ""
+
+
+def _as_action(action_space: gymnasium.Space, action: Any) -> Any:
+    """Return an action as the space has it: a copy, in its dtype. Raises ValueError if it is not in the space."""
+    converted = only_of_batch(action_space, batch_of_one(action_space, action, "safe_action"))
+    if not action_space.contains(converted):
+        raise ValueError(f"safe_action {action!r} is not in the action space {action_space}")
+    return converted

@@ -20,6 +20,7 @@ from daedalus.actor.environments.environment_errors import (
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.environments_in_turn import EnvironmentsInTurn
 from daedalus.actor.environments.gymnasium_environments import GymnasiumEnvironments
+from daedalus.actor.environments.masks import has_choices
 from daedalus.actor.environments.rendering import render_without_display
 from daedalus.actor.environments.wrappers import Camera, MaskInInfo, OneEpisode, RepeatedSteps, Shutter
 from daedalus.policy.user_modules import NO_MODULES, UserModuleError, UserModules
@@ -126,7 +127,8 @@ def make_gymnasium(
             "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"
         )
     try:
-        environments = GymnasiumEnvironments(environment, spec.id, spec.leave_out)
+        choices = has_choices(environment.single_action_space, spec)
+        environments = GymnasiumEnvironments(environment, spec.id, spec.leave_out, has_choices=choices)
     except EnvironmentSetupError:
         environment.close()
         raise

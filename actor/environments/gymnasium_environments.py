@@ -22,7 +22,7 @@ _logger = logging.getLogger(__name__)
 class GymnasiumEnvironments:
     """A BackendEnvironments over a gymnasium vector environment."""
 
-    def __init__(self, environment: Any, name: str, leave_out: Sequence[str] = ()) -> None:
+    def __init__(self, environment: Any, name: str, leave_out: Sequence[str] = (), *, has_choices: bool = True) -> None:
         """Construct from the vector environment, and reset it if its actions may have masks: only `info` shows them.
 
         Of environments that are stepped in turn only the first is reset: a reset may be slow.
@@ -31,6 +31,7 @@ class GymnasiumEnvironments:
           environment: the vector environment.
           name: its id, for errors.
           leave_out: components of the observation that nobody reads: what is wrong with them is no error.
+          has_choices: whether some actions are choices, which may have masks; see `has_choices`.
 
         Raises EnvironmentSetupError if an environment raises an exception, as `reset` and `step` do, or has no such
         component to leave out.
@@ -42,7 +43,7 @@ class GymnasiumEnvironments:
         self._read_space = without(self.observation_space, leave_out)
         self._episode_info = EpisodeInfo()
         self.action_mask: Any = None
-        if isinstance(self.action_space, gymnasium.spaces.Box):
+        if not has_choices:
             return
         if isinstance(environment, SyncVectorEnv):
             self.action_mask = self._first_mask(environment)

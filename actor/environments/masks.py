@@ -10,13 +10,20 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from daedalus.actor.environments.components import ObservationComponent
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.protocol.spaces import ActionSpace, DiscreteSpace
+from daedalus.protocol.spec import EnvironmentSpec
 
 MASK_KEY = "action_mask"
+
+
+def has_choices(action_space: gymnasium.Space, spec: EnvironmentSpec) -> bool:
+    """Return whether the actions of a run may have masks: they are not all continuous."""
+    return not isinstance(action_space, gymnasium.spaces.Box) or spec.action_table is not None
 
 
 class Masks:
@@ -143,7 +150,12 @@ def _flags(name: str, mask: np.ndarray, space: DiscreteSpace | None) -> np.ndarr
         raise EnvironmentSetupError(
             f"the {MASK_KEY} of {name!r} has shape {mask.shape[1:]}, but the action has {space.choices} choices"
         )
-    return flat.astype(np.bool_)
+    legal = flat.astype(np.bool_)
+    if flat.dtype.kind != "b" and (other := legal != flat).any():  # such as -inf for an illegal choice
+        raise EnvironmentSetupError(
+            f"the {MASK_KEY} of {name!r} has the value {flat[other][0]:g}: write 1 for each legal choice, 0 for others"
+        )
+    return legal
 
 
 def _array(masks: Any) -> np.ndarray:

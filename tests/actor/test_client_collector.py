@@ -336,6 +336,17 @@ def test_safe_action_is_what_it_was_although_the_loop_changes_an_action_that_it_
     assert guard.action(None).tolist() == [0.0, 0.0]
 
 
+def test_safe_action_is_taken_in_the_dtype_of_its_space() -> None:
+    """numpy makes float64 and int64, and the spaces of actions often have float32 and int32."""
+    box, choice = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(3, dtype=np.int32)
+    both = gymnasium.spaces.Dict({"move": box, "grip": choice})
+    action = PolicyGuard(both, {"move": np.zeros(2), "grip": np.int64(1)}, None, untrained=False).action(None)
+    assert both.contains(action)
+    assert (action["move"].tolist(), int(action["grip"])) == ([0.0, 0.0], 1)
+    with pytest.raises(ValueError, match="is not in the action space"):
+        PolicyGuard(box, [0.0, 2.0], None, untrained=False)
+
+
 def test_safe_action_may_depend_on_the_observation() -> None:
     guard = PolicyGuard(gymnasium.spaces.Discrete(9), lambda observation: observation + 1, None, untrained=False)
     assert guard.action(4) == 5
@@ -345,7 +356,8 @@ def test_safe_action_may_depend_on_the_observation() -> None:
     ("arguments", "reason"),
     [
         ((None, 30.0), "pass a safe_action"),
-        ((7, None), "safe_action 7 is not in the action space"),
+        ((7, None), r"safe_action is 7, which is outside Discrete\(2\)"),
+        (([1], None), "safe_action has shape"),
         ((1, 0.0), "must be above 0 seconds"),
         ((1, float("nan")), "must be above 0 seconds"),
     ],

@@ -112,6 +112,15 @@ def test_action_has_the_form_of_its_space_and_its_bounds() -> None:
     assert ACTION.contains({**action, "grip": np.int64(action["grip"])})
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64])
+def test_choice_has_the_dtype_of_its_space(dtype: type) -> None:
+    """An environment may check `action_space.contains(action)`, which is false for another dtype."""
+    space = gym.Discrete(3, start=4, dtype=dtype)
+    actions = ActionComponents(space).env_actions({"action": np.array([[0], [2]])})
+    assert actions.tolist() == [4, 6]
+    assert all(space.contains(action) for action in actions)
+
+
 def test_number_with_equal_bounds_is_always_that_number() -> None:
     components = ActionComponents(gym.Box(np.array([-1, 0.3], np.float32), np.array([1, 0.3], np.float32)))
     assert components.spaces == {

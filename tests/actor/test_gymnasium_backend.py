@@ -125,7 +125,7 @@ def test_no_reward_limit_ends_episodes_after_steps_without_a_positive_reward() -
     rows = _rows(environments, [bad, good, nothing, bad, good, nothing, nothing, good])
     assert [row[1] for row in rows] == [-0.5, 0.5, 0.0, -0.5, 0.0, 0.0, 0.0, 0.0]
     assert [row[3] for row in rows] == [False, False, False, True, False, False, True, False]
-    assert [tuple(row[0][0][0][:2]) for row in rows[3:6]] == [(0, 4), (1, 0), (1, 1)]
+    assert [tuple(row[0][0][0][:2]) for row in rows[3:6]] == [(1, 4), (2, 0), (2, 1)], "and one reset before, for masks"
     assert [row[2] for row in rows] == [row[3] for row in rows], "nothing more is to come: terminated, too"
 
 
@@ -148,8 +148,8 @@ def test_second_reset_restarts_all_episodes() -> None:
     again = [environments.reset(7)]
     again += [environments.step(np.array([0, 2]))[0] for _ in range(2)]
     first, again = np.stack(first), np.stack(again)
-    assert (first[:, :, 0, 0, 0] == 0).all()
-    assert (again[:, :, 0, 0, 0] == 1).all()
+    assert first[:, :, 0, 0, 0].tolist() == [[1, 0]] * 3, "the first was reset once more, to learn whether it has masks"
+    assert again[:, :, 0, 0, 0].tolist() == [[2, 1]] * 3
     np.testing.assert_array_equal(first[:, :, 1:], again[:, :, 1:])
     _, _, terminated, truncated = environments.step(np.array([0, 2]))
     assert (terminated.tolist(), truncated.tolist()) == ([True, False], [True, False])

@@ -86,13 +86,23 @@ class Uneven(Narrowing):
         return seen, {"action_mask": list(self.mask())} if self._convention == "list" else info
 
 
+class Pedals(Narrowing):
+    """Narrowing with continuous actions; an action table makes choices of them."""
+
+    action_space = gym.Box(-1.0, 1.0, (1,))
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        return super().step(int(action[0]) + 1)
+
+
 @pytest.fixture(autouse=True)
 def _registered() -> Any:
     gymnasium.register("Narrowing-v0", lambda **kwargs: Narrowing(**kwargs))
     gymnasium.register("Uneven-v0", lambda **kwargs: Uneven(**kwargs))
+    gymnasium.register("Pedals-v0", lambda **kwargs: Pedals(**kwargs))
     yield
-    del gymnasium.registry["Narrowing-v0"]
-    del gymnasium.registry["Uneven-v0"]
+    for name in ("Narrowing-v0", "Uneven-v0", "Pedals-v0"):
+        del gymnasium.registry[name]
 
 
 @pytest.mark.parametrize("convention", ["info", "method", "observation"])
@@ -306,6 +316,11 @@ def test_forbidding_every_choice_is_refused_unless_no_action_is_taken() -> None:
         (np.array(["x"] * 5), "has shape"),
         ({"gripper": np.ones(5)}, "names 'gripper', which is no discrete component"),
         ({}, "has no entry for 'action' any more"),
+        (
+            np.array([0.0, -np.inf, 0.0, 0.0, 0.0]),
+            "of 'action' has the value -inf: write 1 for each legal choice, 0 for",
+        ),
+        (np.array([1.0, np.nan, 0.0, 0.0, 0.0]), "has the value nan"),
     ],
 )
 def test_mask_that_does_not_fit_is_refused(mask: Any, reason: str) -> None:
@@ -377,3 +392,15 @@ def test_gymnasiums_checker_plays_legal_actions(convention: str) -> None:
     assert not [note for note in narrowing_notes(convention) if "Error" in note]
     (note,) = [note for note in narrowing_notes("none") if "Error" in note]
     assert "an illegal action was taken" in note
+
+
+def test_choices_of_an_action_table_may_have_masks() -> None:
+    table = ((-1.0,), (0.0,), (1.0,))
+    spec = EnvironmentSpec(id="Pedals-v0", kwargs={"convention": "info"}, action_table=table)
+    report = check_environment(spec, NO_MODULES, seconds=60.0, env_steps=20)
+    assert (report.problems, report.env_steps) == ((), 20)
+    environments = make_environments(spec, 2)
+    try:
+        assert environments.reset(1).masks["action"].tolist() == [[True, False, False]] * 2
+    finally:
+        environments.close()

@@ -512,6 +512,7 @@ def test_name_that_is_no_part_of_a_key_is_refused(learner: ScriptedLearner, conn
         ({"type": "act", "observation": [0] * 4, "reward": "1"}, "a reward must be a number"),
         ({"type": "act", "observation": [0] * 4, "more": 1}, "act has an unknown field 'more'"),
         ({"type": "hello", "version": 1, "name": "b", **CARTPOLE}, "hello is out of turn: a connection has one hello"),
+        ({"type": "reward", "reward": 1e300}, "the reward is 1e+300: it must be finite"),
         ({"type": "end_episode", "terminated": False}, "a truncated episode needs its last observation"),
         ({"type": "end_episode", "terminated": 1}, "terminated must be true or false"),
         ({"type": "fly"}, "the message has no type that a client sends"),

@@ -57,6 +57,8 @@ def failure(value: str) -> str:
 
 def test_a_missing_module_or_name_is_reported(tmp_path: Path) -> None:
     (tmp_path / "mine_without_it.py").write_text("")
+    (tmp_path / "mine_that_ends.py").write_text("import argparse; argparse.ArgumentParser().parse_args(['--wrong'])")
+    assert failure("mine_that_ends:f").startswith("mine_that_ends ends the process when it is imported: begin what it")
     assert failure("mine_that_is_absent:f").endswith("install it, or start in the folder of mine_that_is_absent.py")
     assert "cannot import mine_absent.part (No module" in failure("mine_absent.part:f")
     assert failure("mine_without_it:f") == "mine_without_it.py has no 'f'"

@@ -1,6 +1,7 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -277,7 +278,18 @@ def test_inconsistent_space_is_rejected(space: type[Specification], fields: dict
         space.model_validate(fields)
 
 
-LONGEST = {"kind": "continuous", "low": [-1.23456789e-300] * 4096, "high": [1.23456789e300] * 4096}
+def test_bounds_are_equal_if_they_are_in_float32() -> None:
+    """An environment has them in float64 and a client's copy in float32: both are actors of one run."""
+    ours, theirs = (
+        ContinuousSpace(low=(-0.7,), high=(None,)),
+        ContinuousSpace(low=(-float(np.float32(0.7)),), high=(None,)),
+    )
+    assert ours == theirs
+    with pytest.raises(ValidationError, match="not finite in float32"):
+        ContinuousSpace(low=(0.0,), high=(1e39,))
+
+
+LONGEST = {"kind": "continuous", "low": [-1.23456789e-30] * 4096, "high": [1.23456789e30] * 4096}
 
 
 @pytest.mark.parametrize(
