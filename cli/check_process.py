@@ -101,7 +101,7 @@ def check_in_process(
         try:
             answer = _read(results.fileno(), stop or threading.Event(), check.most_seconds, slow_seconds, on_slow)
             if answer:
-                os.kill(pid, signal.SIGKILL)  # threads of the environment could keep it alive
+                _end(pid, own_group=not check.shown)  # threads of the environment could keep it alive
         except BaseException:
             _end(pid, own_group=not check.shown)
             raise

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import NoReturn, TextIO
 
+from daedalus.policy.user_code import frames_of, is_of_user
 from daedalus.transport.slow_calls import in_progress
 
 _logger = logging.getLogger(__name__)
@@ -26,6 +27,7 @@ UNREAD = 128 + getattr(signal, "SIGPIPE", 13)  # exit status, as of other progra
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # errors of a full disk, and of a terminal that was closed
 _STUCK_SECONDS = 4.0  # in one call after a signal: a process that is stuck ends within 5 s
 _END_SECONDS = 30.0  # for the orderly end of a process that is not stuck, even on a busy machine
+_THREADS_SECONDS = 1.0  # for threads that are not ours, at the end
 _LAST_WORD_SECONDS = 0.5  # for a last line that may block
 _TRACEBACK_SECONDS = 5.0  # for a traceback that may block
 _LONGEST_LINE = 1 << 16  # bytes, from the parent
@@ -113,11 +115,18 @@ def stop_on_signals(*, exit_if_stuck: bool = False) -> threading.Event:
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see interrupts_held
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))  # a child's signals are not the parent's
+        os.register_at_fork(after_in_child=_default_signals)
     threading.Thread(target=watch, name="signals", daemon=True).start()
     if exit_if_stuck:
         threading.Thread(target=_exit_if_stuck, args=(stop,), name="stuck-watch", daemon=True).start()
     return stop
+
+
+def _default_signals() -> None:
+    """Undo `stop_on_signals` in a fork, such as a process of an environment: a signal shall end it."""
+    signal.set_wakeup_fd(-1)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _ignore(_number: int, _frame: object) -> None:
@@ -192,15 +201,16 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
     `outputs` are the streams that the command writes to, besides standard output and standard error.
     """
     open_standard_streams()
+    before = set(threading.enumerate())
     try:
         try:
             with _interrupts_recognised():
-                return _ended(command())
+                return _ended(command(), before)
         finally:
             sys.stdout.flush()
     except KeyboardInterrupt:  # before a command has handlers of its own, or without any
         print("stopped", file=sys.stderr)
-        return _ended(1)
+        return _ended(1, before)
     except BrokenPipeError:
         unread = [stream for stream in (*outputs, sys.stdout, sys.stderr) if _is_unread(stream)]
         if not unread:  # another pipe: a fault of ours
@@ -220,13 +230,26 @@ def exit_status(command: Callable[[], int], *outputs: TextIO) -> int:
         return 1
 
 
-def _ended(status: int) -> int:
-    """Return the status, or end the process with it now if a call of Zenoh is in progress, which would abort it."""
-    if in_progress():
+def _ended(status: int, before: set[threading.Thread]) -> int:
+    """Return the status, or end the process with it now if it could not end by itself.
+
+    A call of Zenoh that is in progress would abort it. And the interpreter waits for every thread that is no daemon:
+    one of an environment, such as the loop of a simulator's connection, may run for ever.
+    """
+    if in_progress() or _any_lasts(set(threading.enumerate()) - before):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
     return status
+
+
+def _any_lasts(threads: set[threading.Thread]) -> bool:
+    """Return whether the interpreter would wait for one of these threads for longer than a second."""
+    deadline = time.monotonic() + _THREADS_SECONDS
+    waited_for = [thread for thread in threads if not thread.daemon]
+    for thread in waited_for:
+        thread.join(max(deadline - time.monotonic(), 0.0))
+    return any(thread.is_alive() for thread in waited_for)
 
 
 @contextlib.contextmanager
@@ -276,11 +299,15 @@ def exit_on_thread_exceptions() -> None:
     """Make an exception in any thread end the process with status 1, with its traceback on standard error.
 
     An exception that no thread handles is a fault of ours. Without this hook only its thread would end and the process
-    would idle; with it a supervisor restarts the process. Call this at the start of a command.
+    would idle; with it a supervisor restarts the process. In a thread that an environment has started for itself it
+    only ends the thread, as in every other program. Call this at the start of a command.
     """
 
     def end_process(arguments: threading.ExceptHookArgs) -> None:
         name = arguments.thread.name if arguments.thread else "unknown"
+        if _is_of_user(arguments.exc_value):
+            threading.__excepthook__(arguments)
+            return
 
         def say_why() -> None:
             print(f"exception in thread {name}:", file=sys.stderr)
@@ -293,6 +320,13 @@ def exit_on_thread_exceptions() -> None:
         _end_with(say_why, within=_TRACEBACK_SECONDS)
 
     threading.excepthook = end_process
+
+
+def _is_of_user(error: BaseException | None) -> bool:
+    """Return whether an exception was raised by the user's code without a function of ours below it."""
+    names = [frame.tb_frame.f_globals.get("__name__", "") for frame in frames_of(error)]
+    ours = any(name == "__main__" or name.partition(".")[0] == "daedalus" for name in names)
+    return not ours and any(is_of_user(frame) for frame in frames_of(error))
 
 
 def process_started() -> float:

@@ -1,8 +1,10 @@
 """Environments that each break gymnasium's interface in one way."""
 
+import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from typing import Any
 
@@ -27,6 +29,11 @@ class Faulty(gymnasium.Env[Any, Any]):
             raise FileNotFoundError("level.txt")
         if fault == "hang":
             time.sleep(3600)
+        if fault == "child process":  # an environment may have one, and no fault
+            self._child = multiprocessing.get_context("fork").Process(target=time.sleep, args=(3600,), daemon=True)
+            self._child.start()
+        if fault == "thread":
+            threading.Thread(target=time.sleep, args=(3600,)).start()
 
     def __getattribute__(self, name: str) -> Any:
         if name.endswith("_space") and super().__getattribute__("__dict__").get("_fault") == f"no {name}":
@@ -68,6 +75,10 @@ class Faulty(gymnasium.Env[Any, Any]):
             raise _SimulatorError(3, "no contact")
         if self._fault == "error in a function":
             _connect()
+        if self._fault == "error in a thread":
+            thread = threading.Thread(target=_connect, daemon=True)
+            thread.start()
+            thread.join()
         reward: Any = np.nan if self._fault == "reward" and self._step == 3 else 1.0
         reward = -1e12 if self._fault == "large reward" else reward
         info: Any = _odd_info(self._step) if self._fault == "info" else {}
@@ -75,7 +86,7 @@ class Faulty(gymnasium.Env[Any, Any]):
         return result[:4] if self._fault == "values" else result
 
     def close(self) -> None:
-        if self._fault == "close" and self._step:
+        if self._fault in ("close", "close alone") and self._step:
             time.sleep(3600)
 
 

@@ -21,6 +21,7 @@ from daedalus.actor.checking.violations import (
     reset_violations,
     step_violations,
 )
+from daedalus.actor.environments.closing import limited_close
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.leaves import without
 from daedalus.actor.environments.masks import MASK_KEY, has_choices, mask_of_one
@@ -94,7 +95,7 @@ def _check_one(
     except EnvironmentSetupError as error:
         return EnvironmentReport(problems=(str(error),))
     finally:
-        with suppress(Exception, SystemExit):  # of the user's code
+        with suppress(Exception, SystemExit), limited_close():  # of the user's code
             environment.close()
 
 

@@ -97,6 +97,16 @@ def import_extra(module: str, extra: str, purpose: str, otherwise: str = "") -> 
         ) from None
 
 
+def hint_of_count(made: int, count: int) -> str:
+    """Return what may be wrong where an environment cannot be made, but `made` others of `count` could."""
+    if not made:
+        return ""
+    return (
+        f" (environment {made + 1} of {count} of this process: if only one can run at a time, use "
+        "--set collection.envs_per_actor=1 --actors 1)"
+    )
+
+
 @contextmanager
 def creation_errors(environment: str, hint: str = "") -> Iterator[None]:
     """Raise EnvironmentSetupError for anything that the constructor of an environment raises; `hint` ends its message.

@@ -8,9 +8,11 @@ import signal
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from queue import Empty
 from typing import Any, SupportsFloat
 
@@ -18,9 +20,15 @@ import gymnasium
 import numpy as np
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector.async_vector_env import _async_worker
 
 from daedalus.actor.environments.components import is_text
-from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
+from daedalus.actor.environments.environment_errors import (
+    EnvironmentSetupError,
+    creation_errors,
+    hint_of_count,
+    playing_error,
+)
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.leaves import leaves
 
@@ -28,6 +36,7 @@ _CLOSE_SECONDS = 10.0  # for the environments' own `close`, which may finish a v
 _TERMINATE_SECONDS = 1.0  # for a process that handles SIGTERM itself
 _DEATH_SECONDS = 2.0  # from the end of a process's pipe to its exit status
 _ERROR_SECONDS = 10.0  # from the answer of a process that failed to its error
+_UNMADE = 70  # exit status of a process whose environment cannot be made
 
 _PRELOADED = ["daedalus.actor.environments.gymnasium_backend"]
 
@@ -116,6 +125,31 @@ def _end_after(parent: multiprocessing.process.BaseProcess) -> None:
     os._exit(1)
 
 
+def _serve(name: str, count: int, index: int, make: Callable[[], gymnasium.Env], *arguments: Any) -> None:
+    """Make one environment and serve it, as gymnasium's worker does; or put the reason why it cannot be made.
+
+    Args:
+      name: id of the environments, for errors.
+      count: number of environments.
+      index: of this one.
+      make: creates it.
+      arguments: the other arguments of a worker of gymnasium.
+    """
+    _, _, _, errors, *_ = arguments  # pipe, parent_pipe, shared_memory, error_queue
+    try:
+        with creation_errors(name, hint_of_count(index, count)):
+            environment = make()
+    except EnvironmentSetupError as error:
+        errors.put((index, EnvironmentSetupError, EnvironmentSetupError(str(error)), ""))
+        sys.exit(_UNMADE)
+    _async_worker(index, lambda: environment, *arguments)
+
+
+def _kill(processes: Sequence[multiprocessing.process.BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
+
+
 class EnvironmentProcesses(AsyncVectorEnv):
     """One process for each environment. SIGINT to the process group does not reach them: their parent ends them."""
 
@@ -142,10 +176,20 @@ class EnvironmentProcesses(AsyncVectorEnv):
                 error = self._death()
                 self.close(terminate=True)
                 raise error from None
+            except BaseException:
+                _kill(getattr(self, "processes", ()))
+                raise
+        # The interpreter waits for processes that are no daemons: end those that nobody has closed.
+        weakref.finalize(self, _kill, self.processes)
         self._idle = True
 
     def _start(self, makers: Sequence[_Maker]) -> None:
-        options: dict[str, Any] = {"context": _start_method(), "autoreset_mode": AutoresetMode.NEXT_STEP}
+        options: dict[str, Any] = {
+            "context": _start_method(),
+            "autoreset_mode": AutoresetMode.NEXT_STEP,
+            "worker": partial(_serve, self._name, len(makers)),
+            "daemon": False,  # an environment may start processes of its own
+        }
         try:
             super().__init__(makers, **options)
         except (TypeError, ValueError) as error:
@@ -221,6 +265,9 @@ class EnvironmentProcesses(AsyncVectorEnv):
             if process.sentinel in closed:
                 process.join(_DEATH_SECONDS)
         status = next((process.exitcode for process in self.processes if process.exitcode is not None), None)
+        if status == _UNMADE:
+            with suppress(Empty):
+                return self.error_queue.get(timeout=_ERROR_SECONDS)[2]
         if status is None:
             hint = ""
         elif status == -getattr(signal, "SIGKILL", 9):

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from daedalus.actor.environments.environment_errors import creation_errors
+from daedalus.actor.environments.environment_errors import creation_errors, hint_of_count
 from daedalus.actor.environments.episode_info import info_to_keep
 from daedalus.actor.environments.masks import MASK_KEY
 
@@ -31,7 +31,7 @@ class EnvironmentsInTurn(SyncVectorEnv):
         made: list[gymnasium.Env] = []
 
         def make(maker: Callable[[], gymnasium.Env]) -> gymnasium.Env:
-            with creation_errors(name, _hint(len(made), len(makers))):
+            with creation_errors(name, hint_of_count(len(made), len(makers))):
                 made.append(maker())
             return made[-1]
 
@@ -68,13 +68,3 @@ class EnvironmentsInTurn(SyncVectorEnv):
             return super()._add_info(vector_infos, kept, env_num)
         finally:
             self._collecting = False
-
-
-def _hint(made: int, count: int) -> str:
-    """Return what may be wrong where an environment cannot be made, but `made` others of `count` could."""
-    if not made:
-        return ""
-    return (
-        f" (environment {made + 1} of {count} of this process: if only one can run at a time, use "
-        "--set collection.envs_per_actor=1 --actors 1)"
-    )

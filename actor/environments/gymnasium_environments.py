@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -9,7 +10,9 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from daedalus.actor.checking.violations import observation_violations
+from daedalus.actor.environments.closing import limited_close
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError, playing_error
+from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.episode_info import EpisodeInfo
 from daedalus.actor.environments.interface import BackendStep
 from daedalus.actor.environments.leaves import without
@@ -106,6 +109,8 @@ class GymnasiumEnvironments:
     def close(self) -> None:
         """See BackendEnvironments. An exception of an environment is only logged: it has done its work."""
         try:
-            self._environment.close()
+            # Environments in processes have a limit of their own, which ends these.
+            with nullcontext() if isinstance(self._environment, EnvironmentProcesses) else limited_close():
+                self._environment.close()
         except (Exception, SystemExit) as error:  # of the user's code
             _logger.warning("environment %s: close raises %s%s", self._name, first_line(error), place_of(error))

@@ -1,5 +1,6 @@
 """The backend `gymnasium`: repeats, no_reward_limit, wrappers, cameras and processes."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -16,9 +17,9 @@ from allowed_modules import TEST_MODULES
 from gymnasium.envs.registration import EnvSpec
 from picture_environment import Picture
 from plain import PlainEnvironments, choices
-from processes import until
+from processes import LIMIT, until
 
-from daedalus.actor.environments import environment_processes, gymnasium_backend, make
+from daedalus.actor.environments import closing, environment_processes, gymnasium_backend, make
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.environment_processes import EnvironmentProcesses
 from daedalus.actor.environments.gymnasium_backend import EnvironmentFactory, as_on_gymnasium, make_gymnasium
@@ -295,6 +296,61 @@ def test_close_ends_processes_whose_environments_do_not_close(monkeypatch: pytes
     assert [process.exitcode for process in environments.processes] == [-signal.SIGKILL] * 2
 
 
+def test_environment_in_a_process_may_start_processes() -> None:
+    environments = make_environments(_faulty("child process", processes=True), 1, modules=FAULTY)
+    assert environments.reset(1) is not None
+    environments.close()
+
+
+def test_processes_say_why_an_environment_cannot_be_made() -> None:
+    """The first is made by this process, for its spaces."""
+    makers = [EnvironmentFactory(spec=_faulty(fault), modules=FAULTY) for fault in ("", "constructor")]
+    with pytest.raises(EnvironmentSetupError) as caught:
+        EnvironmentProcesses("Mine-v0", makers)
+    assert str(caught.value).startswith("environment Mine-v0 cannot be created: FileNotFoundError: level.txt (")
+    assert "environment 2 of 2 of this process: if only one can run at a time" in str(caught.value)
+    assert not [each for each in multiprocessing.active_children() if "EnvironmentProcesses" in each.name]
+
+
+LEFT_OPEN = """
+from daedalus.actor.environments.environment_processes import EnvironmentProcesses
+from counting_environment import Counting
+
+environments = EnvironmentProcesses("Mine-v0", [Counting] * 2)
+environments.reset(seed=1)
+print("open", flush=True)
+"""
+
+
+def test_processes_that_nobody_has_closed_do_not_hold_up_the_end_of_their_parent() -> None:
+    path = os.pathsep.join(sys.path)
+    command = [sys.executable, "-c", LEFT_OPEN]
+    ended = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=LIMIT, check=False
+    )
+    assert (ended.returncode, ended.stdout) == (0, "open\n"), ended.stderr
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_close_that_does_not_return_is_given_up(
+    count: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What an evaluation has played would be lost."""
+    monkeypatch.setattr(closing, "CLOSE_SECONDS", 0.3)
+    monkeypatch.setattr(closing, "_NEXT_SECONDS", 0.1)
+    environments = make_environments(_faulty("close alone"), count, modules=FAULTY)
+    environments.reset(1)
+    environments.step(np.zeros(count, np.int64))
+    handler = signal.getsignal(signal.SIGALRM)
+    environments.close()
+    assert "close raises TimeoutError: it does not return (" in caplog.text
+    assert (signal.getsignal(signal.SIGALRM), signal.getitimer(signal.ITIMER_REAL)) == (handler, (0.0, 0.0))
+
+
+def _faulty(fault: str, **fields: Any) -> EnvironmentSpec:
+    return EnvironmentSpec(id="faulty_environments:Faulty-v0", kwargs={"fault": fault}, **fields)
+
+
 def test_killed_process_is_reported_and_close_ends_the_others() -> None:
     environments = _processes()
     environments.reset(seed=1)
@@ -309,6 +365,7 @@ def test_killed_process_is_reported_and_close_ends_the_others() -> None:
 
 
 HANGING = """
+import multiprocessing
 import os
 import time
 from counting_environment import Counting
