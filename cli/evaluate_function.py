@@ -14,7 +14,7 @@ import numpy as np
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.cli.commands.evaluate import run_evaluation
 from daedalus.cli.commands.evaluate_arguments import check, parser
-from daedalus.policy.user_modules import ModuleNotAllowedError
+from daedalus.policy.user_modules import ModuleNotAllowedError, refuse_while_imported
 from daedalus.protocol.spec import Backend
 
 
@@ -72,8 +72,10 @@ def evaluate(
 
     Raises ValueError for invalid arguments, NoPolicyError if there is no checkpoint or no such pretrained policy,
     DamagedError if none can be read, HubError if a policy cannot be pulled, EnvironmentSetupError if the environment
-    cannot be made or needs a module that is not allowed, and VideoError if the video cannot be written.
+    cannot be made or needs a module that is not allowed, VideoError if the video cannot be written, and RuntimeError if
+    the module of the environment calls it while it is imported.
     """
+    refuse_while_imported("daedalus.evaluate")
     arguments = parser().parse_args([])
     arguments.directory = None if directory is None else Path(directory)
     arguments.newest, arguments.pretrained = newest, pretrained

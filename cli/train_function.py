@@ -24,6 +24,7 @@ from daedalus.learner.reporting.trackers.tracker import TRACKERS
 from daedalus.learner.run import run_directory
 from daedalus.learner.run.initial import check_initial
 from daedalus.learner.run.settings import SettingsError, assign
+from daedalus.policy.user_modules import refuse_while_imported
 
 _KEPT_ERRORS = 40  # newest lines of standard error for a TrainingError
 
@@ -94,9 +95,10 @@ def train(
       quiet: print nothing.
 
     Raises SettingsError for invalid settings, TypeError for an argument of another type, TrainingError if a process
-    failed.
+    failed, RuntimeError if the module of the environment calls it while it is imported.
     """
     started = time.monotonic()
+    refuse_while_imported("daedalus.train")
     preset = str(preset) if isinstance(preset, Path) else preset
     _check_types(preset, env, callback, settings, processes)
     log = (log,) if isinstance(log, str) else log

@@ -7,8 +7,10 @@ of this process allows it.
 import importlib
 import os
 import sys
+import threading
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -62,8 +64,11 @@ class UserModules:
             raise UserModuleError(f"{setting}={value}: {_of_file(Path(name), value.rpartition(':')[2])}")
         if os.getcwd() not in sys.path:  # at the end: an installed package has precedence
             sys.path.append(os.getcwd())
+        if name == "__main__":
+            raise UserModuleError(f"{setting}={value}: name the module of the file, without .py, in place of __main__")
         try:
-            return importlib.import_module(name)
+            with _imported(name):
+                return importlib.import_module(name)
         except ImportError as error:
             raise UserModuleError(f"{setting}={value}: {_import_failure(name, error)}") from error
         except SystemExit as error:  # such as a script that reads its command line
@@ -84,6 +89,25 @@ class UserModules:
 
 
 NO_MODULES = UserModules()
+_importing = threading.local()
+
+
+@contextmanager
+def _imported(name: str) -> Iterator[None]:
+    before, _importing.name = getattr(_importing, "name", ""), name
+    try:
+        yield
+    finally:
+        _importing.name = before
+
+
+def refuse_while_imported(function: str) -> None:
+    """Raise RuntimeError if this thread imports a module of the user: `function` starts processes that do, too."""
+    if name := getattr(_importing, "name", ""):
+        raise RuntimeError(
+            f"{function} is called while {name} is imported, which the processes of the run do, too: "
+            'put the call under `if __name__ == "__main__":`'
+        )
 
 
 def shown_path(path: str) -> str:

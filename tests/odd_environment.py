@@ -75,9 +75,16 @@ class Vector(VectorEnv[Any, Any, Any]):
             raise ValueError("no such vector")
         ended = self._steps == 3
         info = {"score": self._steps * 10 + np.arange(self.num_envs), "_score": ended.astype(kind)}
-        return self._observe(), (self._steps > 0) * 1.0, ended.astype(kind), np.zeros(self.num_envs, kind), info
+        rewards = (self._steps > 0) * 1.0
+        odd: dict[str, Any] = {"reward column": rewards[:, None], "one reward": 1.0, "text": "ten"}
+        rewards = odd.get(self._oddity, rewards)
+        info = None if self._oddity == "no info" else info
+        return self._observe(), rewards, ended.astype(kind), np.zeros(self.num_envs, kind), info
 
     def _observe(self) -> Any:
+        if self._oddity in ("complex", "fewer rows", "nan"):
+            odd = {"complex": np.full((self.num_envs, 2), 0.7 + 0.7j), "fewer rows": np.zeros((1, 2), np.float32)}
+            return odd.get(self._oddity, np.full((self.num_envs, 2), np.nan, np.float32))
         return np.repeat(self._steps[:, None] / 3, self._size, axis=1).astype(np.float32)
 
 

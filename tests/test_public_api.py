@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import pytest
-from processes import Running, processes_mentioning, until
+from processes import LIMIT, Running, processes_mentioning, until
 from recorded_runs import record
 from saved_runs import CARTPOLE, COUNTING, save
 
@@ -191,6 +191,23 @@ def test_objects_of_other_types_are_refused(arguments: dict, message: str, tmp_p
         daedalus.train(**arguments, run_dir=tmp_path / "run")
     assert str(refused.value).startswith(message)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_script_without_a_guard_is_reported(tmp_path: Path) -> None:
+    """The process that checks the environment would import the script, train, start another one, and so on."""
+    (tmp_path / "mine_unguarded.py").write_text(
+        "import daedalus, gymnasium\n"
+        "from gymnasium.envs.classic_control import CartPoleEnv\n"
+        "gymnasium.register('Mine-v0', CartPoleEnv)\n"
+        "daedalus.train(env='mine_unguarded:Mine-v0', env_steps=1000)\n"
+    )
+    command = [sys.executable, "mine_unguarded.py"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert ended.returncode == 1
+    assert (
+        "daedalus.train is called while mine_unguarded is imported, which the processes of the run do" in ended.stderr
+    )
+    assert 'put the call under `if __name__ == "__main__":`' in ended.stderr
 
 
 def test_ctrl_c_ends_the_processes_with_a_checkpoint(tmp_path: Path) -> None:

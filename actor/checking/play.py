@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.report import EnvironmentReport
@@ -176,11 +177,15 @@ class _Play:
         self._reset_seconds += time.monotonic() - began
         self._resets += 1
         self._add(reset_violations(self._observation_space, result))
+        if self._resets == 1:
+            self._batch("observation", self._environment.observation_space, result[0])
         self._observe(result[0], result[1], over=False)
 
     def _step(self) -> tuple[float, bool]:
         """Take one random step, and return its reward and whether the episode is over."""
         action = self._transforms.env_action(self._random_actions.choose(self._masks))
+        if not self._env_steps:
+            self._batch("action", self._environment.action_space, action)
         began, busy = time.monotonic(), time.process_time()
         result = self._call("step", action)
         self._busy_seconds += time.process_time() - busy
@@ -192,6 +197,18 @@ class _Play:
         over = bool(terminated or truncated)
         self._observe(observation, info, over=over)
         return float(reward), over
+
+    def _batch(self, kind: str, space: gymnasium.Space, value: Any) -> None:
+        """Raise _ProblemError if gymnasium cannot make a batch of values of a space, or take it apart, as actors do."""
+        try:
+            batch = concatenate(space, [value, value], create_empty_array(space, n=2))
+            for _ in iterate(batch_space(space, 2), batch):
+                pass
+        except Exception as error:  # broad: a value that does not fit, or a space of a class of its own
+            raise _ProblemError(
+                f"gymnasium cannot make a batch of the {kind}s, as actors do ({first_line(error)}): let each part of "
+                f"{kind}_space have the shape and the dtype of its values"
+            ) from None
 
     def _observe(self, observation: Any, info: dict[str, Any], *, over: bool) -> None:
         """Take the masks of the next action. Raise _ProblemError if the run could not use the observation or them."""

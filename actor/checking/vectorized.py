@@ -3,11 +3,15 @@
 import time
 
 import numpy as np
+from gymnasium.vector.utils import batch_space, iterate
 
 from daedalus.actor.checking.random_actions import RandomActions
+from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import uses_vector_entry_point
-from daedalus.actor.environments.make import make_environments
+from daedalus.actor.environments.leaves import without
+from daedalus.actor.environments.make import make_bare, make_environments
+from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import Spaces
 from daedalus.protocol.spec import EnvironmentSpec
@@ -27,6 +31,8 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
     try:
         if not uses_vector_entry_point(spec, modules):
             return ""
+        if problem := _observations_problem(spec, modules, seed):
+            return f"environment {spec.id}: {problem} (training uses its vector entry point)"
         environments = make_environments(spec, _COUNT, modules=modules)
         try:
             if environments.spaces != spaces:
@@ -45,6 +51,24 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
     except EnvironmentSetupError as error:
         return f"{error} (training uses its vector entry point)"
     return ""
+
+
+def _observations_problem(spec: EnvironmentSpec, modules: UserModules, seed: int) -> str:
+    """Return what makes the first observations differ from their space, or an empty string."""
+    environments, _ = make_bare(spec, _COUNT, modules)
+    try:
+        space = without(environments.observation_space, spec.leave_out)
+        observations = environments.reset(seed)
+        try:
+            rows = list(iterate(batch_space(environments.observation_space, _COUNT), observations))
+        except Exception as error:  # broad: they may be anything
+            return f"reset returns observations that are no batch of observation_space ({first_line(error)})"
+        if len(rows) != _COUNT:
+            return f"reset returns {len(rows)} observations for {_COUNT} environments"
+        found = (violation for row in rows for violation in observation_violations(space, row, "reset"))
+        return next((text for kind, text in found if kind == "problem"), "")
+    finally:
+        environments.close()
 
 
 def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -61,7 +61,7 @@ class GymnasiumEnvironments:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
             raise self._failure("reset", error) from error
-        self.action_mask = info.get(MASK_KEY)
+        self.action_mask = self._checked_info("reset", info).get(MASK_KEY)
         return observations
 
     def step(self, actions: Any) -> BackendStep:
@@ -72,11 +72,35 @@ class GymnasiumEnvironments:
             raise
         except (Exception, SystemExit) as error:  # of the user's code
             raise self._failure("step", error) from error
-        self.action_mask = info.get(MASK_KEY)
-        terminated, truncated = np.asarray(terminated, np.bool_), np.asarray(truncated, np.bool_)
+        self.action_mask = self._checked_info("step", info).get(MASK_KEY)
+        rewards = self._one_each("rewards", rewards, np.float64)
+        terminated = self._one_each("terminated", terminated, np.bool_)
+        truncated = self._one_each("truncated", truncated, np.bool_)
         if info:
             self._episode_info.add(info, terminated | truncated)
         return observations, rewards, terminated, truncated
+
+    def _checked_info(self, call: str, info: Any) -> dict[str, Any]:
+        if not isinstance(info, dict):
+            raise EnvironmentSetupError(
+                f"environment {self._name}: {call} returns info of type {type(info).__name__}: it must be a dict"
+            )
+        return info
+
+    def _one_each(self, what: str, values: Any, dtype: type) -> np.ndarray:
+        """Return one value of each environment [E]; `values` may have further axes of size 1."""
+        try:
+            array = np.asarray(values, dtype)
+        except (TypeError, ValueError):
+            array = np.zeros(0)
+        if array.shape == (self.count,):
+            return array
+        if array.size != self.count:
+            raise EnvironmentSetupError(
+                f"environment {self._name}: step returns {what} of shape {np.shape(values)}, but it must be one "
+                f"{'number' if dtype is np.float64 else 'bool'} for each of the {self.count} environments"
+            )
+        return array.reshape(self.count)
 
     def _first_mask(self, environment: SyncVectorEnv) -> Any:
         """Reset the first environment, and return its mask with a first axis of 1, or None without masks."""

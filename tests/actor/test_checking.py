@@ -1,13 +1,14 @@
 """actor/checking: what is found in environments with faults, and in good ones."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 import pytest
 from allowed_modules import TEST_MODULES
 from building import run_spec
-from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
 from gymnasium.wrappers import NormalizeObservation
 from plain import plain_spaces
 
@@ -81,6 +82,40 @@ def test_what_does_not_stop_training_is_a_warning_given_once() -> None:
     assert not report.problems
     (flag,) = check("flag").warnings
     assert "step returns terminated=0, of type int: it must be a bool" in flag
+
+
+class Batched(gymnasium.Env):
+    """An environment of any two spaces, whose values are of another dtype, or cannot be batched."""
+
+    def __init__(self, observations: gymnasium.Space, actions: gymnasium.Space, observation: Any) -> None:
+        self.observation_space, self.action_space, self._observation = observations, actions, observation
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self._observation, {}
+
+    def step(self, action: Any) -> Any:
+        return self._observation, 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "observation", "kind"),
+    [
+        (MultiBinary(4), Discrete(2), np.zeros(4), "observation"),
+        (Box(-1, 1, (1,)), Dict(a=Discrete(2), b=Dict()), np.zeros(1), "action"),
+    ],
+)
+def test_what_an_actor_cannot_batch_is_a_problem(
+    observations: gymnasium.Space,
+    actions: gymnasium.Space,
+    observation: Any,
+    kind: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One environment alone can be played."""
+    registered = EnvSpec("Batched-v0", lambda: Batched(observations, actions, observation), disable_env_checker=True)
+    monkeypatch.setitem(gymnasium.registry, "Batched-v0", registered)
+    (problem,) = check_environment(EnvironmentSpec(id="Batched-v0"), MODULES, seconds=60.0, env_steps=3).problems
+    assert problem.startswith(f"environment Batched-v0: gymnasium cannot make a batch of the {kind}s, as actors do (")
 
 
 def test_a_good_environment_is_measured() -> None:

@@ -39,13 +39,14 @@ class First(PlainPolicy):
         return np.zeros(len(observations), np.int64), np.zeros(len(observations), np.float32), state
 
 
-@pytest.mark.parametrize("flags", ["", "int flags", "float flags"])
-def test_flags_of_a_vector_environment_may_be_numbers(flags: str) -> None:
+@pytest.mark.parametrize("flags", ["", "int flags", "float flags", "reward column"])
+def test_flags_of_a_vector_environment_may_be_numbers_and_rewards_a_column(flags: str) -> None:
     checked = spec("OddVector-v0", oddity=flags)
     assert problems(checked) == ()
     rollout = collect(started_collector(checked, First(), count=2, rollout_length=8, modules=MODULES))
     assert rollout.terminated.tolist() == [[row in (2, 6)] * 2 for row in range(8)]
     assert rollout.terminated.dtype == np.bool_
+    np.testing.assert_array_equal(rollout.rewards, [[float(row % 4 != 3)] * 2 for row in range(8)])
     np.testing.assert_array_equal(rollout.episode_lengths, [3] * 4)
     np.testing.assert_array_equal(rollout.episode_info["score"], [30.0, 31.0] * 2)
 
@@ -57,6 +58,12 @@ def test_flags_of_a_vector_environment_may_be_numbers(flags: str) -> None:
         ("autoreset", "its vector entry point must use gymnasium's AutoresetMode.NEXT_STEP"),
         ("step", "step raises ValueError: no such vector"),
         ("space", "its vector entry point has "),
+        ("one reward", r"step returns rewards of shape (), but it must be one number for each of the 2 environments"),
+        ("text", "step returns rewards of shape (), but it must be one number"),
+        ("no info", "step returns info of type NoneType: it must be a dict"),
+        ("complex", "reset returns an observation of type ndarray, which is not an array of numbers"),
+        ("fewer rows", "reset returns 1 observations for 2 environments"),
+        ("nan", "reset returns an observation with the value nan at index 0: it must be finite"),
     ],
 )
 def test_faults_of_a_vector_entry_point_are_found_by_the_check(oddity: str, text: str) -> None:

@@ -57,6 +57,7 @@ def failure(value: str) -> str:
 
 def test_a_missing_module_or_name_is_reported(tmp_path: Path) -> None:
     (tmp_path / "mine_without_it.py").write_text("")
+    assert failure("__main__:f") == "name the module of the file, without .py, in place of __main__"
     (tmp_path / "mine_that_ends.py").write_text("import argparse; argparse.ArgumentParser().parse_args(['--wrong'])")
     assert failure("mine_that_ends:f").startswith("mine_that_ends ends the process when it is imported: begin what it")
     assert failure("mine_that_is_absent:f").endswith("install it, or start in the folder of mine_that_is_absent.py")
