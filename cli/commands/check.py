@@ -163,6 +163,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
         return "", ""
     from daedalus.algorithms.errors import AlgorithmError
     from daedalus.algorithms.gradients import GradientComputer
+    from daedalus.policy.acting.program import export_program
     from daedalus.policy.network.actor_critic import ActorCritic
     from daedalus.policy.network.encoders import encoder_names
     from daedalus.policy.network.errors import NetworkError
@@ -170,6 +171,7 @@ def _network(spec: RunSpec, spaces: Spaces | None, modules: UserModules) -> tupl
     try:
         network = ActorCritic(spec.policy, spaces, modules, spec.training)
         GradientComputer(spec.training, network, spaces, modules)  # tries an own algorithm
+        export_program(network, spaces)
     except (AlgorithmError, NetworkError) as error:
         return "", str(error)
     memory = "" if spec.policy.memory == "none" else f", memory {spec.policy.memory}"

@@ -112,8 +112,9 @@ def test_what_an_actor_cannot_batch_is_a_problem(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One environment alone can be played."""
-    registered = EnvSpec("Batched-v0", lambda: Batched(observations, actions, observation), disable_env_checker=True)
-    monkeypatch.setitem(gymnasium.registry, "Batched-v0", registered)
+    monkeypatch.setitem(gymnasium.registry, "Batched-v0", EnvSpec("Batched-v0", disable_env_checker=True))
+    made: Any = lambda: Batched(observations, actions, observation)  # noqa: E731 - of any type
+    gymnasium.registry["Batched-v0"].entry_point = made
     (problem,) = check_environment(EnvironmentSpec(id="Batched-v0"), MODULES, seconds=60.0, env_steps=3).problems
     assert problem.startswith(f"environment Batched-v0: gymnasium cannot make a batch of the {kind}s, as actors do (")
 

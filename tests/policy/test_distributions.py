@@ -1,7 +1,9 @@
 """Each distribution against torch's own, against the frequencies of its samples, and exported against torch."""
 
 import math
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from daedalus.policy.network.distributions.gaussian import Gaussian, SquashedGau
 from daedalus.policy.network.distributions.kumaraswamy import Kumaraswamy
 from daedalus.policy.network.distributions.mixture import GaussianMixture
 from daedalus.policy.network.errors import NetworkError
+from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import ArraySpace, ContinuousSpace, DiscreteSpace, Spaces
 from daedalus.protocol.spec import PolicySpec
 
@@ -327,3 +330,70 @@ def test_bounded_distribution_refuses_unbounded_actions(name: str) -> None:
         NetworkError, match=rf"policy.distribution={name} needs bounded actions, but 'arm' is .*gaussian"
     ):
         ActorCritic(PolicySpec(distribution=name), spaces)
+
+
+# ------------------------------------------------------------------------------------------ of the user's own
+
+OWN = """
+import torch
+from daedalus.policy.network.distributions.distribution import Distribution
+
+
+class Own(Distribution):
+    def __init__(self, space):
+        super().__init__()
+        self.parameter_count = self.normal_count = space.size
+
+    def sample(self, parameters, uniform, normal):
+        return {sample}
+
+    def log_prob(self, parameters, actions):
+        return {log_prob}
+
+    def entropy(self, parameters):
+        return {entropy}
+"""
+GOOD = {
+    "sample": "parameters + normal",
+    "log_prob": "-((actions - parameters) ** 2).sum(-1) / 2",
+    "entropy": "torch.zeros_like(parameters[..., 0])",
+}
+
+
+def own_distribution(folder: Path, monkeypatch: pytest.MonkeyPatch, **parts: str) -> ActorCritic:
+    """Return a network with a distribution of the user's own, some of whose functions are others than GOOD's."""
+    (folder / "mine_distribution.py").write_text(OWN.format(**GOOD | parts))
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "mine_distribution", raising=False)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    modules = UserModules(frozenset({"mine_distribution"}))
+    spaces = Spaces(observations={"seen": ArraySpace(shape=(4,), dtype="float32")}, actions={"arm": BOX})
+    return ActorCritic(PolicySpec(distribution="mine_distribution:Own"), spaces, modules)
+
+
+def test_own_distribution_is_the_policys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert type(own_distribution(tmp_path, monkeypatch).distribution.components[0]).__name__ == "Own"
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"sample": "(parameters + normal)[:, :1]"}, r"sample returns \(2, 1\) for two rows: it must be .* \(2, 3\)"),
+        (
+            {"log_prob": "-((actions - parameters) ** 2)"},
+            r"log_prob returns \(2, 3\) for two rows: it must be .* \(2,\)",
+        ),
+        ({"entropy": "torch.tensor(1.0)"}, r"entropy returns \(\) for two rows"),
+        ({"entropy": "1.0"}, "entropy returns float for two rows"),
+        ({"log_prob": "(parameters / 0).sum(-1)"}, "log_prob of parameters that are all 0 is not finite: nan"),
+        ({"sample": "parameters.missing"}, "AttributeError: 'Tensor' object has no attribute 'missing'"),
+    ],
+)
+def test_fault_of_an_own_distribution_is_one_line(
+    parts: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise it would be a traceback of the learner, or an error of every actor."""
+    with pytest.raises(NetworkError, match=f"^policy.distribution=mine_distribution:Own.*{message}") as caught:
+        own_distribution(tmp_path, monkeypatch, **parts)
+    assert "\n" not in str(caught.value)

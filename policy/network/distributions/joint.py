@@ -131,6 +131,7 @@ def _custom(reference: str, name: str, space: ContinuousSpace, modules: UserModu
         counts = (distribution.parameter_count, distribution.uniform_count, distribution.normal_count)
         if not all(isinstance(count, int) and count >= 0 for count in counts) or not counts[0]:
             raise NetworkError(f"has counts {counts}: parameter_count must be at least 1, the others at least 0")
+        _try(distribution, space)
     except UserModuleError as error:
         raise NetworkError(str(error)) from error.__cause__
     except NetworkError as error:
@@ -138,3 +139,22 @@ def _custom(reference: str, name: str, space: ContinuousSpace, modules: UserModu
     except Exception as error:  # the user's code may raise anything
         raise NetworkError(f"policy.distribution={reference}: {first_line(error)}{place_of(error)}") from error
     return distribution
+
+
+def _try(distribution: Distribution, space: ContinuousSpace) -> None:
+    """Call the functions of a user's distribution with two rows. Raises NetworkError, and whatever they raise."""
+    parameters = torch.zeros((2, distribution.parameter_count))
+    uniform = torch.full((2, distribution.uniform_count), 0.5)
+    with torch.no_grad():
+        actions = distribution.sample(parameters, uniform, torch.zeros((2, distribution.normal_count)))
+        results = {
+            "sample": (actions, (2, space.size)),
+            "log_prob": (distribution.log_prob(parameters, actions), (2,)),
+            "entropy": (distribution.entropy(parameters), (2,)),
+        }
+    for name, (values, shape) in results.items():
+        if not isinstance(values, Tensor) or values.shape != shape:
+            found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+            raise NetworkError(f"{name} returns {found} for two rows: it must be a tensor of shape {shape}")
+        if not values.isfinite().all():
+            raise NetworkError(f"{name} of parameters that are all 0 is not finite: {values.flatten()[0]:g}")
