@@ -176,6 +176,7 @@ def _report(check: EnvironmentCheck, writing: int) -> None:
     """Check the environment, and write the report to a descriptor."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # the parent reports Ctrl-C
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    threading.excepthook = threading.__excepthook__  # a fork has the parent's, which ends the process
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(int(check.most_seconds) + _ALARM_SECONDS)
     if check.shown:

@@ -295,17 +295,20 @@ def _is_unread(stream: TextIO) -> bool:
     return bool(poll.poll(0))  # of errors and closed ends alone
 
 
-def exit_on_thread_exceptions() -> None:
+def exit_on_thread_exceptions(*, plays: bool = False) -> None:
     """Make an exception in any thread end the process with status 1, with its traceback on standard error.
 
     An exception that no thread handles is a fault of ours. Without this hook only its thread would end and the process
-    would idle; with it a supervisor restarts the process. In a thread that an environment has started for itself it
-    only ends the thread, as in every other program. Call this at the start of a command.
+    would idle; with it a supervisor restarts the process. Call this at the start of a command.
+
+    Args:
+      plays: the process plays environments. In a thread that one has started for itself, an exception ends only the
+        thread, as in every other program.
     """
 
     def end_process(arguments: threading.ExceptHookArgs) -> None:
         name = arguments.thread.name if arguments.thread else "unknown"
-        if _is_of_user(arguments.exc_value):
+        if plays and _is_of_user(arguments.exc_value):
             threading.__excepthook__(arguments)
             return
 

@@ -81,5 +81,5 @@ def _serve_run(
 
 
 if __name__ == "__main__":
-    exit_on_thread_exceptions()
+    exit_on_thread_exceptions(plays=True)
     sys.exit(exit_status(main))

@@ -160,5 +160,5 @@ def _reserved_stdout() -> BinaryIO:
 
 
 if __name__ == "__main__":
-    exit_on_thread_exceptions()
+    exit_on_thread_exceptions(plays=True)
     sys.exit(exit_status(lambda: main(_reserved_stdout())))

@@ -269,7 +269,7 @@ def _text(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    exit_on_thread_exceptions()
+    exit_on_thread_exceptions(plays=True)
     open_standard_streams()  # before descriptors are opened
     stopped, result = stop_on_signals(exit_if_stuck=True), _reserved_stdout()
     sys.exit(exit_status(lambda: main(stop=stopped, output=result), result))

@@ -95,7 +95,7 @@ def test_an_exception_in_a_thread_of_an_environment_ends_only_the_thread(tmp_pat
     done = ended(
         "import threading, simulator\n"
         "from daedalus.cli.processes import exit_on_thread_exceptions\n"
-        "exit_on_thread_exceptions()\n"
+        "exit_on_thread_exceptions(plays=True)\n"
         "thread = threading.Thread(target=simulator.listen)\n"
         "thread.start()\n"
         "thread.join()\n"
