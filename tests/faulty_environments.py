@@ -86,6 +86,9 @@ class Faulty(gymnasium.Env[Any, Any]):
         return result[:4] if self._fault == "values" else result
 
     def close(self) -> None:
+        if self._fault == "child process":
+            self._child.terminate()
+            self._child.join()
         if self._fault in ("close", "close alone") and self._step:
             time.sleep(3600)
 
