@@ -308,7 +308,7 @@ def exit_on_thread_exceptions(*, plays: bool = False) -> None:
 
     def end_process(arguments: threading.ExceptHookArgs) -> None:
         name = arguments.thread.name if arguments.thread else "unknown"
-        if plays and _is_of_user(arguments.exc_value):
+        if plays and _is_of_environment(arguments.exc_value):
             threading.__excepthook__(arguments)
             return
 
@@ -325,8 +325,8 @@ def exit_on_thread_exceptions(*, plays: bool = False) -> None:
     threading.excepthook = end_process
 
 
-def _is_of_user(error: BaseException | None) -> bool:
-    """Return whether an exception was raised by the user's code without a function of ours below it."""
+def _is_of_environment(error: BaseException | None) -> bool:
+    """Return whether an exception was raised in a thread of an environment: no function of ours has called it."""
     names = [frame.tb_frame.f_globals.get("__name__", "") for frame in frames_of(error)]
     ours = any(name == "__main__" or name.partition(".")[0] == "daedalus" for name in names)
     return not ours and any(is_of_user(frame) for frame in frames_of(error))

@@ -9,8 +9,10 @@ from daedalus.actor.checking.random_actions import RandomActions
 from daedalus.actor.checking.violations import observation_violations
 from daedalus.actor.environments.environment_errors import EnvironmentSetupError
 from daedalus.actor.environments.gymnasium_backend import uses_vector_entry_point
+from daedalus.actor.environments.interface import BackendEnvironments
 from daedalus.actor.environments.leaves import without
-from daedalus.actor.environments.make import make_bare, make_environments
+from daedalus.actor.environments.make import make_bare
+from daedalus.actor.environments.transforms import TransformedEnvironment
 from daedalus.policy.user_code import first_line
 from daedalus.policy.user_modules import UserModules
 from daedalus.protocol.spaces import Spaces
@@ -31,10 +33,11 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
     try:
         if not uses_vector_entry_point(spec, modules):
             return ""
-        if problem := _observations_problem(spec, modules, seed):
-            return f"environment {spec.id}: {problem} (training uses its vector entry point)"
-        environments = make_environments(spec, _COUNT, modules=modules)
+        bare, rest = make_bare(spec, _COUNT, modules)
         try:
+            if problem := _observations_problem(bare, spec, seed):
+                return f"environment {spec.id}: {problem} (training uses its vector entry point)"
+            environments = TransformedEnvironment(bare, rest)
             if environments.spaces != spaces:
                 return (
                     f"environment {spec.id}: its vector entry point has {environments.spaces}, "
@@ -47,28 +50,24 @@ def vectorized_problem(spec: EnvironmentSpec, modules: UserModules, spaces: Spac
                 if time.monotonic() > until:
                     break
         finally:
-            environments.close()
+            bare.close()
     except EnvironmentSetupError as error:
         return f"{error} (training uses its vector entry point)"
     return ""
 
 
-def _observations_problem(spec: EnvironmentSpec, modules: UserModules, seed: int) -> str:
+def _observations_problem(environments: BackendEnvironments, spec: EnvironmentSpec, seed: int) -> str:
     """Return what makes the first observations differ from their space, or an empty string."""
-    environments, _ = make_bare(spec, _COUNT, modules)
+    space = without(environments.observation_space, spec.leave_out)
+    observations = environments.reset(seed)
     try:
-        space = without(environments.observation_space, spec.leave_out)
-        observations = environments.reset(seed)
-        try:
-            rows = list(iterate(batch_space(environments.observation_space, _COUNT), observations))
-        except Exception as error:  # broad: they may be anything
-            return f"reset returns observations that are no batch of observation_space ({first_line(error)})"
-        if len(rows) != _COUNT:
-            return f"reset returns {len(rows)} observations for {_COUNT} environments"
-        found = (violation for row in rows for violation in observation_violations(space, row, "reset"))
-        return next((text for kind, text in found if kind == "problem"), "")
-    finally:
-        environments.close()
+        rows = list(iterate(batch_space(environments.observation_space, _COUNT), observations))
+    except Exception as error:  # broad: they may be anything
+        return f"reset returns observations that are no batch of observation_space ({first_line(error)})"
+    if len(rows) != _COUNT:
+        return f"reset returns {len(rows)} observations for {_COUNT} environments"
+    found = (violation for row in rows for violation in observation_violations(space, row, "reset"))
+    return next((text for kind, text in found if kind == "problem"), "")
 
 
 def _chosen(random: RandomActions, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

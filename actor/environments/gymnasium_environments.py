@@ -33,8 +33,8 @@ class GymnasiumEnvironments:
         Args:
           environment: the vector environment.
           name: its id, for errors.
-          leave_out: components of the observation that nobody reads: what is wrong with them is no error.
-          has_choices: whether some actions are choices, which may have masks; see `has_choices`.
+          leave_out: components of the observation that nobody reads: a value outside their space is no error.
+          has_choices: whether some actions are choices, which may have masks.
 
         Raises EnvironmentSetupError if an environment raises an exception, as `reset` and `step` do, or has no such
         component to leave out.
