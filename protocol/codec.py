@@ -34,7 +34,7 @@ from daedalus.protocol.messages import CompactSnapshot, Message, Origin, Program
 from daedalus.protocol.texts import bounded_text
 from daedalus.protocol.uploads import Gradient, Rollout
 
-PROTOCOL_VERSION = 10
+PROTOCOL_VERSION = 11
 
 _MAGIC = b"DAED"
 _PREFIX = struct.Struct("<4sHHI")

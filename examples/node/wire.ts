@@ -8,7 +8,7 @@
 import { decode as unpack, encode as pack } from "@msgpack/msgpack";
 import { constants, zstdCompressSync, zstdDecompressSync } from "node:zlib";
 
-export const PROTOCOL_VERSION = 10;
+export const PROTOCOL_VERSION = 11;
 export const MAX_BODY_BYTES = 2 ** 30; // of messages from the learner: weights may be large
 
 const MAGIC = 0x44454144; // "DAED" as a little-endian number

@@ -1,7 +1,7 @@
 """One fixed message of every kind; their bytes are in golden/v{PROTOCOL_VERSION}/.
 
 A change of the wire shows as other bytes. One that is meant raises PROTOCOL_VERSION, and `PYTHONPATH=. python
-tests/protocol/golden.py` writes the bytes of the new version; those of the old ones stay.
+tests/protocol/golden.py` writes the bytes of the new version. Those of a tagged release stay; others are deleted.
 """
 
 from pathlib import Path
