@@ -177,7 +177,7 @@ def test_threads_may_encode_and_decode_concurrently() -> None:
 # --------------------------------------------------------------------------------- the layout, golden
 
 
-def test_bytes_of_version_10_are_as_documented() -> None:
+def test_bytes_of_version_11_are_as_documented() -> None:
     header = msgpack.packb(
         {
             "kind": "Snapshot",
@@ -189,14 +189,14 @@ def test_bytes_of_version_10_are_as_documented() -> None:
     assert header is not None
     padding = bytes(-(12 + len(header)) % 8)
     body = struct.pack("<4f", 1, 2, 3, 4) + bytes([1, 2, 3]) + bytes(5)
-    expected = b"DAED" + struct.pack("<H", 10) + struct.pack("<H", 0) + struct.pack("<I", len(header))
+    expected = b"DAED" + struct.pack("<H", 11) + struct.pack("<H", 0) + struct.pack("<I", len(header))
     assert encode(SNAPSHOT) == expected + header + padding + body
 
 
 def test_prefix_can_be_read_with_struct() -> None:
     data = SAMPLES["rollout"]
     magic, version, flags, length = struct.unpack_from("<4sHHI", data)
-    assert (magic, version, flags) == (b"DAED", 10, 1)
+    assert (magic, version, flags) == (b"DAED", 11, 1)
     content = msgpack.unpackb(data[12 : 12 + length])
     assert list(content) == ["kind", "fields", "arrays", "size"]
     assert content["kind"] == "Rollout"
