@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs check format clean
+.PHONY: train test test-trackio test-compose examples screenshots attack fuzz mutants docs check format lock clean
 
 train: .venv/ready-train
 	$(BIN)/daedalus train cartpole
@@ -77,6 +77,19 @@ docs: .venv/ready-test
 .venv/ready-test: .venv/ready-train
 	$(PIP) -e ".[learner,plot,sweep,certs,box2d,mujoco,minigrid,envpool,atari,video,monitoring,wandb,mlflow,hub,gateway,browser,docs,dev]"
 	touch $@
+
+# Hashes of the packages of the images and of releases. torch and its requirements are left out: an index has the CPU
+# build or a CUDA build, with other requirements, under the same version.
+LOCK = $(BIN)/uv pip compile --quiet --python-version 3.11 -c constraints.txt --generate-hashes \
+	--no-annotate --custom-compile-command "make lock" --overrides build/without-torch.txt
+lock: .venv/ready-train
+	$(PIP) uv
+	mkdir -p build
+	echo "torch ; sys_platform == 'none'" >build/without-torch.txt
+	$(LOCK) pyproject.toml --extra box2d --extra monitoring -o deploy/requirements/actor.txt >/dev/null
+	$(LOCK) pyproject.toml --extra learner --extra plot --extra certs --extra monitoring --extra gateway --extra box2d \
+		-o deploy/requirements/learner.txt >/dev/null
+	printf 'build\nsetuptools\n' | $(LOCK) - -o deploy/requirements/build.txt >/dev/null
 
 clean:
 	rm -rf .venv build *.egg-info

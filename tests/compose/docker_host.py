@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import ssl
 import subprocess
@@ -15,7 +16,7 @@ from pathlib import Path
 from pip_configuration import for_image, options_of
 
 BASE = "daedalus-test-base"  # the name in override.yml
-_PYTHON = "python:3.11.14-slim-bookworm"  # the name in the Dockerfile
+(_PYTHON,) = re.findall(r"^ARG BASE=(\S+)$", (Path(__file__).parents[2] / "Dockerfile").read_text(), re.MULTILINE)
 _STAND_IN = "daedalus-test-debian"
 _STAND_IN_PACKAGES = "python3,python3-venv,python3-pip,ca-certificates"
 _LIMIT = 120.0  # seconds for a daemon to start

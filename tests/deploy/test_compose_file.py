@@ -1,16 +1,13 @@
 """Test of docker-compose.yml and the files that it mounts. `make test-compose` starts the containers."""
 
-import json
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-import zenoh
 from commands import check
-
-from daedalus.transport.zenoh_settings import Capacity, session_settings
 
 ROOT = Path(__file__).parents[2]
 SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
@@ -19,7 +16,7 @@ SERVICES: dict[str, dict[str, Any]] = yaml.safe_load((ROOT / "docker-compose.yml
 def test_the_build_context_holds_every_package() -> None:
     packages = {"daedalus", *(link.name for link in (ROOT / "daedalus").iterdir() if link.is_symlink())}
     kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    files = {"pyproject.toml", "constraints.txt", "README.md", "LICENSE", "MANIFEST.in"}
+    files = {"pyproject.toml", "constraints.txt", "deploy/requirements", "README.md", "LICENSE", "MANIFEST.in"}
     assert packages | files == kept
 
 
@@ -29,7 +26,7 @@ def test_the_default_services_are_router_learner_and_actor() -> None:
     assert monitoring == {"exporter", "tensorboard", "prometheus", "grafana"}
 
 
-@pytest.mark.parametrize("name", ["learner", "actor", "exporter"])
+@pytest.mark.parametrize("name", ["router", "learner", "actor", "exporter"])
 def test_the_command_of_each_service_is_valid(name: str) -> None:
     assert check(SERVICES[name]["command"]) == name
 
@@ -56,7 +53,7 @@ def test_ports_are_open_on_the_loopback_address_only() -> None:
 
 def test_each_mounted_file_exists() -> None:
     mounts = [mount for service in SERVICES.values() for mount in service.get("volumes", []) if mount.startswith("./")]
-    assert len(mounts) == 5
+    assert len(mounts) == 4
     assert all((ROOT / mount.split(":")[0]).exists() for mount in mounts)
 
 
@@ -80,23 +77,31 @@ def test_each_container_is_limited() -> None:
         assert any(mount.startswith("/tmp:") for mount in service["tmpfs"]), name
 
 
-def test_images_of_others_are_pinned() -> None:
-    for service in SERVICES.values():
-        if not service["image"].startswith("daedalus-"):
-            assert re.search(r":v?\d+\.\d+\.\d+$|@sha256:[0-9a-f]{64}$", service["image"]), service["image"]
+def test_images_of_others_are_pinned_by_digest() -> None:
     (base,) = re.findall(r"^ARG BASE=(\S+)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
-    assert re.search(r":\d+\.\d+\.\d+-slim-\w+$", base)
-    assert f'_PYTHON = "{base}"' in (ROOT / "tests" / "compose" / "docker_host.py").read_text()
+    for image in [base, *(service["image"] for service in SERVICES.values())]:
+        if not image.startswith("daedalus-"):
+            assert re.search(r":[\w.-]+@sha256:[0-9a-f]{64}$", image), image
 
 
-def test_the_router_image_has_the_zenoh_version_of_the_constraints() -> None:
-    assert f"eclipse-zenoh=={SERVICES['router']['image'].split(':')[1]}\n" in (ROOT / "constraints.txt").read_text()
+@pytest.mark.parametrize("name", ["actor", "learner", "build"])
+def test_packages_of_images_have_hashes_and_the_versions_of_the_constraints(name: str) -> None:
+    text = (ROOT / "deploy" / "requirements" / f"{name}.txt").read_text()
+    locked = dict(re.findall(r"^([\w.-]+)==([^ ;\\]+)", text, re.MULTILINE))
+    constraints = (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
+    for package, version in locked.items():
+        assert f"{package}=={version}\n" in constraints
+    blocks = text.split("\n", 2)[2].replace(" \\\n    --hash", " --hash").splitlines()
+    assert len(blocks) == len(locked)
+    assert all(re.search(r" --hash=sha256:[0-9a-f]{64}", block) for block in blocks)
+    assert f"-r deploy/requirements/{name}.txt" in (ROOT / "Dockerfile").read_text()
 
 
-def test_zenoh_reads_the_configuration_of_the_router() -> None:
-    configuration = zenoh.Config.from_file(str(ROOT / "deploy" / "zenoh" / "router.json5"))
-    assert configuration.get_json("mode") == '"router"'
-    assert configuration.get_json("listen/endpoints") == '["tcp/0.0.0.0:7447"]'
-    settings = session_settings("router", [], [], {}, Capacity())
-    written = {path: json.loads(configuration.get_json(path)) for path in settings if path.startswith("transport/")}
-    assert written == {path: settings[path] for path in written}
+@pytest.mark.parametrize(("name", "extra"), [("actor", "monitoring"), ("learner", "learner")])
+def test_packages_of_images_are_all_that_the_project_requires(name: str, extra: str) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {
+        re.split(r"[<>=\[]", each)[0] for each in [*project["dependencies"], *project["optional-dependencies"][extra]]
+    }
+    text = (ROOT / "deploy" / "requirements" / f"{name}.txt").read_text()
+    assert required - {"torch"} <= set(re.findall(r"^([\w.-]+)==", text, re.MULTILINE))

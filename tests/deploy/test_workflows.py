@@ -60,7 +60,7 @@ def test_a_workflow_pins_its_actions_limits_its_jobs_and_needs_no_secret(path: P
     workflow = read(path.name)
     for step in steps(workflow):
         if "uses" in step:
-            assert re.fullmatch(r"[\w-]+/[\w-]+@(v|release/v)\d+", step["uses"])
+            assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", step["uses"])  # a tag can be moved
     assert all("timeout-minutes" in job for job in workflow["jobs"].values())
     assert workflow["permissions"] == {"contents": "read"}
     assert "secrets." not in path.read_text()
@@ -73,7 +73,7 @@ def test_only_the_job_that_publishes_has_an_identity_and_only_tags_start_it() ->
     permissions = {name: job.get("permissions", {}) for name, job in release["jobs"].items()}
     assert permissions == {"build": {}, "publish": {"id-token": "write"}}
     assert release["jobs"]["publish"]["needs"] == "build"
-    assert {"run": "python -m build"} in release["jobs"]["build"]["steps"]
+    assert {"run": "python -m build --no-isolation"} in release["jobs"]["build"]["steps"]
 
 
 def test_the_citation_names_the_version_and_the_licence_of_the_project() -> None:
