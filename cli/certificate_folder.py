@@ -1,6 +1,7 @@
 """The folder of `daedalus certs`: the CA, and one folder for each identity.
 
     ca/ca.pem, ca/key.pem            the CA that signs the certificates of learner and router
+    ca/gateway/ca.pem, key.pem       the CA that signs the certificates of gateways, for clients and browsers
     ca/actor-NAME/ca.pem, key.pem    the issuer of this actor's certificates; operators likewise
     ca/IDENTITY/certificate.pem      a copy of the certificate that was issued last
     learner/, router/, gateway/, actor-NAME/    what the process of this identity needs: see transport/credentials.py
@@ -8,7 +9,9 @@
 The tokens of a gateway's clients are in client_tokens.py.
 
 An issuer of its own for each client makes revocation possible: without the issuer in clients.pem, no listener accepts
-the certificate. The file needs the package `cryptography`.
+the certificate. A gateway has another CA than the learner: actors accept every certificate of the learner's CA that is
+valid for the host they connect to, so a gateway on that host could otherwise pass as the learner. The file needs the
+package `cryptography`.
 """
 
 import datetime
@@ -63,13 +66,14 @@ class CertificateFolder:
 
     @classmethod
     def create(cls, directory: Path, hosts: list[str], lifetime: datetime.timedelta) -> "CertificateFolder":
-        """Create a CA, and certificates for a learner, a router and the operator `operator`, in an empty folder."""
+        """Create the CAs, and certificates for learner, router and the operator `operator`, in an empty folder."""
         if directory.exists() and any(directory.iterdir()):
             raise CredentialsError(
                 f"{directory} is not empty: add certificates with `daedalus certs issue`, or name a new folder"
             )
         _check_hosts(hosts)
         CertificateAuthority.create(directory / "ca", "Daedalus CA", _CA_LIFETIME)
+        CertificateAuthority.create(directory / "ca" / "gateway", "Daedalus gateway CA", _CA_LIFETIME)
         made = cls(directory)
         made.issue([*map(Identity, _ZENOH_LISTENERS), Identity("operator", "operator")], lifetime, hosts)
         return made
@@ -95,13 +99,14 @@ class CertificateFolder:
         _check_number({*self.identities(), *identities})
         for identity in identities:
             record, folder = self.directory / "ca" / identity.folder, self.directory / identity.folder
-            if identity.role in LISTENERS:
-                authority, for_hosts = self._ca, self._hosts(identity, hosts)
+            if identity.role in _ZENOH_LISTENERS:
+                authority = self._ca
                 record.mkdir(exist_ok=True)
             else:
-                authority, for_hosts = self._issuer(record, identity), []
+                authority = self._issuer(record, identity)
+            for_hosts = self._hosts(identity, hosts) if identity.role in LISTENERS else []
             authority.issue(folder, identity.common_name, for_hosts, lifetime)
-            shutil.copyfile(self.directory / "ca" / CA, folder / CA)
+            shutil.copyfile((record if identity.role == "gateway" else self.directory / "ca") / CA, folder / CA)
             shutil.copyfile(folder / CERTIFICATE, record / CERTIFICATE)
         self._write_clients()
 
@@ -128,14 +133,18 @@ class CertificateFolder:
         return list(dict.fromkeys([*(hosts or []), *own, "localhost", "127.0.0.1", "::1"]))
 
     def _issuer(self, record: Path, identity: Identity) -> CertificateAuthority:
-        """Return the issuer of a client's certificates, which is created with the first certificate."""
+        """Return the issuer of a client's or gateway's certificates, which is created with the first certificate."""
         if (record / CA).exists():  # not where the creation was interrupted
             return CertificateAuthority(record)
         return CertificateAuthority.create(record, identity.common_name, _CA_LIFETIME)
 
     def _write_clients(self) -> None:
         """Write clients.pem for learner and router, and the configuration of a standard zenohd."""
-        issuers = sorted((self.directory / "ca").glob(f"*/{CA}"))
+        issuers = [
+            self.directory / "ca" / identity.folder / CA
+            for identity in sorted(self.identities())
+            if identity.role in CLIENT_ROLES
+        ]
         content = "".join(path.read_text("ascii") for path in (self.directory / "ca" / CA, *issuers))
         for role in _ZENOH_LISTENERS:
             if (self.directory / role).exists():

@@ -2,7 +2,7 @@
 
 ca/tokens.json         what is kept of each token: its digest and when it expires
 gateway/tokens.json    a copy for the gateway, which reads it again when it changes
-client-NAME/           token and ca.pem, for the client
+client-NAME/           token, and ca.pem of the gateways, for the client
 operator-NAME/         token, beside the operator's certificate
 """
 
@@ -42,7 +42,7 @@ class ClientTokens:
         for name in names:
             folder = self.directory / f"client-{name}"
             folder.mkdir(exist_ok=True)
-            shutil.copyfile(self.directory / "ca" / CA, folder / CA)
+            shutil.copyfile(self.directory / "ca" / "gateway" / CA, folder / CA)
         self._issue({name: f"client-{name}" for name in names}, days)
 
     def issue_operators(self, folders: dict[str, str], days: int) -> None:

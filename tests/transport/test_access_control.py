@@ -11,6 +11,7 @@ import pytest
 from certificates import issue_expired, make_certificates, unchecked
 from processes import free_address
 
+from daedalus.cli.commands.certs import certs
 from daedalus.protocol import keys
 from daedalus.transport.credentials import CredentialsError, load, with_remedy
 from daedalus.transport.interface import AddressInUseError, RefusedError, Transport, TransportError
@@ -271,6 +272,22 @@ def test_actor_certificate_cannot_be_used_by_a_learner(certificates: Path) -> No
     address, router = listen_somewhere(folder)
     with closing(router), pytest.raises(RefusedError, match="cannot be verified"):
         connect([address], load(certificates / "actor-box", "actor"))
+
+
+def test_gateway_certificate_is_neither_a_learners_nor_a_clients(certificates: Path) -> None:
+    """Not even on the learner's own host: gateways have another CA, which no actor and no listener trusts."""
+    assert certs(["issue", "gateway", "--directory", str(certificates)]) == 0
+    folder = certificates / "gateway"
+    with pytest.raises(CredentialsError, match="holds the certificate of gateway, but learner is required"):
+        load(folder, "learner")
+    shutil.copyfile(certificates / "router" / "clients.pem", folder / "clients.pem")
+    address, impostor = listen_somewhere(folder)
+    with closing(impostor), pytest.raises(RefusedError, match=r"cannot be verified: .*different CAs"):
+        connect([address], load(certificates / "actor-box", "actor"))
+    address, router = listen_somewhere(certificates / "router")
+    shutil.copyfile(certificates / "actor-box" / "ca.pem", folder / "ca.pem")
+    with closing(router), pytest.raises(RefusedError, match="refuses the certificate"):
+        connect([address], unchecked(folder, "gateway", ""))
 
 
 def test_host_missing_in_the_certificate_is_not_trusted(certificates: Path) -> None:
