@@ -17,8 +17,7 @@ from daedalus.cli.run_source import LearnerSource
 from daedalus.gateway.app import application
 from daedalus.gateway.config import GatewayConfig
 from daedalus.gateway.errors import ClientError
-from daedalus.gateway.gateway import JOIN_SECONDS, Gateway
-from daedalus.gateway.raw.endpoint import RawEndpoint
+from daedalus.gateway.gateway import Gateway
 from daedalus.gateway.security import LOOPBACK, guard
 from daedalus.gateway.server import Server, tls_context
 from daedalus.gateway.tokens import OperatorToken, Tokens
@@ -87,7 +86,6 @@ class GatewayService:
         certified = [] if settings.serving is None else _bracketed(settings.serving.hosts())
         names = [*LOOPBACK, *settings.hosts, *certified, socket.gethostname()]
         rules = guard(names, port, settings.origins, tokens, settings.operator_token)
-        raw = RawEndpoint(self._raw_transport, rules, self._config.actor_name)
         where, secure = f"{settings.shown_host}:{port}", "s" if tls else ""
         _logger.info("clients connect to ws%s://%s/actor", secure, where)
         if settings.announce is None:
@@ -95,13 +93,9 @@ class GatewayService:
         else:
             settings.announce(f"http{secure}://{where}/")
         tasks = [asyncio.create_task(self._await_stop()), asyncio.create_task(self._reach_network())]
-
-        async def close() -> None:
-            await asyncio.gather(raw.close(), self._close())
-
         try:
-            await Server(application(self._gateway, raw, rules, self._data), tls).run_until(
-                self._ended, listener, close
+            await Server(application(self._gateway, rules, self._data), tls).run_until(
+                self._ended, listener, self._close
             )
         finally:
             for task in tasks:
@@ -109,14 +103,6 @@ class GatewayService:
             await asyncio.to_thread(self._transports.close)
         if self._failures:
             raise self._failures[0]
-
-    def _raw_transport(self) -> Transport:
-        """Return the transport of one raw client. Waits for the network, on the thread of that client."""
-        settings = self._settings
-        transport = connect_with_retry(settings.connect, self._stop, JOIN_SECONDS, settings.credentials)
-        if transport is None:
-            raise TransportError("the gateway stops")
-        return transport
 
     def _fail(self, error: Exception) -> None:
         self._failures.append(error)

@@ -13,7 +13,6 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from daedalus.gateway.assets import Asset, read_assets
 from daedalus.gateway.connection import ClientConnection
 from daedalus.gateway.gateway import Gateway
-from daedalus.gateway.raw.endpoint import RawEndpoint
 from daedalus.gateway.security import HEADERS, Guard
 from daedalus.gateway.watching.page_data import PageData
 from daedalus.gateway.watching.viewer import ViewerConnection
@@ -21,7 +20,7 @@ from daedalus.gateway.watching.viewer import ViewerConnection
 Application = Callable[[Any, Any, Any], Awaitable[None]]
 
 
-def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Guard, data: PageData) -> Application:
+def application(gateway: "asyncio.Future[Gateway]", guard: Guard, data: PageData) -> Application:
     """Return the application: every request passes the guard first.
 
     `gateway` has its result when the network is reached; clients wait for it.
@@ -32,12 +31,6 @@ def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Gua
 
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             await ClientConnection(gateway, guard, scope, receive, send).serve()
-
-    class Raw:
-        """The WebSocket of one client that runs the policy itself."""
-
-        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-            await raw.serve(scope, receive, send)
 
     class Watch:
         """The WebSocket of one page."""
@@ -58,7 +51,6 @@ def application(gateway: "asyncio.Future[Gateway]", raw: RawEndpoint, guard: Gua
 
     routes: list[BaseRoute] = [
         WebSocketRoute("/actor", Actor()),
-        WebSocketRoute("/raw", Raw()),
         WebSocketRoute("/watch", Watch()),
         Route("/", run_page),
         Route("/play", play_page),

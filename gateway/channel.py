@@ -11,10 +11,6 @@ class Channel(Protocol):
         """Set the largest message, before memory is allocated for it."""
         ...
 
-    def become_stream(self, size: int) -> None:
-        """Set the largest message, and let the client wait for any time."""
-        ...
-
     def divert(self, on_message: Callable[[str | bytes], None], on_writable: Callable[[], None]) -> None:
         """Call functions from now on, in place of queueing messages, which costs a switch of tasks for each message.
 

@@ -26,7 +26,6 @@ _MAX_CONNECTIONS = 2048
 _MAX_NEWCOMERS = 128  # WebSockets that hold a large part of a first message
 _SMALL_HELLO_BYTES = 16 << 10
 _STOP_SECONDS = 2  # for connections to end after a stop
-_KEEP_ALIVE = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
 _QUEUED_MESSAGES = 8  # of one client, before reading pauses
 _MAX_FRAGMENTS = 4096  # of one message: the limit on its bytes does not count empty ones
 _REQUEST_SECONDS = 10.0  # from the connection, or the last answer, to the end of the next answer; and for a handshake
@@ -172,16 +171,6 @@ class OurWebSocket(WebSocketsSansIOProtocol):
     def limit(self, size: int) -> None:
         """See Channel."""
         self.conn.max_message_size = size
-
-    def become_stream(self, size: int) -> None:
-        """See Channel. TCP detects a host that vanished, in place of pings."""
-        self.limit(size)
-        self.stop_keepalive()
-        connection = self.transport.get_extra_info("socket")
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEP_ALIVE:
-            if hasattr(socket, name):
-                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def divert(self, on_message: Callable[[str | bytes], None], on_writable: Callable[[], None]) -> None:
         """See Channel."""
