@@ -54,6 +54,7 @@ class GatewaySettings:
     hosts: list[str] = field(default_factory=list)  # further names of this gateway
     origins: list[str] = field(default_factory=list)  # of pages that may connect
     operator_token: OperatorToken | None = None
+    takes_clients: bool = True  # or the page only
     other_runs: Callable[[], list[OtherRun]] = lambda: []
     camera: tuple[str, ...] | None = None  # command of the camera's process; None: no camera
     announce: Callable[[str], None] | None = None  # receives the address of the page, instead of the log
@@ -70,7 +71,7 @@ class GatewayService:
         self._gateway: asyncio.Future[Gateway] = self._loop.create_future()
         self._monitor: RunMonitor | None = None
         self._camera = None if settings.camera is None else CameraProcess(settings.camera)
-        self._data = PageData(settings.other_runs, self._camera)
+        self._data = PageData(settings.other_runs, self._camera, takes_clients=settings.takes_clients)
         self._transports = ExitStack()
         owner = settings.credentials.name if settings.credentials else ""
         name = f"{owner or 'gateway'}.gateway-{os.getpid()}"
@@ -85,9 +86,12 @@ class GatewayService:
         tls = None if settings.serving is None else tls_context(settings.serving.directory)
         certified = [] if settings.serving is None else _bracketed(settings.serving.hosts())
         names = [*LOOPBACK, *settings.hosts, *certified, socket.gethostname()]
-        rules = guard(names, port, settings.origins, tokens, settings.operator_token)
+        # Whoever reaches a plain TCP address may ask its learner for the status: the page may show it to everybody.
+        openly = settings.operator is None and all(address.startswith("tcp/") for address in settings.connect)
+        rules = guard(names, port, settings.origins, tokens, settings.operator_token, reads_openly=openly)
         where, secure = f"{settings.shown_host}:{port}", "s" if tls else ""
-        _logger.info("clients connect to ws%s://%s/actor", secure, where)
+        if settings.takes_clients:
+            _logger.info("clients connect to ws%s://%s/actor", secure, where)
         if settings.announce is None:
             _logger.info("the page of the run is at http%s://%s/", secure, where)
         else:

@@ -21,8 +21,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway.errors import ClientError
+from daedalus.gateway.places import Places
 from daedalus.gateway.tokens import TOKENS, OperatorToken, Tokens, digest
-from daedalus.gateway.watching import page_data
 from daedalus.gateway.watching.source import OtherRun
 from daedalus.transport.memory import MemoryNetwork
 
@@ -71,7 +71,7 @@ def gateway(network: MemoryNetwork, tmp_path: Path) -> Iterator[RunningGateway]:
 def watch(gateway: RunningGateway) -> Iterator[Watch]:
     with ExitStack() as stack:
 
-        def open_one(token: str = "", **options: Any) -> Viewer:
+        def open_one(token: str = TOKEN, **options: Any) -> Viewer:
             socket = connect(f"ws://127.0.0.1:{gateway.port}/watch", open_timeout=LIMIT, max_size=None, **options)
             viewer = Viewer(stack.enter_context(socket))
             viewer.send(type="hello", token=token)
@@ -100,7 +100,7 @@ def _lowered(headers: Message) -> dict[str, str]:
 
 def test_a_page_that_is_opened_before_there_is_a_learner_says_so(watch: Watch) -> None:
     viewer = watch()
-    assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False}
+    assert viewer.receive("hello") == {"type": "hello", "orders": True, "camera": False, "clients": True}
     assert viewer.receive("run") == {"type": "run", "state": "connecting", "reason": "", "status": None}
     # A page that was connected before may still show the actors and curves of another run.
     assert viewer.receive("actors")["rows"] == []
@@ -214,8 +214,19 @@ def test_first_message_must_be_a_hello(gateway: RunningGateway) -> None:
         assert viewer.closed() == 1008
 
 
-def test_viewers_are_limited(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_data, "MAX_VIEWERS", 1)
+@pytest.mark.parametrize("token", ["", "wrong"])
+def test_a_page_without_the_operators_token_reads_nothing(gateway: RunningGateway, watch: Watch, token: str) -> None:
+    noted: list[bool] = []
+    gateway.call(lambda: setattr(gateway.data, "on_watch", lambda watched: noted.append(watched) if watched else None))
+    viewer = watch(token)
+    message = json.loads(viewer.socket.recv(timeout=LIMIT))
+    assert (message["type"], message["code"]) == ("error", "refused")
+    assert viewer.closed() == 1008
+    assert noted == []
+
+
+def test_viewers_are_limited(gateway: RunningGateway, watch: Watch) -> None:
+    gateway.call(lambda: setattr(gateway.data, "places", Places(1, "pages")))
     watch().receive("hello")
     second = watch()
     assert second.receive("error")["code"] == "unavailable"
