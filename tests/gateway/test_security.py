@@ -22,7 +22,7 @@ import pytest
 from gateways import JsonClient, RunningGateway
 from processes import LIMIT, until
 from scripted_learner import ScriptedLearner
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from daedalus.cli.commands.certs import certs
 from daedalus.gateway import app, places, server
@@ -172,11 +172,31 @@ def test_requests_of_other_pages_and_under_other_names_are_refused(
     assert "unsafe" not in policy
 
 
-def test_page_of_another_site_cannot_open_a_websocket(learner: ScriptedLearner, connect: Connect) -> None:
-    with pytest.raises(InvalidStatus) as refused:
-        connect(origin="http://evil.example")
-    assert refused.value.response.status_code == 403
-    assert b"allow them with --allow-origin" in refused.value.response.body
+@pytest.mark.parametrize("path", ["/actor", "/watch"])
+@pytest.mark.parametrize(
+    ("origin", "host", "reason"),
+    [
+        ("http://evil.example", "", b"allow them with --allow-origin"),
+        ("null", "", b"allow them with --allow-origin"),
+        ("http://127.0.0.1:1", "", b"allow them with --allow-origin"),  # another program on this machine
+        ("http://evil.example:PORT", "evil.example:PORT", b"add it with --host"),  # DNS rebinding
+    ],
+)
+def test_page_of_another_site_cannot_open_a_websocket(
+    gateway: RunningGateway, path: str, origin: str, host: str, reason: bytes
+) -> None:
+    port, request = (
+        str(gateway.port),
+        f"GET {path} HTTP/1.1\r\nHost: {host or '127.0.0.1:PORT'}\r\nOrigin: {origin}\r\n",
+    )
+    with (
+        socket.create_connection(("127.0.0.1", gateway.port), LIMIT) as connection,
+        connection.makefile("rb") as answer,
+    ):
+        connection.sendall(request.replace("PORT", port).encode() + HANDSHAKE + b"\r\n")
+        content = answer.read()
+    assert content.startswith(b"HTTP/1.1 403")
+    assert reason in content
 
 
 def test_allowed_origins_and_names_are_the_gateways_and_those_of_the_user() -> None:

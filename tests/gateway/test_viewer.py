@@ -15,8 +15,9 @@ from typing import Any
 import pytest
 from gateways import RunningGateway
 from processes import LIMIT, until
+from scripted_learner import ScriptedLearner
 from watched import FakeSource, actor_status, observed, run_status
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from daedalus.cli.commands.certs import certs
@@ -259,6 +260,39 @@ def test_pages_name_files_that_exist_and_have_no_inline_script(gateway: RunningG
 @pytest.mark.parametrize("path", ["/page/none.js", "/page/../server.py", "/page/%2e%2e%2fserver.py", "/page/", "/x"])
 def test_other_files_are_not_served(gateway: RunningGateway, path: str) -> None:
     assert fetch(gateway, path)[0] == 404
+
+
+def test_gateway_of_a_page_takes_no_clients(network: MemoryNetwork) -> None:
+    running = RunningGateway(network, follows=False, takes_clients=False, reads_openly=False)
+    try:
+        assert fetch(running, "/")[0] == 200
+        assert fetch(running, "/play")[0] == 403
+        for path, reason in (("actor", b"this gateway serves its page only"), ("raw", b"")):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(f"ws://127.0.0.1:{running.port}/{path}", open_timeout=LIMIT)
+            assert refused.value.response.status_code == 403
+            assert reason in (refused.value.response.body or b"")
+        with connect(f"ws://127.0.0.1:{running.port}/watch", open_timeout=LIMIT) as socket:
+            viewer = Viewer(socket)
+            viewer.send(type="hello", token="")
+            assert "start it with --operator-token FILE" in viewer.receive("error")["reason"]
+    finally:
+        running.close()
+
+
+@pytest.mark.parametrize("path", ["actor", "watch"])
+@pytest.mark.parametrize("kind", ["order", "drain", "status", "query", "metrics", "events", "actors"])
+def test_no_message_without_a_token_orders_or_asks_anything(
+    gateway: RunningGateway, learner: ScriptedLearner, path: str, kind: str
+) -> None:
+    orders: list[str] = []
+    gateway.call(lambda: setattr(gateway.data, "give_order", lambda order: orders.append(order) or ""))
+    with connect(f"ws://127.0.0.1:{gateway.port}/{path}", open_timeout=LIMIT) as socket:
+        socket.send(json.dumps({"type": kind, "order": "stop", "token": ""}))
+        assert json.loads(socket.recv(timeout=LIMIT))["code"] in ("malformed", "out_of_turn")
+        with pytest.raises(ConnectionClosed):
+            socket.recv(timeout=LIMIT)
+    assert orders == []
 
 
 def test_pages_are_refused_under_another_name(gateway: RunningGateway) -> None:
